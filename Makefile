@@ -1,0 +1,34 @@
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: help setup demo test bench check clean
+
+help:  ## show this help
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
+
+setup: .venv/.ready  ## make .venv: system packages, Python packages
+
+.venv/.ready: pyproject.toml constraints.txt
+	@tools/setup.sh $(PYTHON)
+	@touch $@
+
+demo: setup  ## compare the solvers on the demo suite, write out/demo/report
+	@$(BIN)/mortarbench run suites/demo.toml --out out/demo --fresh
+
+test: setup check  ## check, then run the tests
+	$(BIN)/pytest -q
+
+bench: setup  ## time our own kernels (pytest-benchmark)
+	$(BIN)/pytest benchmarks --benchmark-only --benchmark-warmup=on \
+	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
+
+check: setup  ## format, lint, types, import contracts
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:  ## remove .venv, results and caches
+	rm -rf .venv out .mypy_cache .ruff_cache .pytest_cache .import_linter_cache \
+	    .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,29 @@
+"""The contract between problems, solvers and reports, and the clock."""
+
+from harness.errors import InputError
+from harness.kkt import Residuals, kkt_residuals, verdict
+from harness.plugin import Case, Family, Fields, Reference, Solver, Value
+from harness.qp import QP, Matrix, Vector, no_rows
+from harness.record import Record, Verdict
+from harness.solution import Solution, Status
+
+__all__ = [
+    "QP",
+    "Case",
+    "Family",
+    "Fields",
+    "InputError",
+    "Matrix",
+    "Record",
+    "Reference",
+    "Residuals",
+    "Solution",
+    "Solver",
+    "Status",
+    "Value",
+    "Vector",
+    "Verdict",
+    "kkt_residuals",
+    "no_rows",
+    "verdict",
+]

@@ -1,0 +1,48 @@
+"""Composition root: the only module that imports problems, solvers and reports."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from threadpoolctl import threadpool_limits
+
+from harness import cli
+from harness.plugin import Fields
+from harness.supervisor import ONE_THREAD
+from harness.workbench import Workbench
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+
+def main() -> None:
+    """Run the command line, with one thread in every library."""
+    threadpool_limits(limits=1)  # of the BLASes that are loaded: numpy's, CHOLMOD's
+    os.environ.update(ONE_THREAD)  # what a solver loads later reads these, once
+    workbench = Workbench(
+        families=PROBLEMS,
+        solvers=SOLVERS,
+        reference=reference_solution,
+        report=_report,
+        plot=_plot,
+    )
+    sys.exit(cli.main(workbench, sys.argv[1:]))
+
+
+def _report(folder: Path, formats: Sequence[str]) -> list[Path]:
+    from reports import write_report  # late: workers must not carry matplotlib
+
+    return write_report(folder, formats)
+
+
+def _plot(fields: Fields, path: Path) -> None:
+    from reports.mechanics import draw_deformed
+
+    draw_deformed(fields, path)
+
+
+if __name__ == "__main__":
+    main()

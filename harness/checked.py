@@ -1,0 +1,77 @@
+"""Plain data that a user wrote, checked: what is wrong, where, what would be right.
+
+All functions raise `InputError`; `where` names the value as the user knows it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from harness.errors import InputError, unknown
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Put the place in the user's input before what is wrong there."""
+    try:
+        yield
+    except InputError as e:
+        raise InputError(f"{where}: {e}") from None
+
+
+def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Refuse a key that means nothing to us."""
+    for key in table:
+        if key not in known:
+            raise unknown("key", key, known)
+
+
+def at_least_one(where: str, value: object) -> int:
+    """Take a positive integer; neither 2.0 nor true is one."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{where} = {value!r}; expected an integer of at least 1")
+    return value
+
+
+def positive(where: str, value: Any) -> float:
+    """Take a positive finite number."""
+    if not is_number(value) or not 0 < value < math.inf:
+        raise InputError(f"{where} = {value!r}; expected a positive number")
+    return float(value)
+
+
+def is_number(value: object) -> bool:
+    """Whether `value` is a number; a bool is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def text(where: str, value: object) -> str:
+    """Take a text that is not empty."""
+    if not isinstance(value, str) or not value:
+        raise InputError(f"{where} = {value!r}; expected a text, not empty")
+    return value
+
+
+def any_list(where: str, value: object) -> list[Any]:
+    """Take a list, empty or not."""
+    if not isinstance(value, list):
+        raise InputError(f"{where} = {value!r}; expected a list")
+    return value
+
+
+def filled_list(where: str, value: object) -> list[Any]:
+    """Take a list with entries."""
+    entries = any_list(where, value)
+    if not entries:
+        raise InputError(f"{where} is empty; expected at least one entry")
+    return entries
+
+
+def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
+    """Take a table."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where} = {value!r}; expected {instead}")
+    return value

@@ -1,0 +1,133 @@
+"""The command line: options, exit codes, and which function does what.
+
+Exit codes: 0 done; 1 done, and the answer is no; 2 the input was wrong, one line on
+stderr; 3 a fault of ours, with a traceback; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from harness import commands
+from harness.errors import InputError
+from harness.registry import entry_point_plugins
+from harness.workbench import FORMATS, Workbench
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser for which a bad command line is bad input like any other: one line."""
+
+    def error(self, message: str) -> NoReturn:
+        usage = " ".join(self.format_usage().split())
+        raise InputError(f"{message}; {usage}")
+
+
+def main(workbench: Workbench, argv: Sequence[str]) -> int:
+    """Run one command and return its exit code."""
+    try:
+        workbench = workbench.extended(entry_point_plugins())
+        if argv[:1] == ["worker"]:  # how runs start their workers; not for users
+            return commands.worker(workbench, argv[1:])
+        options, left = _parser().parse_known_args(argv)
+        if left:
+            options.parser.error(f"unknown argument {left[0]!r}")
+        code: int = options.run(workbench, options)
+    except InputError as e:
+        print(f"mortarbench: {' '.join(str(e).splitlines())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("mortarbench: interrupted; the same command continues", file=sys.stderr)
+        return 130
+    except Exception:
+        traceback.print_exc()
+        return 3
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="mortarbench",
+        description="Compare QP solvers on elastic contact problems.",
+        allow_abbrev=False,
+    )
+    add = parser.add_subparsers(
+        metavar="COMMAND", required=True, parser_class=_Parser
+    ).add_parser
+
+    command = add("list", help="what there is", allow_abbrev=False)
+    command.add_argument("what", choices=("problems", "solvers", "suites"))
+    _add_plugin(command)
+    _add_json(command)
+    command.set_defaults(run=commands.list_, parser=command)
+
+    command = add("run", help="measure a suite; continues a run", allow_abbrev=False)
+    _add_run_options(command)
+    command.set_defaults(run=commands.run, parser=command)
+
+    command = add("solve", help="one solver on one case, once", allow_abbrev=False)
+    command.add_argument("case", metavar="CASE", help="FAMILY/key=value/…/FORM")
+    command.add_argument("--solver", metavar="NAME", required=True)
+    command.add_argument("--tol", metavar="T", type=float, default=1e-8)
+    command.add_argument(
+        "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
+    )
+    _add_plugin(command)
+    _add_json(command)
+    command.set_defaults(run=commands.solve, parser=command)
+
+    command = add("export", help="one QP as a file", allow_abbrev=False)
+    command.add_argument("case", metavar="CASE")
+    command.add_argument("file", metavar="FILE.npz", type=Path)
+    _add_plugin(command)
+    command.set_defaults(run=commands.export, parser=command)
+
+    command = add("report", help="report on a result folder", allow_abbrev=False)
+    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument(
+        "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
+    )
+    command.set_defaults(run=commands.report, parser=command)
+
+    command = add("doctor", help="is this machine fit to measure", allow_abbrev=False)
+    command.set_defaults(run=commands.doctor, parser=command)
+    return parser
+
+
+def _add_run_options(command: argparse.ArgumentParser) -> None:
+    command.add_argument("suite", metavar="SUITE.toml", help="or the name of a suite")
+    command.add_argument(
+        "--out", metavar="DIR", type=Path, help="default: out/NAME-OF-SUITE"
+    )
+    command.add_argument(
+        "--solver", metavar="NAME", action="append", default=[], help="only this one"
+    )
+    command.add_argument(
+        "--case", metavar="PATTERN", action="append", default=[], help="only these"
+    )
+    _add_plugin(command)
+    command.add_argument("--repeats", metavar="N", type=int)
+    command.add_argument("--time-limit", metavar="SECONDS", type=float)
+    command.add_argument("--memory-limit", metavar="MIB", type=float)
+    command.add_argument(
+        "--fresh", action="store_true", help="forget what the folder holds"
+    )
+
+
+def _add_plugin(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--plugin",
+        metavar="FILE.py",
+        type=Path,
+        action="append",
+        default=[],
+        help="more solvers or problems",
+    )
+
+
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", action="store_true", help="for machines")

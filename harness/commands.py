@@ -1,0 +1,218 @@
+"""What each command does; stdout carries results, stderr progress and reasons."""
+
+from __future__ import annotations
+
+import json
+import sys
+from argparse import Namespace
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness import show
+from harness.doctor import advice, noise_floor, render
+from harness.environment import capture, digest
+from harness.errors import InputError, unknown
+from harness.journal import read_journal
+from harness.judge import blank, has_point, judged, plain
+from harness.measure import measure
+from harness.names import assemble, canonical, parse
+from harness.progress import shown_on
+from harness.qpfile import save_qp
+from harness.record import Record, Verdict
+from harness.registry import SolverSpec, options_of, resolve
+from harness.run import run as run_suite
+from harness.suite import load_suite, with_overrides
+from harness.workbench import FORMATS, Workbench
+from harness.worker import serve
+
+
+def list_(workbench: Workbench, options: Namespace) -> int:
+    """List what there is, one line each or as one JSON array."""
+    workbench = workbench.with_files(options.plugin)
+    rows: list[dict[str, Any]]
+    match options.what:
+        case "problems":
+            rows = [
+                {
+                    "name": name,
+                    "description": show.first_sentence(family),
+                    "defaults": assemble(family, {}, family.forms[0]).params,
+                    "forms": family.forms,
+                }
+                for name, family in workbench.families.items()
+            ]
+        case "solvers":
+            rows = [
+                {
+                    "name": name,
+                    "description": show.first_sentence(solver),
+                    "options": options_of(solver),
+                }
+                for name, solver in workbench.solvers.items()
+            ]
+        case _:
+            rows = [
+                {
+                    "name": path.stem,
+                    "description": show.first_comment(path),
+                    "path": str(path),
+                }
+                for path in sorted(workbench.suites.glob("*.toml"))
+            ]
+    print(json.dumps(plain(rows)) if options.json else show.listing(rows))
+    return 0
+
+
+def run(workbench: Workbench, options: Namespace) -> int:
+    """Measure what the result folder lacks of a suite, and report."""
+    workbench = workbench.with_files(options.plugin)
+    path = workbench.suite_path(options.suite)
+    suite = with_overrides(
+        load_suite(path, workbench.families, workbench.solvers),
+        workbench.families,
+        workbench.solvers,
+        solvers=options.solver,
+        cases=options.case,
+        repeats=options.repeats,
+        time_limit=options.time_limit,
+        memory_limit=options.memory_limit,
+    )
+    out = options.out or Path("out") / suite.name
+    environment = capture()
+    with shown_on(sys.stderr) as progress:
+        run_suite(
+            suite,
+            families=workbench.families,
+            reference=workbench.reference,
+            out=out,
+            command=lambda spec: worker_command(spec, options.plugin),
+            resolve=lambda spec: resolve(spec, workbench.solvers),
+            environment=environment,
+            digest=digest(environment),
+            progress=progress,
+            fresh=options.fresh,
+        )
+    print(show.summary(read_journal(out), [s.label for s in suite.solvers]))
+    written = workbench.report(out, FORMATS)
+    for page in (file for file in written if file.suffix == ".html"):
+        print(page)
+    return 0
+
+
+def solve(workbench: Workbench, options: Namespace) -> int:
+    """Measure one solver on one case in this process; 0 if we can verify its answer."""
+    if not 0 < options.tol < 1:
+        raise InputError(f"--tol = {options.tol}; expected a number between 0 and 1")
+    if options.plot is not None:
+        _check_writable(options.plot, ".png")
+    workbench = workbench.with_files(options.plugin)
+    name = parse(options.case, workbench.families)
+    family = workbench.families[name.family]
+    spec = SolverSpec(name=options.solver, label=options.solver)
+    solver = resolve(spec, workbench.solvers)
+    case = family.build(name.form, name.params, workbench.reference)
+    record = blank(
+        name,
+        canonical(name, family),
+        spec,
+        options=options_of(solver),
+        tol=options.tol,
+        repeat=0,
+        environment=digest(capture()),
+    )
+    if options.plot is not None and case.fields is None:
+        raise InputError(f"{record.case} has no bodies to draw; leave out --plot")
+
+    measurement = measure(solver, case.qp, options.tol)
+    record = judged(record, case, measurement)
+    _show(record, options.json)
+    if options.plot is not None and case.fields is not None:
+        if has_point(measurement.solution):
+            workbench.plot(case.fields(measurement.solution), options.plot)
+        else:
+            _say(f"no picture: {record.solver} returned no point")
+    return 0 if record.status is Verdict.VERIFIED else 1
+
+
+def export(workbench: Workbench, options: Namespace) -> int:
+    """Write the QP of one case for other people's solvers."""
+    _check_writable(options.file, ".npz")
+    workbench = workbench.with_files(options.plugin)
+    name = parse(options.case, workbench.families)
+    family = workbench.families[name.family]
+    case = family.build(name.form, name.params, workbench.reference)
+    meta = {
+        "name": canonical(name, family),
+        "family": name.family,
+        "params": name.params,
+        "form": name.form,
+        "units": "non-dimensional; energy in SI = scale * objective + constant",
+        "scale": case.scale,
+        "constant": case.constant,
+    }
+    save_qp(options.file, case.qp, plain(meta))
+    print(options.file)
+    return 0
+
+
+def report(workbench: Workbench, options: Namespace) -> int:
+    """Write the report on a result folder."""
+    formats = options.format.split(",")
+    for form in formats:
+        if form not in FORMATS:
+            raise unknown("format", form, FORMATS, where="--format")
+    for file in workbench.report(options.folder, formats):
+        print(file)
+    return 0
+
+
+def doctor(_workbench: Workbench, _options: Namespace) -> int:
+    """Describe this machine and say what to change before measuring."""
+    environment = capture()
+    print(render(environment, advice(environment), noise_floor()))
+    return 0
+
+
+def worker_command(spec: SolverSpec, plugins: Iterable[Path]) -> list[str]:
+    """Make the command that starts the worker of a solver, less its two pipes."""
+    request = {
+        "name": spec.name,
+        "options": spec.options,
+        "plugins": [str(path.resolve()) for path in plugins],
+    }
+    # -P: what lies in the working directory must not pass for a library
+    return [sys.executable, "-P", "-m", "harness", "worker", json.dumps(request)]
+
+
+def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
+    """Be the worker that `worker_command` starts."""
+    text, request_fd, reply_fd = arguments
+    request = json.loads(text)
+    workbench = workbench.with_files([Path(file) for file in request["plugins"]])
+    spec = SolverSpec(
+        name=request["name"], label=request["name"], options=request["options"]
+    )
+    serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
+    return 0
+
+
+def _show(record: Record, as_json: bool) -> None:
+    if as_json:
+        print(record.to_json())
+    elif record.status is not Verdict.DECLINED:
+        print(show.outcome(record))
+    if record.status is Verdict.DECLINED:
+        _say(f"{record.solver} declines {record.case}: {record.message}")
+
+
+def _check_writable(path: Path, suffix: str) -> None:
+    """Refuse a file that could not be written before any work is done for it."""
+    if path.suffix != suffix:
+        raise InputError(f"{path}: unknown format {path.suffix!r}; expected {suffix}")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
+
+
+def _say(text: str) -> None:
+    print(f"mortarbench: {text}", file=sys.stderr)

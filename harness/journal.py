@@ -1,0 +1,78 @@
+"""The journal of a result folder: one fsynced line per measurement, only ever appended.
+
+A process may die at any instant. What it leaves behind is whole lines and at most one
+partial line at the end, which counts for nothing: readers skip it, the next writer cuts
+it off.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from harness.errors import InputError
+from harness.record import Record
+
+
+class Journal:
+    """The writer's end of one file ``FOLDER/journal/NAME.jsonl``.
+
+    Hold `harness.folder.locked` while one is open: a second writer could cut off a line
+    that this one is writing.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        path = folder / "journal" / f"{name}.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+        whole = _whole_lines(path.read_bytes())
+        os.truncate(self._fd, len(whole))
+
+    def append(self, record: Record) -> None:
+        """Write one line and return when it is on the disk."""
+        line = memoryview((record.to_json() + "\n").encode())
+        while line:  # a write to a full disk may be short
+            line = line[os.write(self._fd, line) :]
+        os.fsync(self._fd)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        os.close(self._fd)
+
+
+def read_journal(folder: Path) -> list[Record]:
+    """Read every record of a result folder, file by file in the order of their names.
+
+    Raises
+    ------
+    InputError
+        When there is no journal, or a line other than a partial last one is bad.
+
+    """
+    paths = sorted((folder / "journal").glob("*.jsonl"))
+    if not paths:
+        raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
+    return [record for path in paths for record in _records(path)]
+
+
+def _records(path: Path) -> Iterator[Record]:
+    for number, line in enumerate(_whole_lines(path.read_bytes()).splitlines(), 1):
+        try:
+            yield Record.from_json(line.decode())
+        except ValueError as e:
+            raise InputError(f"{path}, line {number}: {e}") from None
+
+
+def _whole_lines(text: bytes) -> bytes:
+    """Drop what follows the last newline."""
+    return text[: text.rfind(b"\n") + 1]

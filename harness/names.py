@@ -1,0 +1,127 @@
+"""Case names: ``FAMILY/key=value/…/FORM``, parsed strictly and written canonically.
+
+A family may derive a default from other keys (a number of layers from another one). It
+then has ``complete(params) -> params``, which takes the keys that were set and returns
+all of them; without it, keys left out take the value in the family's ``defaults``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from harness.errors import InputError, unknown
+from harness.plugin import Family, Value
+
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+_CALLED = {int: "integer", float: "finite number", str: "text"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaseName:
+    """One case of a family: what `Family.build` needs, checked."""
+
+    family: str
+    params: Mapping[str, Value]  #: every key, in the family's order
+    form: str
+
+
+def parse(text: str, families: Mapping[str, Family]) -> CaseName:
+    """Parse ``beam-ring/Nr=30/dual``; keys left out take the family's defaults.
+
+    Raises
+    ------
+    InputError
+        For an unknown family, key or form, a key set twice, a part that is no
+        key=value, a value of the wrong type, and whatever ``family.check`` refuses.
+
+    """
+    head, *parts = text.split("/")
+    if head not in families:
+        raise unknown("family", head, families)
+    family = families[head]
+    if not parts or "=" in parts[-1]:
+        forms = ", ".join(family.forms)
+        raise InputError(f"{text}: no form at the end; expected one of {forms}")
+    given: dict[str, str] = {}
+    for part in parts[:-1]:
+        key, equals, value = part.partition("=")
+        if not equals:
+            raise InputError(f"{head}: malformed part {part!r}; expected key=value")
+        if key in given:
+            raise InputError(f"{head}: key {key!r} is set twice; set it once")
+        given[key] = value
+    return assemble(family, given, parts[-1])
+
+
+def assemble(family: Family, given: Mapping[str, object], form: str) -> CaseName:
+    """Make the checked name of the case with the keys `given`, texts or typed values.
+
+    Raises
+    ------
+    InputError
+        As `parse`.
+
+    """
+    if form not in family.forms:
+        raise unknown("form", form, family.forms, where=family.name)
+    typed: dict[str, Value] = {}
+    for key, value in given.items():
+        if key not in family.defaults:
+            raise unknown("key", key, family.defaults, where=family.name)
+        typed[key] = _typed(f"{family.name}: {key}", value, type(family.defaults[key]))
+    params = _completed(family, typed)
+    if (check := getattr(family, "check", None)) is not None:
+        check(params)
+    return CaseName(family=family.name, params=params, form=form)
+
+
+def canonical(name: CaseName, family: Family) -> str:
+    """Write `name` with only those keys that its other keys do not imply."""
+    needed = dict(name.params)
+    for key in family.defaults:
+        fewer = {k: v for k, v in needed.items() if k != key}
+        if _completed(family, fewer) == name.params:
+            needed = fewer
+    middle = [f"{key}={value}" for key, value in needed.items()]
+    return "/".join([name.family, *middle, name.form])
+
+
+def match(pattern: str, names: Iterable[str]) -> list[str]:
+    """Keep the canonical names that the shell glob `pattern` matches."""
+    return [name for name in names if fnmatchcase(name, pattern)]
+
+
+def _completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
+    """Fill in the keys that are not given, in the family's order."""
+    complete = getattr(family, "complete", lambda given: {**family.defaults, **given})
+    params = complete(given)
+    return {key: params[key] for key in family.defaults}
+
+
+def _typed(where: str, value: object, kind: type) -> Value:
+    """Convert a text, or check a typed value, to the type of the key's default."""
+    if kind is str and isinstance(value, str) and value and not set("/=") & set(value):
+        return value
+    if kind is int:
+        if isinstance(value, str) and _INTEGER.fullmatch(value):
+            return int(value)
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+    if kind is float and (number := _float(value)) is not None:
+        return number
+    raise InputError(f"{where}={value!r} is no {_CALLED[kind]}")
+
+
+def _float(value: object) -> float | None:
+    """Read a finite number, or None where `value` is none; a bool is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

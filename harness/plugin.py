@@ -1,0 +1,84 @@
+"""What one can plug in: solvers, and families of problems that build cases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from harness.qp import QP, Vector
+from harness.solution import Solution
+
+Value = int | float | str  #: of one key of a case name
+Reference = Callable[[QP], Solution]  #: the injected high-accuracy solve
+
+
+class Solver(Protocol):
+    """A QP solver; in practice a frozen dataclass whose fields are its options."""
+
+    def declines(self, qp: QP) -> str | None:
+        """Say why this solver cannot take `qp`, or None if it can."""
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        """Convert and factorise; return the call that solves. Both are timed.
+
+        `tol` is the relative KKT accuracy asked for; the adapter maps it to the
+        solver's own test. The returned call is made once: repeats prepare afresh.
+        """
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fields:
+    """A deformed state of bodies, for pictures and files; SI units."""
+
+    points: NDArray[Any]  #: (N, 2) reference positions, m
+    cells: NDArray[Any]  #: (E, 4) node numbers, counter-clockwise
+    bodies: NDArray[Any]  #: (E,) body number of each cell
+    displacement: NDArray[Any]  #: (N, 2) m
+    nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
+    contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
+    contact_forces: NDArray[Any] | None = None  #: (c, 2) force on each slave node, N/m
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Case:
+    """One QP together with its way back to the physical problem.
+
+    `scale` and `constant` turn the objective of the emitted QP into the potential
+    energy of the physical problem:  energy = scale·objective + constant.
+    """
+
+    qp: QP
+    recover: Callable[[Solution], Vector]  #: point of the QP → physical unknown u, SI
+    quantities: Callable[[Solution], Mapping[str, Any]]  #: physical results, SI
+    fields: Callable[[Solution], Fields] | None = None  #: for pictures, where there are
+    scale: float = 1.0
+    constant: float = 0.0
+
+
+class Family(Protocol):
+    """A parametrised family of problems; in practice a frozen dataclass."""
+
+    @property
+    def name(self) -> str:
+        """The first component of its case names."""
+
+    @property
+    def defaults(self) -> Mapping[str, Value]:
+        """Every key with its default, in the order of canonical names."""
+
+    @property
+    def forms(self) -> tuple[str, ...]:
+        """The forms that it can emit."""
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Build one case from complete params.
+
+        A family may also have ``check(params) -> None``, which is called before a run
+        starts, and ``complete(given) -> params`` where a default depends on another
+        key. All raise `InputError` for values outside the family's range.
+        """

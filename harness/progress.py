@@ -1,0 +1,77 @@
+"""How a run goes, on stderr: a bar on a terminal, else one line per measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TextIO
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from harness.record import Record
+from harness.run import Progress as Listener
+
+
+@contextmanager
+def shown_on(stream: TextIO) -> Iterator[Listener]:
+    """Give what a run reports its progress to."""
+    if not stream.isatty():
+        yield _Lines(stream)
+        return
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=Console(file=stream)) as bar:
+        yield _Bar(bar)
+
+
+class _Bar:
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task = bar.add_task("starting", total=None)
+
+    def start(self, total: int) -> None:
+        self._bar.update(self._task, total=total)
+
+    def say(self, text: str) -> None:
+        self._bar.update(self._task, description=escape(text))
+
+    def advance(self, record: Record | None) -> None:
+        self._bar.advance(self._task)
+
+
+class _Lines:
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._done = self._total = 0
+
+    def start(self, total: int) -> None:
+        self._total = total
+        print(f"{total} measurements", file=self._stream, flush=True)
+
+    def say(self, text: str) -> None:
+        """Be silent: the line that follows says what was done."""
+
+    def advance(self, record: Record | None) -> None:
+        self._done += 1
+        if record is None:
+            return
+        seconds = record.total_seconds
+        took = "" if seconds is None else f" in {seconds:.3g} s"
+        print(
+            f"{self._done}/{self._total} {record.solver} on {record.case}: "
+            f"{record.status}{took}",
+            file=self._stream,
+            flush=True,
+        )

@@ -1,0 +1,103 @@
+"""One QP in one npz file, without pickles, for workers and for other people's solvers.
+
+::
+
+    min ½xᵀPx + qᵀx   s.t.   Gx ≤ h,  Ax = b,  lb ≤ x ≤ ub
+
+holds the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
+``M_data, M_indices, M_indptr, M_shape`` of its compressed sparse columns (P whole, not
+a triangle); and ``meta``, a JSON object. Absent constraints have zero rows, absent
+bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from harness.errors import InputError
+from harness.qp import QP, Matrix, Vector
+from harness.store import read_arrays
+
+_VECTORS = ("q", "h", "b", "lb", "ub")
+_MATRICES = ("P", "G", "A")
+_PARTS = ("data", "indices", "indptr", "shape")
+
+
+def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
+    """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
+
+    `meta` is plain data; its key ``dense`` is filled in here.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+
+    """
+    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
+    matrices = {"P": P, "G": qp.G, "A": qp.A}
+    dense = [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
+    arrays = {name: getattr(qp, name) for name in _VECTORS}
+    for name, M in matrices.items():
+        M = csc_array(M)
+        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
+    arrays["meta"] = np.array(json.dumps({**meta, "dense": dense}))
+    try:
+        with path.open("wb") as file:  # given a name, savez would append .npz to it
+            np.savez(file, **arrays)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+
+
+def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
+    """Read a QP and its meta data.
+
+    Raises
+    ------
+    InputError
+        When the file is no npz, lacks an array, or what it holds is no QP.
+
+    """
+    parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
+    arrays = read_arrays(path, (*_VECTORS, *parts, "meta"))
+    try:
+        meta = json.loads(str(arrays["meta"]))
+        if not isinstance(meta, dict):
+            raise ValueError("meta is no JSON object")
+        vectors = {name: _vector(arrays, name) for name in _VECTORS}
+        matrices = {name: _matrix(arrays, name) for name in _MATRICES}
+        for name in set(_MATRICES).intersection(meta.get("dense", ())):
+            matrices[name] = matrices[name].toarray()
+        return QP(**vectors, **matrices), meta
+    except (ValueError, TypeError) as e:
+        raise InputError(f"{path}: {' '.join(str(e).split())}") from None
+
+
+def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
+    if arrays[name].dtype.kind not in "iuf":
+        raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
+    return arrays[name].astype(float)
+
+
+def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
+    """Put a matrix together; unchecked, an index out of range crashes a product."""
+    data = _vector(arrays, f"{name}_data")
+    if not np.isfinite(data).all():
+        raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
+    indices, indptr, shape = (arrays[f"{name}_{part}"] for part in _PARTS[1:])
+    if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
+        raise ValueError(f"{name}_indices, _indptr and _shape must hold integers")
+    try:
+        M = csc_array((data, indices, indptr), shape=tuple(shape.tolist()))
+        M.check_format(full_check=True)
+    except ValueError as e:
+        raise ValueError(f"{name} is no matrix in CSC parts: {e}") from None
+    return M

@@ -1,0 +1,258 @@
+"""A suite, measured: the schedule, resumption, and one journal line per measurement.
+
+One block is every solver once on one case at one tolerance, in random order, so that a
+drift of the machine hits all alike and solvers are compared within a block. The parent
+builds a case once, hands its QP to the workers by file, and judges what they return.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
+
+from harness.errors import InputError
+from harness.folder import claim, locked
+from harness.journal import Journal, read_journal
+from harness.judge import blank, has_point, judged, noted
+from harness.measure import Measurement
+from harness.names import CaseName, canonical
+from harness.plugin import Case, Family, Reference, Solver
+from harness.qpfile import save_qp
+from harness.record import Record, Verdict
+from harness.registry import SolverSpec, options_of
+from harness.solution import Solution, Status
+from harness.store import read_point, save_fields, save_solution
+from harness.suite import Suite
+from harness.supervisor import WorkerProcess
+
+_log = logging.getLogger(__name__)
+
+_MEASURED = ("prepare_seconds", "solve_seconds", "total_seconds", "peak_mib")
+
+
+class Progress(Protocol):
+    """Who is told how a run goes."""
+
+    def start(self, total: int) -> None:
+        """Begin; `total` cells, those that an earlier run measured included."""
+
+    def say(self, text: str) -> None:
+        """Show what happens now."""
+
+    def advance(self, record: Record | None) -> None:
+        """Count one cell as done; None where nothing had to be measured."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Entrant:
+    spec: SolverSpec
+    options: Mapping[str, Any]
+    worker: WorkerProcess
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Bench:
+    """What every measurement of a run needs."""
+
+    suite: Suite
+    families: Mapping[str, Family]
+    reference: Reference
+    entrants: list[_Entrant]
+    out: Path
+    scratch: Path
+    journal: Journal
+    past: list[Record]  #: measured by earlier runs
+    blocks: Iterator[int]  #: numbers not used yet
+    digest: str
+    progress: Progress
+
+
+Cell = tuple[_Entrant, Record]  #: who, and the record to fill in
+
+
+def run(
+    suite: Suite,
+    *,
+    families: Mapping[str, Family],
+    reference: Reference,
+    out: Path,
+    command: Callable[[SolverSpec], list[str]],
+    resolve: Callable[[SolverSpec], Solver],
+    environment: Mapping[str, Any],
+    digest: str,
+    progress: Progress,
+    fresh: bool = False,
+) -> None:
+    """Measure what the result folder `out` lacks of `suite`, in worker processes.
+
+    reference : the injected high-accuracy solve that families may build with
+    command : starts the worker of a solver; two file descriptors are appended to it
+    resolve : configures the solver, whose options go into the records
+    environment, digest : what to write into environment.json, and its digest
+    fresh : forget first what `out` holds
+
+    Raises
+    ------
+    InputError
+        When `out` holds another suite or environment or is in use, and for whatever a
+        family refuses to build. Any other failure costs the measurements it concerns.
+
+    """
+    with locked(out), ExitStack() as stack:
+        claim(out, suite, {"digest": digest, **environment}, fresh=fresh)
+        scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
+        journal = stack.enter_context(Journal(out, digest))
+        past = read_journal(out)
+        entrants = [
+            _Entrant(
+                spec=spec,
+                options=options_of(resolve(spec)),
+                worker=WorkerProcess(command(spec), scratch / f"worker-{i}.log"),
+            )
+            for i, spec in enumerate(suite.solvers)
+        ]
+        for entrant in entrants:
+            stack.callback(entrant.worker.close)
+        bench = _Bench(
+            suite=suite,
+            families=families,
+            reference=reference,
+            entrants=entrants,
+            out=out,
+            scratch=scratch,
+            journal=journal,
+            past=past,
+            blocks=count(1 + max((r.block for r in past), default=-1)),
+            digest=digest,
+            progress=progress,
+        )
+        cells = len(suite.cases) * len(suite.tolerances) * suite.repeats * len(entrants)
+        progress.start(cells)
+        for name in suite.cases:
+            _run_case(bench, name)
+
+
+def _run_case(bench: _Bench, name: CaseName) -> None:
+    """Measure the cells of one case that are not in the journal yet."""
+    blocks = [block for block in _blocks(bench, name) if block]
+    if not blocks:
+        return
+    try:
+        case, qp_file = _built(bench, name)
+    except InputError:
+        raise
+    except Exception as e:  # the family's code
+        _log.warning("%s could not be built", blocks[0][0][1].case, exc_info=True)
+        message = f"case could not be built: {type(e).__name__}: {e}"
+        for block in blocks:
+            number = next(bench.blocks)
+            for _, record in block:
+                _append(bench, record.but(block=number, message=message))
+        return
+    declined: set[tuple[str, float]] = set()
+    for block in blocks:
+        number = next(bench.blocks)
+        for entrant, record in block:
+            if (record.solver, record.tol) in declined:  # it will again: say it once
+                bench.progress.advance(None)
+                continue
+            bench.progress.say(f"{record.solver} on {record.case}")
+            record = _measured(bench, case, qp_file, (entrant, record))
+            _append(bench, record.but(block=number))
+            if record.status is Verdict.DECLINED:
+                declined.add((record.solver, record.tol))
+
+
+def _blocks(bench: _Bench, name: CaseName) -> Iterator[list[Cell]]:
+    """Yield per tolerance and repeat what is still to be measured, shuffled."""
+    suite = bench.suite
+    case = canonical(name, bench.families[name.family])
+    past = [r for r in bench.past if r.case == case]
+    done = {r.run_id for r in past}
+    declined = {(r.solver, r.tol) for r in past if r.status is Verdict.DECLINED}
+    for tol in suite.tolerances:
+        for repeat in range(suite.repeats):
+            block = []
+            for entrant in bench.entrants:
+                record = blank(
+                    name,
+                    case,
+                    entrant.spec,
+                    options=entrant.options,
+                    tol=tol,
+                    repeat=repeat,
+                    environment=bench.digest,
+                )
+                if record.run_id in done or (record.solver, tol) in declined:
+                    bench.progress.advance(None)
+                else:
+                    block.append((entrant, record))
+            random.Random(f"{suite.name} {case} {tol} {repeat}").shuffle(block)
+            yield block
+
+
+def _built(bench: _Bench, name: CaseName) -> tuple[Case, Path]:
+    """Build a case and write its QP for the workers."""
+    family = bench.families[name.family]
+    canonical_name = canonical(name, family)
+    bench.progress.say(f"building {canonical_name}")
+    case = family.build(name.form, name.params, bench.reference)
+    qp_file = bench.scratch / "qp.npz"
+    save_qp(qp_file, case.qp, {"name": canonical_name})
+    return case, qp_file
+
+
+def _measured(bench: _Bench, case: Case, qp_file: Path, cell: Cell) -> Record:
+    """Have a worker make one measurement; judge and store what it returned."""
+    entrant, record = cell
+    record = record.but(
+        sizes=case.qp.sizes,
+        started=datetime.now(UTC).isoformat(timespec="milliseconds"),
+    )
+    point = bench.scratch / "point.npz"
+    reply = entrant.worker.ask(
+        {"qp": str(qp_file), "tol": record.tol, "out": str(point)},
+        time_limit=bench.suite.time_limit,
+        memory_limit=bench.suite.memory_limit,
+    )
+    if reply.answer is None:
+        return record.but(
+            status=reply.verdict, message=reply.message, peak_mib=reply.peak_mib
+        )
+    answer = reply.answer
+    solution = replace(
+        read_point(point, Status(answer["claimed"])),
+        iterations=answer["iterations"],
+        counts=answer["counts"],
+        message=answer["message"],
+    )
+    measured = {name: answer[name] for name in _MEASURED}
+    record = judged(record, case, Measurement(solution=solution, **measured))
+    return _stored(bench.out, case, record, solution)
+
+
+def _stored(out: Path, case: Case, record: Record, solution: Solution) -> Record:
+    """Store the point and, of a first verified repeat, the deformed state."""
+    if not has_point(solution):
+        return record
+    record = record.but(vectors=save_solution(out, solution))
+    if record.status is not Verdict.VERIFIED or record.repeat or case.fields is None:
+        return record
+    try:
+        fields = case.fields(solution)
+    except Exception as e:  # the family's code; its fault must not lose the record
+        return noted(record, "fields", e)
+    return record.but(fields=save_fields(out, fields))
+
+
+def _append(bench: _Bench, record: Record) -> None:
+    bench.journal.append(record)
+    bench.progress.advance(record)

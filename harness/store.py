@@ -1,0 +1,136 @@
+"""Arrays of a result folder, stored once by content: ``FOLDER/vectors/DIGEST.npz``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import InputError
+from harness.plugin import Fields
+from harness.solution import Solution, Status
+
+Arrays = Mapping[str, NDArray[Any]]
+
+_POINT = ("x", "y", "z", "z_box")
+_ALWAYS = ("points", "cells", "bodies", "displacement")
+_OPTIONAL = ("contact_nodes", "contact_forces")
+_NODAL = "nodal_"
+
+
+def save_solution(folder: Path, solution: Solution) -> str:
+    """Store a primal-dual point and return its digest."""
+    return _save(folder, _point(solution))
+
+
+def load_solution(folder: Path, digest: str, status: Status) -> Solution:
+    """Load a stored point as a `Solution` that claims `status`.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged.
+
+    """
+    return read_point(_path(folder, digest), status)
+
+
+def save_fields(folder: Path, fields: Fields) -> str:
+    """Store a deformed state and return its digest."""
+    arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
+    arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
+    return _save(folder, {k: np.asarray(v) for k, v in arrays.items() if v is not None})
+
+
+def load_fields(folder: Path, digest: str) -> Fields:
+    """Load a stored deformed state.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged.
+
+    """
+    arrays = read_arrays(_path(folder, digest), _ALWAYS)
+    nodal = {
+        name.removeprefix(_NODAL): values
+        for name, values in arrays.items()
+        if name.startswith(_NODAL)
+    }
+    known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
+    return Fields(nodal=nodal, **known)
+
+
+def write_point(path: Path, solution: Solution) -> None:
+    """Write the point of a solution to a file of its own."""
+    with path.open("wb") as file:  # given a name, savez would append .npz to it
+        np.savez(file, **_point(solution))  # type: ignore[arg-type]
+
+
+def read_point(path: Path, status: Status) -> Solution:
+    """Read what `write_point` wrote, as a `Solution` that claims `status`."""
+    arrays = read_arrays(path, _POINT)
+    x, y, z, z_box = (arrays[name] for name in _POINT)
+    return Solution(status=status, x=x, y=y, z=z, z_box=z_box)
+
+
+def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Read an npz file, never unpickling.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no npz, or lacks one of the `expected` arrays.
+
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror or e}; expected an npz file") from None
+    except (ValueError, TypeError, AttributeError, EOFError, BadZipFile):
+        # what numpy raises for a text, a pickle, one bare array, a truncated archive
+        raise InputError(f"{path}: not an npz file of plain arrays") from None
+    if missing := [name for name in expected if name not in arrays]:
+        raise InputError(f"{path}: {', '.join(missing)} missing")
+    return arrays
+
+
+def _point(solution: Solution) -> Arrays:
+    return {name: getattr(solution, name) for name in _POINT}
+
+
+def _path(folder: Path, digest: str) -> Path:
+    return folder / "vectors" / f"{digest}.npz"
+
+
+def _save(folder: Path, arrays: Arrays) -> str:
+    """Write arrays under the digest of their content, unless they are there."""
+    digest = _digest(arrays)
+    path = _path(folder, digest)
+    if path.exists():
+        return digest
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+        file.flush()
+        os.fsync(file.fileno())  # before the journal line that will refer to it
+    os.replace(file.name, path)
+    return digest
+
+
+def _digest(arrays: Arrays) -> str:
+    """Hash names, types, shapes and values, not the archive, which holds dates."""
+    content = sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
+        content.update(array.tobytes())
+    return content.hexdigest()[:16]

@@ -1,0 +1,266 @@
+"""Suites: which cases, which solvers, how often and within which limits; from TOML."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from harness import checked
+from harness.errors import InputError, unknown
+from harness.names import CaseName, assemble, canonical, match
+from harness.plugin import Family, Solver
+from harness.registry import SolverSpec, resolve
+
+DEFAULTS: Mapping[str, Any] = {
+    "tolerances": [1e-6],
+    "repeats": 3,
+    "time_limit": 60,
+    "memory_limit": 4096,
+}
+_SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
+_SOLVER_KEYS = ("name", "label", "options")
+_PROBLEM_KEYS = ("family", "forms", "params", "zip")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """What one run measures: every solver on every case at every tolerance."""
+
+    name: str
+    tolerances: tuple[float, ...]
+    repeats: int
+    time_limit: float  #: s per measurement
+    memory_limit: float  #: MiB per measurement
+    solvers: tuple[SolverSpec, ...]  #: of distinct labels
+    cases: tuple[CaseName, ...]  #: all distinct
+    text: str  #: the TOML as read, but with the limits that hold
+
+
+def load_suite(
+    path: Path, families: Mapping[str, Family], solvers: Mapping[str, Solver]
+) -> Suite:
+    """Read a suite and check all of it: nothing is left to fail during the run.
+
+    Raises
+    ------
+    InputError
+        With the file and the place in it, and what would be right.
+
+    """
+    text = _read(path)
+    with checked.located(f"{path}"):
+        table = {**DEFAULTS, **_toml(text)}
+        checked.only_keys(table, _SUITE_KEYS)
+        for key in ("name", "solvers", "problems"):
+            if key not in table:
+                raise InputError(f"{key} is missing")
+        if not re.fullmatch(r"[\w.-]*\w[\w.-]*", checked.text("name", table["name"])):
+            raise InputError(
+                f"name = {table['name']!r} is no name of a folder; "
+                "expected letters, digits, '.', '-' and '_'"
+            )
+        return Suite(
+            name=table["name"],
+            tolerances=_tolerances(table["tolerances"]),
+            repeats=checked.at_least_one("repeats", table["repeats"]),
+            time_limit=checked.positive("time_limit", table["time_limit"]),
+            memory_limit=checked.positive("memory_limit", table["memory_limit"]),
+            solvers=_solvers(table["solvers"], solvers),
+            cases=_cases(table["problems"], families),
+            text=text,
+        )
+
+
+def with_overrides(
+    suite: Suite,
+    families: Mapping[str, Family],
+    registry: Mapping[str, Solver],
+    *,
+    solvers: Sequence[str] = (),
+    cases: Sequence[str] = (),
+    repeats: int | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
+) -> Suite:
+    """Narrow a suite as the options of the command line say.
+
+    solvers : labels of the suite to keep, or names of the registry to add
+    cases : shell globs over canonical names to keep
+
+    Raises
+    ------
+    InputError
+        For an unknown solver, a pattern that matches nothing, a value out of range.
+
+    """
+    changes: dict[str, Any] = {}
+    if solvers:
+        changes["solvers"] = _chosen_solvers(suite, solvers, registry)
+    if cases:
+        changes["cases"] = _chosen_cases(suite, cases, families)
+    if repeats is not None:
+        changes["repeats"] = checked.at_least_one("--repeats", repeats)
+    text = suite.text
+    for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
+        if limit is not None:
+            changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
+            text = _with_limit(text, key, limit)
+    return replace(suite, text=text, **changes)
+
+
+def _with_limit(text: str, key: str, limit: float) -> str:
+    """Set a limit in the TOML, where such keys come before those of any table.
+
+    Measurements under other limits are other measurements, unlike those of fewer
+    solvers, cases or repeats: they make another suite.
+    """
+    line = f"{key} = {limit!r}"
+    if key not in tomllib.loads(text):
+        return f"{line}\n{text}"
+    return re.sub(rf"^[ \t]*{key}[ \t]*=.*$", line, text, count=1, flags=re.MULTILINE)
+
+
+def _chosen_solvers(
+    suite: Suite, names: Sequence[str], registry: Mapping[str, Solver]
+) -> tuple[SolverSpec, ...]:
+    chosen = {spec.label: spec for spec in suite.solvers}
+    known = {label: resolve(spec, registry) for label, spec in chosen.items()}
+    for name in names:
+        if name not in chosen:
+            chosen[name] = SolverSpec(name=name, label=name)
+            with checked.located("--solver"):
+                resolve(chosen[name], {**known, **registry})
+    return tuple(chosen[name] for name in dict.fromkeys(names))
+
+
+def _chosen_cases(
+    suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
+) -> tuple[CaseName, ...]:
+    named = {canonical(case, families[case.family]): case for case in suite.cases}
+    kept: set[str] = set()
+    for pattern in patterns:
+        matched = match(pattern, named)
+        if not matched:
+            raise InputError(
+                f"--case {pattern!r} matches none of the {len(named)} cases of suite "
+                f"{suite.name!r}; the first is {next(iter(named))}"
+            )
+        kept.update(matched)
+    return tuple(case for name, case in named.items() if name in kept)
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}; expected a TOML file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not UTF-8; expected a TOML file") from None
+
+
+def _toml(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as e:  # "Expected … (at line 3, column 5)"
+        what, _, place = str(e).removesuffix(")").rpartition(" (at ")
+        raise InputError(f"{place}: {what}") from None
+
+
+def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
+    found: dict[str, SolverSpec] = {}
+    for i, entry in enumerate(checked.filled_list("solvers", entries)):
+        with checked.located(f"solvers[{i}]"):
+            spec = _spec(entry)
+            if spec.label in found:
+                raise InputError(
+                    f"label {spec.label!r} is used twice; expected a label of its own"
+                )
+            resolve(spec, registry)
+        found[spec.label] = spec
+    return tuple(found.values())
+
+
+def _spec(entry: object) -> SolverSpec:
+    if isinstance(entry, str):
+        return SolverSpec(name=entry, label=entry)
+    table = checked.table("entry", entry, instead="a name or a table")
+    checked.only_keys(table, _SOLVER_KEYS)
+    if "name" not in table:
+        raise InputError("name is missing")
+    name = checked.text("name", table["name"])
+    return SolverSpec(
+        name=name,
+        label=checked.text("label", table.get("label", name)),
+        options=checked.table("options", table.get("options", {})),
+    )
+
+
+def _cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ...]:
+    """All cases in the order written; one that two blocks share is kept once."""
+    found: dict[str, CaseName] = {}
+    for i, block in enumerate(checked.filled_list("problems", blocks)):
+        with checked.located(f"problems[{i}]"):
+            table = checked.table("entry", block)
+            checked.only_keys(table, _PROBLEM_KEYS)
+            name = checked.text("family", table.get("family", ""))
+            if name not in families:
+                raise unknown("family", name, families)
+            family = families[name]
+            forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
+            for params in _grid(table.get("params", {}), table.get("zip", [])):
+                for form in forms:
+                    case = assemble(family, params, checked.text("forms", form))
+                    found.setdefault(canonical(case, family), case)
+    return tuple(found.values())
+
+
+def _grid(params: object, groups: object) -> list[dict[str, object]]:
+    """Span the grid of `params`, first key slowest; zipped keys run together."""
+    table = checked.table("params", params)
+    columns = {
+        key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
+        for key, v in table.items()
+    }
+    zipped: dict[str, list[str]] = {}
+    for group in checked.any_list("zip", groups):
+        for key in checked.filled_list("zip", group):
+            if (
+                not isinstance(table.get(checked.text("zip", key)), list)
+                or key in zipped
+            ):
+                raise InputError(
+                    f"zip: {key!r} is no list in params, or is paired twice; "
+                    'expected groups of such keys, like [["Nr", "Nh"]]'
+                )
+            zipped[key] = group
+        if len({len(columns[key]) for key in group}) > 1:
+            lengths = ", ".join(f"{key} has {len(columns[key])}" for key in group)
+            raise InputError(f"zip: {lengths} values; expected equally many")
+    axes = []
+    for key in columns:
+        together = zipped.get(key, [key])
+        if key == min(together, key=list(columns).index):
+            rows = zip(*(columns[k] for k in together), strict=True)
+            axes.append([dict(zip(together, row, strict=True)) for row in rows])
+    return [
+        {k: v for part in point for k, v in part.items()} for point in product(*axes)
+    ]
+
+
+def _tolerances(value: object) -> tuple[float, ...]:
+    numbers = checked.filled_list("tolerances", value)
+    for number in numbers:
+        if (
+            not checked.is_number(number)
+            or not 0 < number < 1
+            or numbers.count(number) > 1
+        ):
+            raise InputError(
+                f"tolerances = {value}; expected distinct numbers between 0 and 1"
+            )
+    return tuple(map(float, numbers))

@@ -1,0 +1,78 @@
+"""What the composition root hands to the commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from harness.errors import InputError, unknown
+from harness.plugin import Family, Fields, Reference, Solver
+from harness.registry import Plugin, load_plugin, merged
+
+SUITES = Path(__file__).parents[1] / "suites"  #: of the checkout
+FORMATS = ("html", "md", "tex", "csv")  #: of a report
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workbench:
+    """What can be measured, and what to measure and show it with."""
+
+    families: Mapping[str, Family]
+    solvers: Mapping[str, Solver]
+    reference: Reference
+    report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
+    plot: Callable[[Fields, Path], None]
+    suites: Path = SUITES
+
+    def extended(self, plugin: Plugin) -> Workbench:
+        """Add the solvers and problems of a plug-in.
+
+        Raises
+        ------
+        InputError
+            When one of its names exists.
+
+        """
+        return replace(
+            self,
+            families=merged("problem", self.families, plugin.problems),
+            solvers=merged("solver", self.solvers, plugin.solvers),
+        )
+
+    def with_files(self, files: Sequence[Path]) -> Workbench:
+        """Add the plug-ins in `files`.
+
+        Raises
+        ------
+        InputError
+            When one cannot be loaded, or a name of it exists.
+
+        """
+        extended = self
+        for file in files:
+            plugin = load_plugin(file)
+            try:
+                extended = extended.extended(plugin)
+            except InputError as e:
+                raise InputError(f"{file}: {e}") from None
+        return extended
+
+    def suite_path(self, text: str) -> Path:
+        """Find a suite by path, or by its bare name among the suites of the checkout.
+
+        Raises
+        ------
+        InputError
+            When there is neither.
+
+        """
+        path = Path(text)
+        if path.is_file():
+            return path
+        if len(path.parts) > 1 or path.suffix:
+            raise InputError(f"{text}: no such file; expected a suite in TOML")
+        known = {p.stem: p for p in self.suites.glob("*.toml")}
+        if text not in known:
+            raise unknown("suite", text, known)
+        return known[text]

@@ -1,0 +1,96 @@
+"""Quadrilateral meshes with named boundaries (paper, Section 2 and Figure 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Vector
+
+Nodes = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Four-node quadrilaterals; lengths in m.
+
+    A boundary is the chain of its nodes, ordered so that the body lies on its left:
+    with the unit tangent t the outward normal is (t_y, −t_x).
+    """
+
+    points: NDArray[np.float64]  #: (N, 2)
+    cells: Nodes  #: (E, 4) counter-clockwise
+    boundaries: Mapping[str, Nodes]
+
+    @property
+    def dofs(self) -> int:
+        """Number of displacement components; node i has 2i (x) and 2i + 1 (y)."""
+        return self.points.size
+
+
+def rectangle(corner: tuple[float, float], size: tuple[float, float],
+              divisions: tuple[int, int]) -> Mesh:  # fmt: skip
+    """Mesh a rectangle by nx × ny equal cells; boundaries bottom, right, top, left."""
+    nx, ny = divisions
+    x = corner[0] + size[0] * np.arange(nx + 1) / nx
+    y = corner[1] + size[1] * np.arange(ny + 1) / ny
+    grid = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1)
+    return _structured(grid, ("bottom", "right", "top", "left"))
+
+
+def half_ring(centre: tuple[float, float], radii: tuple[float, float],
+              divisions: tuple[int, int]) -> Mesh:  # fmt: skip
+    """Mesh the upper half of a ring by equal angles × equal layers.
+
+    Boundaries: outer (from angle 0 to π), left_foot, inner, right_foot.
+    """
+    angles, layers = divisions
+    theta = np.pi * np.arange(angles + 1) / angles
+    r = radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers
+    direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    grid = np.asarray(centre) + r[:, None, None] * direction
+    return _structured(grid, ("outer", "left_foot", "inner", "right_foot"))
+
+
+def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
+    """Put bodies into one mesh that shares no node; also return each cell's body.
+
+    Boundaries keep their names where these differ between the bodies.
+    """
+    starts = np.cumsum([0] + [len(m.points) for m in meshes])
+    boundaries = {
+        name: nodes + start
+        for m, start in zip(meshes, starts, strict=False)
+        for name, nodes in m.boundaries.items()
+    }
+    cells = [m.cells + start for m, start in zip(meshes, starts, strict=False)]
+    body = np.repeat(np.arange(len(meshes)), [len(m.cells) for m in meshes])
+    points = np.concatenate([m.points for m in meshes])
+    return Mesh(points, np.concatenate(cells), boundaries), body
+
+
+def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
+    """Connect a (rows, columns, 2) grid of points; names from row 0 anticlockwise."""
+    rows, columns = grid.shape[:2]
+    i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
+    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
+    sides = (i[0], i[:, -1], i[-1, ::-1], i[::-1, 0])
+    return Mesh(
+        np.ascontiguousarray(grid.reshape(-1, 2)),
+        cells.reshape(-1, 4),
+        dict(zip(names, sides, strict=True)),
+    )
+
+
+def dofs_of(nodes: Nodes) -> Nodes:
+    """List both displacement components of each node, (2·len,)."""
+    return np.stack([2 * nodes, 2 * nodes + 1], axis=-1).ravel()
+
+
+def as_vectors(u: Vector) -> NDArray[np.float64]:
+    """See a dof vector (2N,) as one vector per node (N, 2)."""
+    return u.reshape(-1, 2)

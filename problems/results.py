@@ -1,0 +1,68 @@
+"""Physical results of a contact problem from a solution of its primal QP; SI units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import QP, Fields, Solution, Vector
+from problems.bodies import Bodies
+from problems.elasticity import elasticity_matrix
+from problems.mesh import Nodes, as_vectors, dofs_of
+from problems.stress import centre_stress, recover, von_mises
+
+ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
+
+
+def quantities(bodies: Bodies, primal: QP, s: Solution, tip: Nodes) -> dict[str, Any]:
+    """Report counts, energy, displacement at `tip`, contact forces and stresses.
+
+    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the master, −ΣBᵀλ over its
+    side, N/m. max_von_mises: per body, of the patch-recovered stress, Pa.
+    """
+    l, F = bodies.length, bodies.force
+    beam = bodies.body_of_node[bodies.master[0]]
+    forces = as_vectors(-(primal.G.T @ s.z) * F)
+    stress = nodal_von_mises(bodies, s.x * l)
+    return {
+        "nodes": len(bodies.mesh.points),
+        "elements": len(bodies.mesh.cells),
+        "dofs": bodies.mesh.dofs,
+        "equality_rows": primal.b.size,
+        "contact_rows": primal.h.size,
+        "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
+        "energy": primal.objective(s.x) * F * l,
+        "tip": (s.x[dofs_of(tip)] * l).tolist(),
+        "contact_force": forces[bodies.body_of_node == beam].sum(axis=0).tolist(),
+        "multiplier_sum": float(s.z.sum() * F),
+        "max_von_mises": {
+            name: float(stress[bodies.body_of_node == b].max())
+            for b, name in enumerate(bodies.names)
+        },
+    }
+
+
+def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
+    """Collect the deformed state for pictures."""
+    u = s.x * bodies.length
+    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force)
+    return Fields(
+        points=bodies.mesh.points,
+        cells=bodies.mesh.cells,
+        bodies=bodies.body,
+        displacement=as_vectors(u),
+        nodal={"von_mises": nodal_von_mises(bodies, u)},
+        contact_nodes=bodies.slave,
+        contact_forces=forces[bodies.slave],
+    )
+
+
+def nodal_von_mises(bodies: Bodies, u: Vector) -> NDArray[np.float64]:
+    """Recover σ_vM at the nodes (N,) from the displacement in m, Pa."""
+    matrices = [elasticity_matrix(m, bodies.plane) for m in bodies.materials]
+    D = np.stack(matrices)[bodies.body]
+    stress = recover(bodies.mesh, centre_stress(bodies.mesh, D, u))
+    nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]
+    return von_mises(stress, nu, bodies.plane)

@@ -1,0 +1,18 @@
+"""Every solver of the comparison, one line each."""
+
+from harness import Solver
+from solvers.clarabel_ import Clarabel
+from solvers.cvxpy_ import CVXPY
+from solvers.osqp_ import OSQP
+from solvers.proxqp_ import ProxQP
+from solvers.qpsolvers_ import QPSolvers
+from solvers.smalbe import SMALBE
+
+SOLVERS: dict[str, Solver] = {
+    "smalbe": SMALBE(),
+    "osqp": OSQP(),
+    "clarabel": Clarabel(),
+    "proxqp": ProxQP(),
+    "qpsolvers:*": QPSolvers(),
+    "cvxpy:*": CVXPY(),
+}

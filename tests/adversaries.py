@@ -1,0 +1,245 @@
+"""A plug-in: a family of tiny QPs, one honest solver, and solvers that misbehave.
+
+    min x₁² + ½x₂² − 4x₁ + 3x₂   s.t.   x₁ ≤ h,  x ≥ 0
+
+has, for h ≤ 2, the solution x = (h, 0) with multipliers z = 4 − 2h and z_box = (0, −3).
+Run as a program with the name of a solver and two file descriptors, it is a worker.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass, replace
+from threading import Timer
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from harness.worker import serve
+
+
+@dataclass(frozen=True)
+class Tiny:
+    name: str = "tiny"
+    forms: tuple[str, ...] = ("plain",)
+
+    @property
+    def defaults(self):
+        return {"h": 1.0, "fault": "none"}
+
+    def build(self, form, params, reference):
+        if params["fault"] == "build":
+            raise ZeroDivisionError("no stiffness")
+        if params["fault"] == "input":
+            raise InputError("tiny: fault=input is out of range")
+
+        def quantities(s):
+            if params["fault"] == "quantities":
+                raise ZeroDivisionError("no quantity")
+            return {"first": s.x[0], "all": s.x, "number": np.int64(2)}
+
+        def fields(s):
+            if params["fault"] == "fields":
+                raise ZeroDivisionError("no field")
+            square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+            return Fields(
+                points=square, cells=np.arange(4)[None], bodies=np.zeros(1, int),
+                displacement=square * s.x[0],
+            )  # fmt: skip
+
+        qp = QP(
+            P=csr_array(np.diag([2.0, 1.0])), q=np.array([-4.0, 3.0]),
+            A=no_rows(2), b=np.zeros(0),
+            G=csr_array([[1.0, 0.0]]), h=np.array([params["h"]]),
+            lb=np.zeros(2), ub=np.full(2, np.inf),
+        )  # fmt: skip
+        return Case(qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields)
+
+
+def at_the_row(qp):
+    """The point with x₁ = h and no other residual than, for h > 2, the sign of z."""
+    h = qp.h[0]
+    return Solution(
+        status=Status.SOLVED, x=np.array([h, 0.0]), y=np.zeros(0),
+        z=np.array([4 - 2 * h]), z_box=np.array([0.0, -3.0]), iterations=1,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Honest:
+    """Solves the tiny QPs with h ≤ 2; subclasses misbehave on those only."""
+
+    level: int = 3
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        if qp.q[0] != -4.0:  # the warm-up
+            return lambda: Solution.without_point(qp, Status.FAILED)
+        return lambda: self.act(qp)
+
+    def act(self, qp):
+        return at_the_row(qp)
+
+
+class Raises(Honest):
+    def act(self, qp):
+        raise ValueError("first line\nsecond line")
+
+
+class Exits(Honest):
+    def act(self, qp):
+        sys.exit(3)
+
+
+class Dies(Honest):
+    def act(self, qp):
+        print("my last words", file=sys.stderr, flush=True)
+        os._exit(7)
+
+
+class DiesLater(Honest):
+    """Answers, and ends the process a moment afterwards."""
+
+    def act(self, qp):
+        Timer(0.3, os._exit, [7]).start()
+        return replace(at_the_row(qp), counts={"process": os.getpid()})
+
+
+class Segfaults(Honest):
+    def act(self, qp):
+        ctypes.string_at(0)
+
+
+class AlwaysSegfaults(Honest):
+    """Even in the warm-up."""
+
+    def prepare(self, qp, tol):
+        ctypes.string_at(0)
+
+
+class Hangs(Honest):
+    def act(self, qp):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        while True:
+            pass
+
+
+class AlwaysHangs(Honest):
+    """Even in the warm-up."""
+
+    def prepare(self, qp, tol):
+        time.sleep(3600)
+
+
+class Prints(Honest):
+    def act(self, qp):
+        for _ in range(50):
+            print("x" * 2**20)
+        return at_the_row(qp)
+
+
+class Leaks(Honest):
+    def act(self, qp):
+        hoard = []
+        while True:
+            hoard.append(np.ones(2**20))  # 8 MiB
+            time.sleep(0.005)
+
+
+class Forks(Honest):
+    def act(self, qp):
+        child = os.fork()
+        if child == 0:
+            time.sleep(3600)
+        return replace(at_the_row(qp), counts={"child": child})
+
+
+class ReturnsTwice(Honest):
+    """Lets a child return first; tells whose child it is that returned."""
+
+    def act(self, qp):
+        if os.fork() != 0:
+            time.sleep(0.2)
+        return replace(at_the_row(qp), counts={"parent": os.getppid()})
+
+
+class WrongShape(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.zeros(3))
+
+
+class ReturnsNone(Honest):
+    def act(self, qp):
+        return None
+
+
+class ReturnsNaN(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.array([np.nan, 0.0]))
+
+
+class Zero(Honest):
+    """Claims that x = 0 is the solution."""
+
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.zeros(2), z=np.zeros(1), z_box=np.zeros(2))
+
+
+class Mutates(Honest):
+    def act(self, qp):
+        qp.q[:] = 0.0
+
+
+class MutatesByForce(Honest):
+    """Answers rightly the QP that it was given, then spoils it."""
+
+    def act(self, qp):
+        answer = at_the_row(qp)
+        for array in (qp.q, qp.h, qp.P.data):
+            array.flags.writeable = True
+            array[:] = 0.5
+        return answer
+
+
+class Warm(Honest):
+    """Needs fewer iterations when what it prepared is solved again."""
+
+    def prepare(self, qp, tol):
+        iterations = iter([9, 1, 1])
+        return lambda: replace(at_the_row(qp), iterations=next(iterations))
+
+
+class Declines(Honest):
+    def declines(self, qp):
+        return "never on a Monday"
+
+
+class Lacks(Honest):
+    def prepare(self, qp, tol):
+        import a_library_nobody_has  # noqa: F401
+
+
+class NumpyScalars(Honest):
+    """Returns what compares equal to plain numbers but is no JSON."""
+
+    def act(self, qp):
+        return replace(
+            at_the_row(qp), status="solved", iterations=np.int64(5),
+            counts={"products": np.int64(7)},
+        )  # fmt: skip
+
+
+SOLVERS = {
+    name.lower(): kind()
+    for name, kind in list(globals().items())
+    if isinstance(kind, type) and issubclass(kind, Honest)
+}
+PROBLEMS = {"tiny": Tiny()}
+
+if __name__ == "__main__":
+    serve(SOLVERS[sys.argv[1]], int(sys.argv[2]), int(sys.argv[3]))

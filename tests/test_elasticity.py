@@ -1,0 +1,125 @@
+"""Stiffness, rigid modes and stresses against exact linear elasticity."""
+
+import numpy as np
+import pytest
+from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
+from problems.mesh import as_vectors, half_ring, rectangle
+from problems.stress import centre_stress, recover, von_mises
+
+STEEL = Material(E=200e9, nu=0.3)
+
+
+def distorted(n, amplitude=0.15):
+    """Unit square of n × n quadrilaterals, smoothly distorted."""
+    mesh = rectangle((0, 0), (1, 1), (n, n))
+    x, y = mesh.points.T
+    bump = amplitude * np.sin(np.pi * x) * np.sin(np.pi * y)
+    mesh.points[:, 0] += bump
+    mesh.points[:, 1] += 0.7 * bump
+    return mesh
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        distorted(5),
+        rectangle((0, 0.5), (2, 0.25), (80, 10)),
+        half_ring((1, 0), (0.3, 0.49), (24, 4)),
+    ],
+    ids=["distorted", "beam", "ring"],
+)
+def test_plane_strain_stiffness_equals_an_independent_code(mesh):
+    reference = Basis(
+        MeshQuad(mesh.points.T.copy(), mesh.cells.T.copy()),
+        ElementVector(ElementQuad1()),
+        intorder=2,  # 2×2 Gauss
+    )
+    expected = linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(
+        reference
+    )
+
+    K = stiffness(mesh, elasticity_matrix(STEEL, "strain"))
+
+    assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
+
+
+@pytest.mark.parametrize("plane", ["strain", "stress"])
+def test_rigid_motions_cost_nothing(plane):
+    mesh = half_ring((1, 0), (0.3, 0.49), (24, 6))
+    K = stiffness(mesh, elasticity_matrix(STEEL, plane))
+    R = rigid_modes(mesh.points)
+
+    assert R.T @ R == pytest.approx(np.eye(3), abs=1e-14)
+    assert abs(K @ R).max() <= 1e-12 * abs(K).max()
+    assert np.linalg.eigvalsh(K.toarray())[3] > 1e-8 * abs(K).max()
+
+
+@pytest.mark.parametrize("plane", ["strain", "stress"])
+def test_a_linear_displacement_has_its_exact_stress_and_no_inner_force(plane):
+    """Patch test: ε = (1, −2, 3)·10⁻³ on distorted cells."""
+    mesh = distorted(5)
+    x, y = mesh.points.T
+    u = np.column_stack([1e-3 * x + 1e-3 * y, 2e-3 * x - 2e-3 * y]).ravel()
+    E, nu = STEEL.E, STEEL.nu
+    shear = E / (2 * (1 + nu)) * 3e-3
+    if plane == "stress":
+        sx = E / (1 - nu**2) * (1e-3 - 2e-3 * nu)
+        sy = E / (1 - nu**2) * (nu * 1e-3 - 2e-3)
+    else:
+        lam, mu = E * nu / ((1 + nu) * (1 - 2 * nu)), E / (2 * (1 + nu))
+        sx, sy = lam * -1e-3 + 2 * mu * 1e-3, lam * -1e-3 - 2 * mu * 2e-3
+    D = elasticity_matrix(STEEL, plane)
+    inner = np.ones(len(mesh.points), dtype=bool)
+    for nodes in mesh.boundaries.values():
+        inner[nodes] = False
+
+    stress = recover(mesh, centre_stress(mesh, D, u))
+    force = as_vectors(stiffness(mesh, D) @ u)
+
+    assert stress == pytest.approx(np.tile([sx, sy, shear], (len(mesh.points), 1)))
+    assert abs(force[inner]).max() <= 1e-10 * abs(force).max()
+
+
+def test_recovered_stress_converges_with_second_order_up_to_the_boundary():
+    """u = (sin 2x cos y, x² y) interpolated on smooth meshes; exact σ by hand."""
+    D = elasticity_matrix(Material(E=1.0, nu=0.3), "strain")
+    errors = []
+    for n in (16, 32, 64):
+        mesh = distorted(n)
+        x, y = mesh.points.T
+        u = np.column_stack([np.sin(2 * x) * np.cos(y), x**2 * y]).ravel()
+        strain = np.column_stack(
+            [
+                2 * np.cos(2 * x) * np.cos(y),
+                x**2,
+                -np.sin(2 * x) * np.sin(y) + 2 * x * y,
+            ]
+        )
+        error = recover(mesh, centre_stress(mesh, D, u)) - strain @ D
+        errors.append(abs(error).max())
+
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(2, abs=0.25)
+
+
+def test_one_layer_of_cells_gets_cell_means():
+    mesh = rectangle((0, 0), (2, 1), (2, 1))
+
+    nodal = recover(mesh, np.array([[1.0], [3.0]]))
+
+    assert nodal.ravel() == pytest.approx([1, 2, 3, 1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("stress", "plane", "expected"),
+    [
+        ((5.0, 0, 0), "stress", 5.0),  # uniaxial tension
+        ((0, 0, 2.0), "stress", 2 * np.sqrt(3)),  # pure shear
+        ((3.0, 3.0, 0), "stress", 3.0),  # equibiaxial
+        ((3.0, 3.0, 0), "strain", 3.0 * (1 - 2 * 0.3)),  # σ_z = 1.8
+    ],
+)
+def test_von_mises_of_elementary_states(stress, plane, expected):
+    assert von_mises(np.array(stress), 0.3, plane) == pytest.approx(expected)

@@ -1,0 +1,100 @@
+import json
+import os
+
+import pytest
+
+from harness import InputError, Record, Verdict
+from harness.journal import Journal, read_journal
+
+
+def record(run_id, **changes):
+    blank = Record(
+        run_id=run_id, case="tiny/plain", family="tiny", params={"h": 1.0},
+        form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
+        status=Verdict.VERIFIED,
+    )  # fmt: skip
+    return blank.but(**changes)
+
+
+def ids(folder):
+    return [r.run_id for r in read_journal(folder)]
+
+
+def test_what_is_appended_is_read_back_in_order(tmp_path):
+    first, second = record("a", gap=1e-9), record("b", status=Verdict.WRONG)
+    with Journal(tmp_path, "here") as journal:
+        journal.append(first)
+        journal.append(second)
+
+    assert read_journal(tmp_path) == [first, second]
+
+
+def test_a_line_is_on_the_disk_when_append_returns(tmp_path, monkeypatch):
+    file = tmp_path / "journal" / "here.jsonl"
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(file.read_bytes()))
+    with Journal(tmp_path, "here") as journal:
+        for run_id in "ab":
+            journal.append(record(run_id))
+
+            assert ids(tmp_path)[-1] == run_id
+            assert synced[-1] == file.read_bytes()
+
+
+def test_files_are_read_in_the_order_of_their_names(tmp_path):
+    for name in ("b", "a"):
+        with Journal(tmp_path, name) as journal:
+            journal.append(record(name))
+
+    assert ids(tmp_path) == ["a", "b"]
+
+
+def test_nan_and_inf_are_null_in_the_file(tmp_path):
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("a", gap=float("nan"), quantities={"u": [float("inf")]}))
+    row = json.loads((tmp_path / "journal" / "here.jsonl").read_text())
+
+    assert row["gap"] is None
+    assert row["quantities"] == {"u": [None]}
+
+
+@pytest.mark.parametrize("tail", ['{"schema": 1, "run', "\N{GREEK SMALL LETTER MU}"])
+def test_a_partial_last_line_is_not_read_and_cut_off_by_the_next_writer(tmp_path, tail):
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("a"))
+    file = tmp_path / "journal" / "here.jsonl"
+    file.write_bytes(file.read_bytes() + tail.encode()[:-1])
+
+    assert ids(tmp_path) == ["a"]
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("b"))
+    assert ids(tmp_path) == ["a", "b"]
+
+
+def test_a_journal_cut_at_any_byte_loses_only_the_line_that_was_cut(tmp_path):
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("a"))
+        journal.append(record("b"))
+    file = tmp_path / "journal" / "here.jsonl"
+    whole = file.read_bytes()
+    first = whole.index(b"\n") + 1
+
+    for size in range(first, len(whole)):
+        file.write_bytes(whole[:size])
+        assert ids(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("bad", ["nonsense", '{"schema": 99}', '{"schema": 1}', ""])
+def test_a_bad_line_that_is_whole_is_named(tmp_path, bad):
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("a"))
+    file = tmp_path / "journal" / "here.jsonl"
+    file.write_text(file.read_text() + bad + "\n")
+
+    with pytest.raises(InputError, match=r"here\.jsonl, line 2: "):
+        read_journal(tmp_path)
+
+
+def test_a_folder_without_journal_is_named(tmp_path):
+    with pytest.raises(InputError, match="no journal in "):
+        read_journal(tmp_path / "nowhere")

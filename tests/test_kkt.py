@@ -1,0 +1,155 @@
+"""Residuals: each KKT condition broken alone, and what must not change them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness import (
+    QP,
+    Residuals,
+    Solution,
+    Status,
+    Verdict,
+    kkt_residuals,
+    no_rows,
+    verdict,
+)
+
+
+def one_variable(q=1.0, h=0.0):
+    """min ½x² + q·x  subject to  x ≤ h."""
+    return QP(P=np.eye(1), q=np.array([q]), A=no_rows(1), b=np.zeros(0),
+              G=np.eye(1), h=np.array([h]),
+              lb=np.full(1, -np.inf), ub=np.full(1, np.inf))  # fmt: skip
+
+
+def point(x, z=0.0, z_box=0.0):
+    return Solution(status=Status.SOLVED, x=np.array([x]), y=np.zeros(0),
+                    z=np.array([z]), z_box=np.array([z_box]))  # fmt: skip
+
+
+def test_a_wrong_sign_multiplier_fails_though_the_other_residuals_vanish():
+    """x = 0, z = −1 for min ½x² + x, x ≤ 0: feasible, stationary, no gap; x* = −1."""
+    r = kkt_residuals(one_variable(), point(0.0, z=-1.0))
+
+    assert (r.primal, r.complementarity, r.gap) == (0, 0, 0)
+    assert r.dual == pytest.approx(1)
+    assert verdict(Status.SOLVED, r, 1e-2) is Verdict.WRONG
+
+
+def test_a_multiplier_on_an_absent_bound_fails():
+    r = kkt_residuals(one_variable(), point(0.0, z_box=-1.0))
+
+    assert r.dual == pytest.approx(1)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_box_multiplier_pushing_outwards_fails(sign):
+    """Active bound with the multiplier of the opposite side, kept stationary by q."""
+    qp = replace(
+        one_variable(q=-sign), h=np.array([9.0]), lb=np.zeros(1), ub=np.ones(1)
+    )
+    at = 0.0 if sign > 0 else 1.0
+    r = kkt_residuals(replace(qp, q=np.array([-sign - at])), point(at, z_box=sign))
+
+    assert r.complementarity > 0.3  # sign·slack to the other bound
+
+
+def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
+    qp = one_variable(q=-3.0, h=2.0)
+    r = kkt_residuals(qp, point(1.0, z=2.0))  # stationary, but x* = 2
+
+    assert (r.primal, r.dual) == (0, 0)
+    assert r.complementarity == pytest.approx(2 / 4)  # z·slack = 2, energy hᵀz = 4
+    assert r.gap == pytest.approx(2 / 4)
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+@pytest.mark.parametrize("condition", ["A x = b", "G x <= h", "lb <= x", "x <= ub"])
+def test_each_violated_constraint_is_measured_relative_to_its_terms(
+    planted, seed, condition
+):
+    qp, s = planted("everything", seed=seed, dense=True)
+    x_size = abs(s.x).max()
+    match condition:
+        case "A x = b":
+            broken = replace(qp, b=qp.b + 0.25)
+            scale = abs(qp.A).sum(axis=1) * x_size + abs(broken.b)
+        case "G x <= h":
+            broken = replace(qp, h=qp.G @ s.x - 0.25)
+            scale = abs(qp.G).sum(axis=1) * x_size + abs(broken.h)
+        case "lb <= x":
+            broken = replace(qp, lb=s.x + 0.25, ub=s.x + 1)
+            scale = x_size + abs(broken.lb)
+        case _:
+            broken = replace(qp, lb=s.x - 1, ub=s.x - 0.25)
+            scale = x_size + abs(broken.ub)
+
+    assert kkt_residuals(broken, s).primal == pytest.approx((0.25 / scale).max())
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_a_planted_solution_has_no_residual_and_a_moved_one_has(planted, seed):
+    qp, s = planted("everything", seed=seed, dense=True)
+
+    assert kkt_residuals(qp, s).worst < 1e-13
+    assert kkt_residuals(qp, replace(s, x=s.x * (1 + 1e-4))).worst > 1e-6
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_units_of_objective_variables_and_rows_do_not_matter(planted, seed):
+    """Objective × 2²⁰, x in units of 2⁻⁷, rows × powers of two: the same residuals."""
+    qp, s = planted("everything", seed=seed, dense=True)
+    s = replace(s, x=s.x + 1e-3, y=s.y * 1.01, z=s.z - 1e-3, z_box=s.z_box * 0.99)
+    o, u = 2.0**20, 2.0**-7
+    rA, rG = 2.0 ** np.arange(-2, 3), 2.0 ** np.arange(-8, 8, 2)
+    scaled = QP(
+        P=qp.P * (o * u * u), q=qp.q * (o * u),
+        A=rA[:, None] * qp.A * u, b=rA * qp.b, G=rG[:, None] * qp.G * u, h=rG * qp.h,
+        lb=qp.lb / u, ub=qp.ub / u,
+    )  # fmt: skip
+    same = replace(
+        s, x=s.x / u, y=s.y * o / rA, z=s.z * o / rG, z_box=s.z_box * (o * u)
+    )
+
+    assert kkt_residuals(scaled, same) == pytest.approx(kkt_residuals(qp, s), rel=1e-10)
+
+
+def test_no_point_no_residual(planted):
+    qp, _ = planted("everything", seed=271828, dense=True)
+    r = kkt_residuals(qp, Solution.without_point(qp, Status.SOLVED))
+
+    assert np.isnan(r).all()
+    assert verdict(Status.SOLVED, r, 1e-2) is Verdict.WRONG
+
+
+def test_one_nan_is_enough_to_fail(planted):
+    qp, s = planted("everything", seed=271828, dense=True)
+    y = s.y.copy()
+    y[0] = np.nan
+
+    assert not kkt_residuals(qp, replace(s, y=y)).worst <= 1
+
+
+def test_the_trivial_solution_of_a_trivial_problem_is_verified():
+    assert kkt_residuals(one_variable(q=0.0), point(0.0)).worst == 0
+
+
+@pytest.mark.parametrize(
+    ("claimed", "worst", "expected"),
+    [
+        (Status.SOLVED, 9e-8, Verdict.VERIFIED),
+        (Status.ITERATION_LIMIT, 9e-8, Verdict.VERIFIED),  # it knew less than it had
+        (Status.SOLVED, 2e-7, Verdict.INACCURATE),
+        (Status.SOLVED, 3e-4, Verdict.INACCURATE),  # half of the digits: √1e-7
+        (Status.SOLVED, 4e-4, Verdict.WRONG),
+        (Status.SOLVED, np.nan, Verdict.WRONG),
+        (Status.ITERATION_LIMIT, 2e-7, Verdict.ITERATION_LIMIT),
+        (Status.INFEASIBLE, np.nan, Verdict.INFEASIBLE_CLAIM),
+        (Status.FAILED, np.nan, Verdict.FAILED),
+        (Status.DECLINED, 0.0, Verdict.DECLINED),
+    ],
+)
+def test_the_verdict_follows_from_the_residuals_at_tol_1e_8(claimed, worst, expected):
+    assert verdict(claimed, Residuals(0, worst, 0, 0), 1e-8) is expected

@@ -1,0 +1,85 @@
+"""The clock in this process; what kills a process is in test_run.py."""
+
+import gc
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness import Status
+from harness.measure import measure
+from harness.registry import load_plugin
+
+PLUGIN = load_plugin(Path(__file__).with_name("adversaries.py"))
+
+
+@pytest.fixture
+def qp():
+    tiny = PLUGIN.problems["tiny"]
+    return tiny.build("plain", tiny.defaults, None).qp
+
+
+def outcome(solver, qp):
+    s = measure(PLUGIN.solvers[solver], qp, 1e-6).solution
+    return s.status, s.message
+
+
+@pytest.mark.parametrize(
+    ("solver", "status", "message"),
+    [
+        ("honest", Status.SOLVED, ""),
+        ("raises", Status.FAILED, "ValueError: first line second line"),
+        ("exits", Status.FAILED, "SystemExit: 3"),
+        ("mutates", Status.FAILED, "ValueError: assignment destination is read-only"),
+        ("declines", Status.DECLINED, "never on a Monday"),
+        ("returnsnone", Status.FAILED, "returned NoneType, expected Solution"),
+        ("wrongshape", Status.FAILED, "Solution.x has shape (3,), expected (2,)"),
+        (
+            "lacks",
+            Status.DECLINED,
+            "not installed: a_library_nobody_has (pip install a_library_nobody_has)",
+        ),
+    ],
+)
+def test_whatever_a_solver_does_is_a_status_and_one_line(qp, solver, status, message):
+    assert outcome(solver, qp) == (status, message)
+
+
+def test_both_phases_are_timed_and_add_up(qp):
+    m = measure(PLUGIN.solvers["honest"], qp, 1e-6)
+
+    assert m.prepare_seconds > 0
+    assert m.solve_seconds > 0
+    assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
+
+
+def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
+    class Hungry(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            np.ones(2**24)  # 128 MiB
+            return super().act(qp)
+
+    modest = PLUGIN.solvers["honest"]
+    before = measure(modest, qp, 1e-6).peak_mib
+    hungry = measure(Hungry(), qp, 1e-6).peak_mib
+    after = measure(modest, qp, 1e-6).peak_mib
+
+    assert hungry > before + 100
+    assert after < before + 50
+
+
+def test_values_that_only_look_plain_become_plain(qp):
+    s = measure(PLUGIN.solvers["numpyscalars"], qp, 1e-6).solution
+
+    assert s.status is Status.SOLVED
+    assert type(s.iterations) is int
+    assert type(s.counts["products"]) is int
+
+
+def test_garbage_is_not_collected_while_the_clock_runs(qp):
+    class Looks(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            raise ValueError(f"gc is {gc.isenabled()}")
+
+    assert measure(Looks(), qp, 1e-6).solution.message == "ValueError: gc is False"
+    assert gc.isenabled()

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from problems.mesh import half_ring, join, rectangle
+
+
+def signed_areas(mesh):
+    x, y = np.moveaxis(mesh.points[mesh.cells], -1, 0)
+    return 0.5 * (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
+
+
+def test_a_rectangle_is_covered_exactly_by_anticlockwise_cells():
+    areas = signed_areas(rectangle((0, 0.5), (2, 0.25), (8, 3)))
+
+    assert areas == pytest.approx(np.full(24, 2 * 0.25 / 24))
+
+
+def test_the_area_of_a_half_ring_converges_with_second_order():
+    exact = np.pi / 2 * (0.49**2 - 0.3**2)
+    errors = [
+        exact - signed_areas(half_ring((1, 0), (0.3, 0.49), (n, 4))).sum()
+        for n in (12, 24, 48)
+    ]
+
+    assert min(errors) > 0  # chords lie inside the arc
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(2, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [rectangle((0, 0.5), (2, 0.25), (8, 3)), half_ring((1, 0), (0.3, 0.49), (24, 4))],
+    ids=["rectangle", "half ring"],
+)
+def test_every_boundary_has_the_body_on_its_left(mesh):
+    """Summed edge normals vanish and ∮ x·n ds is twice the area (Gauss)."""
+    flux, total = 0.0, np.zeros(2)
+    for nodes in mesh.boundaries.values():
+        x = mesh.points[nodes]
+        edge = np.diff(x, axis=0)
+        normal = np.column_stack([edge[:, 1], -edge[:, 0]])
+        flux += ((x[1:] + x[:-1]) / 2 * normal).sum()
+        total += normal.sum(axis=0)
+
+    assert total == pytest.approx(0, abs=1e-14)
+    assert flux == pytest.approx(2 * signed_areas(mesh).sum())
+
+
+def test_boundaries_of_the_ring_lie_where_their_names_say():
+    ring = half_ring((1, 0), (0.3, 0.49), (24, 4))
+    x = {name: ring.points[nodes] for name, nodes in ring.boundaries.items()}
+
+    assert np.hypot(*(x["outer"] - [1, 0]).T) == pytest.approx(0.49)
+    assert np.hypot(*(x["inner"] - [1, 0]).T) == pytest.approx(0.3)
+    assert x["left_foot"] == pytest.approx(
+        np.column_stack([x["left_foot"][:, 0], 0 * x["left_foot"][:, 0]]), abs=1e-15
+    )
+    assert x["left_foot"][:, 0].max() < 1 < x["right_foot"][:, 0].min()
+
+
+def test_joined_bodies_share_no_node():
+    a, b = rectangle((0, 0), (1, 1), (2, 2)), half_ring((1, 0), (0.3, 0.49), (4, 2))
+    both, body = join((a, b))
+
+    first, second = (set(both.cells[body == i].ravel()) for i in (0, 1))
+    assert first.isdisjoint(second)
+    assert len(first) + len(second) == len(both.points)
+    assert both.points[both.boundaries["outer"]] == pytest.approx(
+        b.points[b.boundaries["outer"]]
+    )

@@ -1,0 +1,162 @@
+"""Case names: strict to read, canonical to write."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness import InputError
+from harness.names import CaseName, assemble, canonical, match, parse
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Layers derive from Nh, step from steps, as in the paper's benchmark."""
+
+    name: str = "ring"
+    defaults: Mapping = field(
+        default_factory=lambda: {
+            "Nh": 5, "layers": 0, "steps": 10, "step": 0, "size": 1.0, "plane": "strain"
+        }
+    )  # fmt: skip
+    forms: tuple = ("primal", "dual")
+
+    def complete(self, given):
+        params = {**self.defaults, **given}
+        derived = {"layers": 2 * params["Nh"], "step": params["steps"]}
+        return params | {k: v for k, v in derived.items() if k not in given}
+
+    def check(self, params):
+        if params["Nh"] < 1:
+            raise InputError(f"ring: Nh={params['Nh']} must be at least 1")
+
+
+RING = Ring()
+PLAIN = SimpleNamespace(
+    name="plain", defaults={"n": 4, "kind": "soft"}, forms=("primal",)
+)
+FAMILIES = {"ring": RING, "plain": PLAIN}
+
+
+def test_keys_left_out_take_their_defaults_in_the_family_s_order():
+    name = parse("plain/kind=hard/primal", FAMILIES)
+
+    assert name == CaseName(
+        family="plain", params={"n": 4, "kind": "hard"}, form="primal"
+    )
+    assert list(name.params) == ["n", "kind"]
+
+
+def test_a_derived_default_follows_the_key_that_it_derives_from():
+    params = parse("ring/Nh=7/steps=3/dual", FAMILIES).params
+
+    assert (params["layers"], params["step"]) == (14, 3)
+
+
+def test_the_order_is_the_family_s_whatever_completes_the_keys():
+    family = SimpleNamespace(
+        name="odd",
+        defaults={"a": 1, "b": 2},
+        forms=("primal",),
+        complete=lambda given: {"b": 2, "a": 1, **given},
+    )
+
+    name = assemble(family, {"b": 7, "a": 8}, "primal")
+
+    assert list(name.params) == ["a", "b"]
+    assert canonical(name, family) == "odd/a=8/b=7/primal"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("ring/steps=10/Nh=5/dual", "ring/dual"),
+        ("ring/step=2/Nh=7/dual", "ring/Nh=7/step=2/dual"),
+        ("ring/layers=10/primal", "ring/primal"),
+        ("ring/layers=10/Nh=7/primal", "ring/Nh=7/layers=10/primal"),
+        ("ring/layers=14/Nh=7/primal", "ring/Nh=7/primal"),
+        ("ring/steps=1/step=1/primal", "ring/steps=1/primal"),
+        ("ring/steps=20/step=10/primal", "ring/steps=20/step=10/primal"),
+        ("ring/size=1/primal", "ring/primal"),
+        ("ring/size=0.5/Nh=007/primal", "ring/Nh=7/size=0.5/primal"),
+        ("plain/kind=hard/n=+9/primal", "plain/n=9/kind=hard/primal"),
+    ],
+)
+def test_a_canonical_name_lists_what_is_not_implied_in_the_family_s_order(
+    text, expected
+):
+    name = parse(text, FAMILIES)
+
+    assert canonical(name, FAMILIES[name.family]) == expected
+
+
+@given(
+    Nh=st.integers(1, 9),
+    layers=st.integers(1, 18),
+    steps=st.integers(1, 12),
+    step=st.integers(1, 12),
+    size=st.floats(allow_nan=False, allow_infinity=False),
+    form=st.sampled_from(RING.forms),
+)
+def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
+    name = assemble(RING, params, form)
+
+    assert parse(canonical(name, RING), FAMILIES) == name
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rung/dual", "unknown family 'rung'; did you mean 'ring'? known: plain, ring"),
+        ("ring/Nhh=3/dual", "ring: unknown key 'Nhh'; did you mean 'Nh'? known: "),
+        ("ring/Nh=3/Nh=4/dual", "ring: key 'Nh' is set twice; set it once"),
+        ("ring/Nh3/dual", "ring: malformed part 'Nh3'; expected key=value"),
+        ("ring//dual", "ring: malformed part ''; expected key=value"),
+        ("ring/Nh=x/dual", "ring: Nh='x' is no integer"),
+        ("ring/Nh=3.0/dual", "ring: Nh='3.0' is no integer"),
+        ("ring/Nh=1_0/dual", "ring: Nh='1_0' is no integer"),
+        ("ring/Nh=٣/dual", "ring: Nh='٣' is no integer"),
+        ("ring/Nh=True/dual", "ring: Nh='True' is no integer"),
+        ("ring/size=wide/dual", "ring: size='wide' is no finite number"),
+        ("ring/size=nan/dual", "ring: size='nan' is no finite number"),
+        ("ring/plane=/dual", "ring: plane='' is no text"),
+        ("ring/plane=a=b/dual", "ring: plane='a=b' is no text"),
+        ("ring/Nh=0/dual", "ring: Nh=0 must be at least 1"),
+        ("ring/duel", "ring: unknown form 'duel'; did you mean 'dual'?"),
+        ("ring/Nh=3", "ring/Nh=3: no form at the end; expected one of primal, dual"),
+        ("ring", "ring: no form at the end; expected one of primal, dual"),
+        ("", "unknown family ''"),
+    ],
+)
+def test_what_is_wrong_with_a_name_is_said_in_one_line(text, message):
+    with pytest.raises(InputError) as e:
+        parse(text, FAMILIES)
+
+    assert str(e.value).startswith(message)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("Nh", 3.0), ("Nh", True), ("size", True), ("plane", 3)]
+)
+def test_a_typed_value_of_another_type_is_refused(key, value):
+    with pytest.raises(InputError, match=f"ring: {key}={value} is no "):
+        assemble(RING, {key: value}, "dual")
+
+
+def test_an_integer_will_do_where_the_default_is_a_float():
+    size = assemble(RING, {"size": 2}, "dual").params["size"]
+
+    assert (size, type(size)) == (2.0, float)
+
+
+def test_patterns_are_shell_globs_over_the_whole_name_with_case():
+    names = ["ring/Nh=3/dual", "ring/Nh=13/dual", "ring/Nh=3/primal"]
+
+    assert match("*/dual", names) == names[:2]
+    assert match("ring/Nh=3/*", names) == [names[0], names[2]]
+    assert match("ring/nh=3/*", names) == []
+    assert match("ring/Nh=3", names) == []

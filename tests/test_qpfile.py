@@ -1,0 +1,130 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import aslinearoperator
+
+from harness import QP, InputError, no_rows
+from harness.qpfile import load_qp, save_qp
+
+P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+def make_qp(P, A=None):
+    return QP(
+        P=P, q=np.array([1.0, -2.0, 0.5]),
+        A=no_rows(3) if A is None else A, b=np.zeros(0 if A is None else A.shape[0]),
+        G=csr_array([[0.0, 1.0, -1.0]]), h=np.array([4.0]),
+        lb=np.array([-np.inf, 0.0, -1.0]), ub=np.array([np.inf, np.inf, 1.0]),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """A good file, and a way to spoil one array of it."""
+    path = tmp_path / "qp.npz"
+    save_qp(path, make_qp(csr_array(P)), {"name": "three"})
+
+    def spoil(**changes):
+        with np.load(path) as stored:
+            arrays = {k: stored[k] for k in stored.files} | changes
+        np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+        return path
+
+    return spoil
+
+
+@pytest.mark.parametrize("kind", [csr_array, csc_array, np.asarray, aslinearoperator])
+def test_a_qp_comes_back_whatever_holds_its_matrix(tmp_path, kind):
+    qp = make_qp(kind(P))
+    save_qp(tmp_path / "qp.npz", qp, {"name": "three"})
+    loaded, meta = load_qp(tmp_path / "qp.npz")
+
+    assert meta["name"] == "three"
+    np.testing.assert_array_equal(loaded.P @ np.eye(3), P)
+    np.testing.assert_array_equal(loaded.G.toarray(), qp.G.toarray())
+    assert loaded.A.shape == (0, 3)
+    for name in ("q", "b", "h", "lb", "ub"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(qp, name))
+
+
+@pytest.mark.parametrize(
+    ("kind", "dense"),
+    [(csr_array, False), (np.asarray, True), (aslinearoperator, True)],
+)
+def test_dense_matrices_come_back_dense_and_sparse_ones_as_csc(tmp_path, kind, dense):
+    save_qp(tmp_path / "qp.npz", make_qp(kind(P), A=np.ones((2, 3))), {})
+    loaded, meta = load_qp(tmp_path / "qp.npz")
+
+    assert meta["dense"] == (["P", "A"] if dense else ["A"])
+    assert isinstance(loaded.P, np.ndarray if dense else csc_array)
+    assert isinstance(loaded.A, np.ndarray)
+    assert isinstance(loaded.G, csc_array)
+
+
+def test_the_file_is_what_the_interface_promises(saved):
+    with np.load(saved(), allow_pickle=False) as stored:
+        parts = {f"{M}_{part}" for M in "PGA" for part in
+                 ("data", "indices", "indptr", "shape")}  # fmt: skip
+
+        assert set(stored.files) == {"q", "h", "b", "lb", "ub", "meta"} | parts
+        assert json.loads(str(stored["meta"]))["name"] == "three"
+        # by columns: (2, 1), (1, 3), and an empty one; both triangles
+        assert stored["P_data"].tolist() == [2, 1, 1, 3]
+        assert stored["P_indices"].tolist() == [0, 1, 0, 1]
+        assert stored["P_indptr"].tolist() == [0, 2, 4, 4]
+        assert stored["P_shape"].tolist() == [3, 3]
+
+
+def test_a_file_name_is_taken_as_it_is(tmp_path):
+    save_qp(tmp_path / "qp.data", make_qp(csr_array(P)), {})
+
+    assert [f.name for f in tmp_path.iterdir()] == ["qp.data"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"h": None, "G_indptr": None}, "h, G_indptr missing"),
+        ({"meta": None}, "meta missing"),
+        ({"meta": np.array("[1]")}, "meta is no JSON object"),
+        ({"meta": np.array("{")}, "Expecting property name"),
+        ({"q": np.zeros(2)}, r"QP.P has shape \(3, 3\), expected \(2, 2\)"),
+        ({"q": np.array(["a", "b", "c"])}, "q is of type <U1; expected numbers"),
+        ({"q": np.array([1.0, np.nan, 0.0])}, "QP.q holds NaN or inf"),
+        ({"lb": np.full(3, 2.0)}, "bounds cross"),
+        ({"P_indices": np.array([0, 1, 0, 7])}, "P is no matrix in CSC parts"),
+        ({"P_indices": np.array([0.0, 1, 0, 1])}, "must hold integers"),
+        ({"P_indptr": np.array([0, 2])}, "P is no matrix in CSC parts"),
+        ({"P_shape": np.array([3])}, "P is no matrix in CSC parts"),
+        ({"P_data": np.array([2.0, np.nan, 1, 3])}, "P_data holds NaN or inf"),
+    ],
+)
+def test_a_malformed_file_is_named_with_what_is_wrong(saved, changes, complaint):
+    path = saved(**changes)
+
+    with pytest.raises(InputError, match=complaint) as caught:
+        load_qp(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_other_files_are_refused_and_never_unpickled(tmp_path):
+    text, single, pickled = (tmp_path / name for name in ("text", "one", "pickled"))
+    text.write_text("P = 1\n")
+    with single.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pickled.open("wb") as file:
+        np.savez(file, q=np.array([print], dtype=object))
+
+    for path in (text, single, pickled):
+        with pytest.raises(InputError, match="not an npz file of plain arrays"):
+            load_qp(path)
+    with pytest.raises(InputError, match="nowhere: No such file"):
+        load_qp(tmp_path / "nowhere")
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        save_qp(tmp_path / "no" / "folder.npz", make_qp(csr_array(P)), {})

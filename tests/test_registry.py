@@ -1,0 +1,260 @@
+"""Solvers by name, options by name and type, plug-ins by path."""
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from harness import InputError, registry
+from harness.registry import (
+    SolverSpec,
+    entry_point_plugins,
+    load_plugin,
+    merged,
+    options_of,
+    resolve,
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    max_iter: int = 200
+    alpha: float = 1.5
+    scaling: bool = True
+    mode: str = "fast"
+    seed: int | None = None
+
+    def __post_init__(self):
+        if self.max_iter < 1:
+            raise ValueError("max_iter must be positive,\ngot less")
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Generic(Method):
+    backend: str = ""
+
+    def backends(self):
+        return ("daqp", "scs")
+
+
+@dataclass(frozen=True)
+class Open(Method):
+    """A generic adapter that cannot list its backends."""
+
+    backend: str = ""
+
+
+SOLVERS = {
+    "method": Method(),
+    "method-slow": Method(max_iter=9),
+    "generic:*": Generic(),
+    "open:*": Open(),
+    "open:tuned": Open(backend="tuned", alpha=9.0),
+}
+
+
+def spec(name, **options):
+    return SolverSpec(name=name, label=name, options=options)
+
+
+def test_an_exact_name_gives_that_entry_with_its_options_replaced():
+    assert resolve(spec("method-slow"), SOLVERS) is SOLVERS["method-slow"]
+    assert resolve(spec("method-slow", alpha=2), SOLVERS) == Method(9, 2.0)
+    assert SOLVERS["method-slow"] == Method(9)
+
+
+def test_a_wildcard_entry_takes_the_text_after_the_colon_as_backend():
+    solver = resolve(spec("generic:scs", max_iter=7), SOLVERS)
+
+    assert solver == Generic(backend="scs", max_iter=7)
+    assert resolve(spec("open:anything"), SOLVERS) == Open(backend="anything")
+
+
+def test_an_exact_entry_goes_before_the_wildcard():
+    assert resolve(spec("open:tuned"), SOLVERS).alpha == 9.0
+
+
+def test_an_integer_option_of_a_float_field_becomes_a_float():
+    alpha = resolve(spec("method", alpha=2), SOLVERS).alpha
+
+    assert isinstance(alpha, float)
+
+
+def test_a_field_that_is_none_accepts_anything():
+    assert resolve(spec("method", seed=7), SOLVERS).seed == 7
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (spec("metod"), "unknown solver 'metod'; did you mean 'method'? known: "),
+        (spec("other:scs"), "unknown solver 'other:scs'; "),
+        (spec("generic"), "unknown solver 'generic'; did you mean 'generic:*'? "),
+        (
+            spec("generic:dapq"),
+            "unknown backend of generic 'dapq'; did you mean 'daqp'? known: daqp, scs",
+        ),
+        (spec("open:*"), "open:* names no backend; write open:NAME"),
+        (spec("open:"), "open: names no backend; write open:NAME"),
+        (
+            spec("method", max_itr=9),
+            "method: unknown option 'max_itr'; did you mean 'max_iter'? known: ",
+        ),
+        (spec("generic:scs", backend="daqp"), "generic:scs: unknown option 'backend'"),
+        (
+            spec("method", max_iter=9.0),
+            "method: max_iter = 9.0 is of type float; expected int",
+        ),
+        (
+            spec("method", max_iter=True),
+            "method: max_iter = True is of type bool; expected int",
+        ),
+        (
+            spec("method", alpha=True),
+            "method: alpha = True is of type bool; expected float",
+        ),
+        (
+            spec("method", scaling=1),
+            "method: scaling = 1 is of type int; expected bool",
+        ),
+        (spec("method", mode=1), "method: mode = 1 is of type int; expected str"),
+        (spec("method", max_iter=0), "method: max_iter must be positive, got less"),
+    ],
+)
+def test_what_is_wrong_with_a_solver_is_said_in_one_line(asked, message):
+    with pytest.raises(InputError) as e:
+        resolve(asked, SOLVERS)
+
+    assert str(e.value).startswith(message)
+    assert "\n" not in str(e.value)
+
+
+def test_options_are_all_fields_with_their_values():
+    assert options_of(Method(max_iter=9)) == {
+        "max_iter": 9, "alpha": 1.5, "scaling": True, "mode": "fast", "seed": None
+    }  # fmt: skip
+    assert options_of(object()) == {}
+
+
+PLUGIN = """
+from __future__ import annotations
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Mine:
+    tries: int = 3
+    def declines(self, qp): return None
+    def prepare(self, qp, tol): raise NotImplementedError
+
+SOLVERS = {"mine": Mine(), "mine-9": Mine(9)}
+"""
+
+
+def test_a_file_with_a_frozen_dataclass_is_a_plugin(tmp_path):
+    file = tmp_path / "plug.py"
+    file.write_text(PLUGIN)
+
+    plugin = load_plugin(file)
+
+    assert options_of(plugin.solvers["mine-9"]) == {"tries": 9}
+    assert plugin.problems == {}
+
+
+def test_plugins_of_the_same_file_name_do_not_mix(tmp_path):
+    files = [tmp_path / folder / "plug.py" for folder in "ab"]
+    for tries, file in enumerate(files):
+        file.parent.mkdir()
+        file.write_text(PLUGIN.replace("= 3", f"= {tries}"))
+
+    solvers = [load_plugin(file).solvers["mine"] for file in files]
+
+    assert [s.tries for s in solvers] == [0, 1]
+    assert type(solvers[0]).__module__ != type(solvers[1]).__module__
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "import nothing_of_that_name",
+            "failed to import: ModuleNotFoundError: No mod",
+        ),
+        ("raise RuntimeError('two\\nlines')", "failed to import: RuntimeError: two li"),
+        ("def", "failed to import: SyntaxError: "),
+        ("raise SystemExit(3)", "failed to import: SystemExit: 3"),
+        ("solvers = {}", "defines neither SOLVERS nor PROBLEMS"),
+        ("SOLVERS = [1]", "SOLVERS is of type list; expected dict"),
+        ("SOLVERS = {'a': 1}", "SOLVERS['a'] is of type int; expected a solver"),
+        (PLUGIN + "SOLVERS = {3: Mine()}", "SOLVERS[3] is of type Mine; expected a s"),
+        (PLUGIN + "SOLVERS = {'a': Mine}", "SOLVERS['a'] is a class; expected an inst"),
+        ("PROBLEMS = {'a': 1}", "PROBLEMS['a'] is of type int; expected a family"),
+        (
+            "from types import SimpleNamespace as S\n"
+            "PROBLEMS = {'a': S(name='b', defaults={}, forms=(), build=None)}",
+            "PROBLEMS['a'] is named 'b'; expected the same name twice",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_plugin_is_said_in_one_line(tmp_path, text, message):
+    file = tmp_path / "plug.py"
+    file.write_text(text)
+
+    with pytest.raises(InputError) as e:
+        load_plugin(file)
+
+    assert str(e.value).startswith(f"{file}: {message}")
+    assert "\n" not in str(e.value)
+
+
+def test_a_plugin_that_fails_to_import_leaves_no_half_module(tmp_path):
+    file = tmp_path / "half.py"
+    file.write_text("raise RuntimeError")
+
+    with pytest.raises(InputError):
+        load_plugin(file)
+
+    assert not [name for name in sys.modules if name.startswith("plugin_half")]
+
+
+def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
+    text = tmp_path / "plug.txt"
+    text.write_text(PLUGIN)
+
+    with pytest.raises(InputError, match=r"gone\.py: no such file; expected a Python"):
+        load_plugin(tmp_path / "gone.py")
+    with pytest.raises(InputError, match=r"plug\.txt: no Python file; its name must"):
+        load_plugin(text)
+
+
+def test_entry_points_are_solvers_under_their_names(monkeypatch):
+    def installed(*, group):
+        here = [EntryPoint("mine", "fractions:Fraction.from_float", group)]
+        return here if group == "mortarbench.solvers" else []
+
+    monkeypatch.setattr(registry, "entry_points", installed)
+
+    with pytest.raises(InputError, match=r"entry points: SOLVERS\['mine'\] is of "):
+        entry_point_plugins()
+
+
+def test_an_entry_point_that_fails_to_import_is_named(monkeypatch):
+    broken = EntryPoint("mine", "nothing_of_that_name:X", "mortarbench.solvers")
+    monkeypatch.setattr(registry, "entry_points", lambda *, group: [broken])
+
+    with pytest.raises(
+        InputError, match="entry point nothing_of_that_name:X: failed to import: Mod"
+    ):
+        entry_point_plugins()
+
+
+def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
+    assert merged("solver", {"a": 1}, {"b": 2}) == {"a": 1, "b": 2}
+    with pytest.raises(InputError, match="solver 'a' of the plug-in exists"):
+        merged("solver", {"a": 1}, {"a": 2})

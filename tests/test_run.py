@@ -1,0 +1,354 @@
+"""Whole runs: of solvers that misbehave, interrupted, resumed, on shared folders."""
+
+import json
+import logging
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from harness import InputError, Status, Verdict
+from harness.journal import read_journal
+from harness.names import CaseName
+from harness.registry import SolverSpec, load_plugin, resolve
+from harness.run import run
+from harness.store import load_fields, load_solution
+from harness.suite import Suite
+
+PLUGIN = Path(__file__).with_name("adversaries.py")
+SOLVERS = load_plugin(PLUGIN).solvers
+FAMILIES = load_plugin(PLUGIN).problems
+
+
+class Tally:
+    """A progress that remembers what it was told."""
+
+    def __init__(self, interrupt_after=None):
+        self.total = None
+        self.records = []
+        self.skipped = 0
+        self._left = interrupt_after
+
+    def start(self, total):
+        self.total = total
+
+    def say(self, text):
+        pass
+
+    def advance(self, record):
+        if record is None:
+            self.skipped += 1
+            return
+        self.records.append(record)
+        if self._left is not None and len(self.records) == self._left:
+            raise KeyboardInterrupt
+
+
+def suite(*solvers, cases=({},), **changes):
+    defaults = FAMILIES["tiny"].defaults
+    fixed = Suite(
+        name="test",
+        tolerances=(1e-6,),
+        repeats=1,
+        time_limit=30.0,
+        memory_limit=2000.0,
+        solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
+        cases=tuple(
+            CaseName(family="tiny", params={**defaults, **case}, form="plain")
+            for case in cases
+        ),
+        text='name = "test"\n',
+    )
+    return replace(fixed, **changes)
+
+
+@pytest.fixture
+def measure(tmp_path):
+    """Run a suite in worker processes and return what it told while doing so."""
+
+    def measure(suite, *, interrupt_after=None, digest="here", fresh=False):
+        tally = Tally(interrupt_after)
+        run(
+            suite,
+            families=FAMILIES,
+            reference=None,
+            out=tmp_path,
+            command=lambda spec: [
+                sys.executable, "-P", str(PLUGIN), spec.name
+            ],
+            resolve=lambda spec: resolve(spec, SOLVERS),
+            environment={"machine": "test"},
+            digest=digest,
+            progress=tally,
+            fresh=fresh,
+        )  # fmt: skip
+        return tally
+
+    return measure
+
+
+OUTCOMES = {
+    "honest": (Verdict.VERIFIED, "solved", ""),
+    "raises": (Verdict.FAILED, "failed", "ValueError: first line second line"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3"),
+    "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
+    "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
+    "hangs": (Verdict.TIME_LIMIT, None, "killed after 1 s"),
+    "prints": (Verdict.VERIFIED, "solved", ""),
+    "leaks": (Verdict.MEMORY_LIMIT, None, None),
+    "forks": (Verdict.VERIFIED, "solved", ""),
+    "wrongshape": (
+        Verdict.FAILED, "failed", "Solution.x has shape (3,), expected (2,)",
+    ),
+    "returnsnone": (
+        Verdict.FAILED, "failed", "returned NoneType, expected Solution",
+    ),
+    "returnsnan": (Verdict.WRONG, "solved", ""),
+    "zero": (Verdict.WRONG, "solved", ""),
+    "mutates": (
+        Verdict.FAILED, "failed", "ValueError: assignment destination is read-only",
+    ),
+    "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
+    "declines": (Verdict.DECLINED, "declined", "never on a Monday"),
+}  # fmt: skip
+
+
+def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
+    measure, tmp_path
+):
+    cases = [{"h": 0.5}, {"h": 1.0}]
+    measure(suite(*OUTCOMES, cases=cases, time_limit=1.0, memory_limit=300.0))
+    records = read_journal(tmp_path)
+
+    assert len(records) == 2 * len(OUTCOMES)
+    for case in ("tiny/h=0.5/plain", "tiny/plain"):
+        got = {r.solver: r for r in records if r.case == case}
+        for solver, (status, claimed, message) in OUTCOMES.items():
+            assert (got[solver].status, got[solver].claimed) == (status, claimed), case
+            assert message in (None, got[solver].message)
+
+
+def test_a_verified_record_holds_what_was_measured_and_what_the_case_says(
+    measure, tmp_path
+):
+    measure(suite("honest", cases=[{"h": 0.5}]))
+    (r,) = read_journal(tmp_path)
+
+    assert r.objective == 0.25 - 2.0
+    assert r.quantities == {"first": 0.5, "all": [0.5, 0.0], "number": 2}
+    assert r.sizes == {"variables": 2, "equalities": 0, "inequalities": 1, "bounds": 2}
+    assert r.params == {"h": 0.5, "fault": "none"}
+    assert r.options == {"level": 3}
+    assert max(r.primal, r.dual, r.complementarity, r.gap) == 0
+    assert r.peak_mib > 10
+    assert r.environment == "here"
+    assert load_solution(tmp_path, r.vectors, Status.SOLVED).x.tolist() == [0.5, 0.0]
+    assert load_fields(tmp_path, r.fields).displacement[2].tolist() == [0.5, 0.5]
+
+
+def test_a_multiplier_of_the_wrong_sign_is_wrong(measure, tmp_path):
+    measure(suite("honest", cases=[{"h": 3.0}]))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.status, r.claimed) == (Verdict.WRONG, "solved")
+    assert r.primal == r.complementarity == r.gap == 0 < r.dual
+    assert r.vectors is not None
+    assert r.fields is None
+
+
+def test_a_point_with_nan_has_neither_quantities_nor_vectors(measure, tmp_path):
+    measure(suite("returnsnan"))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.objective, r.vectors, r.quantities) == (None, None, {})
+
+
+def test_repeats_are_cold_and_the_state_is_stored_for_the_first_only(measure, tmp_path):
+    measure(suite("warm", repeats=3))
+    records = read_journal(tmp_path)
+
+    assert [r.iterations for r in records] == [9, 9, 9]
+    assert [r.repeat for r in records] == [0, 1, 2]
+    assert len({r.vectors for r in records}) == 1
+    assert [r.fields is None for r in records] == [False, True, True]
+
+
+def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
+    two = suite("declines", "honest", repeats=2, tolerances=(1e-4, 1e-6))
+    tally = measure(two)
+    refusals = [r for r in read_journal(tmp_path) if r.solver == "declines"]
+
+    assert [(r.tol, r.repeat) for r in refusals] == [(1e-4, 0), (1e-6, 0)]
+    assert (tally.total, len(tally.records), tally.skipped) == (8, 6, 2)
+    assert measure(two).records == []
+
+
+def test_a_block_is_every_solver_once_in_an_order_that_changes(measure, tmp_path):
+    names = ("honest", "warm", "zero", "mutatesbyforce")
+    measure(suite(*names, repeats=6))
+    records = read_journal(tmp_path)
+    blocks = [[r for r in records if r.block == i] for i in range(6)]
+
+    assert all(sorted(r.solver for r in block) == sorted(names) for block in blocks)
+    assert all(len({r.repeat for r in block}) == 1 for block in blocks)
+    assert len({tuple(r.solver for r in block) for block in blocks}) > 1
+    assert [r.block for r in records] == sorted(r.block for r in records)
+
+
+def test_the_schedule_is_the_same_every_time(measure, tmp_path):
+    twice = suite("honest", "warm", "zero", repeats=3)
+    orders = []
+    for _ in range(2):
+        measure(twice, fresh=True)
+        orders.append([r.run_id for r in read_journal(tmp_path)])
+
+    assert orders[0] == orders[1]
+
+
+def test_run_ids_tell_every_cell_apart_and_equal_cells_alike(measure, tmp_path):
+    cells = suite(
+        "honest", cases=[{}, {"h": 0.5}], tolerances=(1e-4, 1e-6), repeats=2,
+        solvers=(
+            SolverSpec(name="honest", label="a"),
+            SolverSpec(name="honest", label="b"),
+            SolverSpec(name="honest", label="c", options={"level": 5}),
+        ),
+    )  # fmt: skip
+    measure(cells)
+    first = {r.run_id for r in read_journal(tmp_path)}
+    renamed = suite("honest", solvers=(replace(cells.solvers[2], options={}),))
+    measure(renamed, fresh=True)
+    (other,) = read_journal(tmp_path)
+
+    assert len(first) == 2 * 2 * 2 * 3
+    assert other.run_id not in first  # other options, same label
+
+
+@pytest.mark.parametrize("cut", [1, 50, 3000])
+def test_a_run_cut_off_continues_with_each_measurement_exactly_once(
+    measure, tmp_path, cut
+):
+    whole = suite("honest", "dies", "declines", repeats=2, cases=[{}, {"h": 0.5}])
+    measure(whole)
+    (file,) = (tmp_path / "journal").iterdir()
+    before = [r.run_id for r in read_journal(tmp_path)]
+    file.write_bytes(file.read_bytes()[:-cut])
+    kept = len(read_journal(tmp_path))
+
+    tally = measure(whole)
+    after = [r.run_id for r in read_journal(tmp_path)]
+
+    assert kept < len(before) == 10
+    assert len(tally.records) == 10 - kept
+    assert len(tally.records) + tally.skipped == tally.total == 12
+    assert sorted(after) == sorted(before)
+    assert len(set(after)) == 10
+
+
+def test_an_interrupted_run_leaves_a_whole_journal_and_continues(measure, tmp_path):
+    whole = suite("honest", "zero", repeats=3)
+    with pytest.raises(KeyboardInterrupt):
+        measure(whole, interrupt_after=2)
+    assert len(read_journal(tmp_path)) == 2
+
+    assert len(measure(whole).records) == 4
+    assert len({r.run_id for r in read_journal(tmp_path)}) == 6
+
+
+def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
+    whole = suite("honest", "zero", repeats=2)
+    with pytest.raises(KeyboardInterrupt):
+        measure(whole, interrupt_after=1)
+    measure(whole)
+
+    assert [r.block for r in read_journal(tmp_path)] == [0, 1, 2, 2]
+
+
+def test_a_case_that_cannot_be_built_costs_its_own_records_only(
+    measure, tmp_path, caplog
+):
+    with caplog.at_level(logging.WARNING):
+        measure(suite("honest", "zero", cases=[{"fault": "build"}, {}], repeats=2))
+    records = read_journal(tmp_path)
+    lost = [r for r in records if r.params["fault"] == "build"]
+
+    assert len(lost) == 4
+    assert {(r.status, r.message) for r in lost} == {
+        (Verdict.FAILED, "case could not be built: ZeroDivisionError: no stiffness")
+    }
+    assert sum(r.status is Verdict.VERIFIED for r in records) == 2
+    assert "no stiffness" in caplog.text
+
+
+def test_a_case_that_is_refused_ends_the_run(measure):
+    with pytest.raises(InputError, match="out of range"):
+        measure(suite("honest", cases=[{"fault": "input"}]))
+
+
+@pytest.mark.parametrize(
+    ("fault", "note"),
+    [
+        ("quantities", "no quantities: ZeroDivisionError: no quantity"),
+        ("fields", "no fields: ZeroDivisionError: no field"),
+    ],
+)
+def test_what_a_case_cannot_evaluate_costs_a_note(measure, tmp_path, fault, note):
+    measure(suite("honest", cases=[{"fault": fault}]))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.status, r.message) == (Verdict.VERIFIED, note)
+    assert r.vectors is not None
+
+
+def test_the_folder_tells_suite_and_environment(measure, tmp_path):
+    measure(suite("honest"))
+
+    assert (tmp_path / "suite.toml").read_text() == 'name = "test"\n'
+    environment = json.loads((tmp_path / "environment.json").read_text())
+    assert environment == {"digest": "here", "machine": "test"}
+    assert (tmp_path / "journal" / "here.jsonl").exists()
+
+
+def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_path):
+    measure(suite("honest"))
+    (tmp_path / "notes.txt").write_text("mine")
+
+    other = suite("zero", text='name = "other"\n')
+    with pytest.raises(InputError, match=r"holds another suite .* --fresh"):
+        measure(other)
+    with pytest.raises(InputError, match=r"another environment \(here, now there\)"):
+        measure(suite("honest"), digest="there")
+    assert [r.solver for r in read_journal(tmp_path)] == ["honest"]
+
+    measure(other, digest="there", fresh=True)
+    assert [r.solver for r in read_journal(tmp_path)] == ["zero"]
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
+    measure, tmp_path
+):
+    hold = (
+        "import sys; from pathlib import Path; from harness.folder import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", hold, str(tmp_path)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as first:  # fmt: skip
+        assert first.stdout.readline() == b"held\n"
+        with pytest.raises(InputError, match="is being written by another run"):
+            measure(suite("honest"), fresh=True)
+        first.stdin.close()
+        first.wait()
+
+    assert len(measure(suite("honest")).records) == 1
+
+
+def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
+    (tmp_path / ".lock").mkdir()
+
+    with pytest.raises(InputError, match="expected a folder that can be written"):
+        measure(suite("honest"))

@@ -1,0 +1,228 @@
+"""SMALBE: its path, its invariants and the problems that break such solvers."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from harness import QP, Status, kkt_residuals, no_rows
+from solvers.projected import orthonormal_rows, projected_problem
+from solvers.smalbe import SMALBE, first_iterate, smalbe
+from solvers.spectrum import norm_estimate
+
+
+def bounded(P, q, A=None, b=(), lb=-np.inf, ub=np.inf):
+    q = np.asarray(q, dtype=float)
+    n = q.size
+    lb, ub = np.broadcast_to(lb, n).astype(float), np.broadcast_to(ub, n).astype(float)
+    return QP(
+        P=np.asarray(P, dtype=float), q=q,
+        A=no_rows(n) if A is None else np.asarray(A, dtype=float),
+        b=np.asarray(b, dtype=float), G=no_rows(n), h=np.zeros(0),
+        lb=lb, ub=ub,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def dual():
+    """A dual of a floating body: F of rank n − 2, λ ≥ 0 on the second half, Gλ = e."""
+
+    def draw(seed, n=30, r=3):
+        rng = np.random.default_rng(seed)
+        W = rng.standard_normal((n, n - 2))
+        G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
+        lb = np.where(np.arange(n) < n // 2, -np.inf, 0.0)
+        return bounded(W @ W.T / n, rng.standard_normal(n), G, G @ x, lb=lb)
+
+    return draw
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
+def test_what_is_claimed_is_true(dual, seed, tol):
+    qp = dual(seed)
+    s = SMALBE().prepare(qp, tol)()
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 10 * tol
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+@pytest.mark.parametrize("exponent", [-30, 30])
+def test_scaling_the_objective_changes_no_step(dual, seed, exponent):
+    """By a power of two, hence in exact arithmetic."""
+    qp, factor = dual(seed), 2.0**exponent
+    scaled = replace(qp, P=qp.P * factor, q=qp.q * factor)
+    plain, large = (SMALBE().prepare(p, 1e-8)() for p in (qp, scaled))
+
+    assert large.counts == plain.counts
+    assert (large.x == plain.x).all()
+    assert large.y == pytest.approx(plain.y * factor, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_scaled_repeated_and_zero_rows_of_G_change_no_answer(dual, seed):
+    qp = dual(seed)
+    mix = np.vstack(
+        [1e6 * qp.A[0], qp.A[1], 1e-6 * qp.A[2], qp.A.sum(axis=0), 0 * qp.A[0]]
+    )
+    e = np.array([1e6 * qp.b[0], qp.b[1], 1e-6 * qp.b[2], qp.b.sum(), 0.0])
+    plain, mixed = (
+        SMALBE().prepare(qp, 1e-10)(),
+        SMALBE().prepare(replace(qp, A=mix, b=e), 1e-10)(),
+    )
+
+    assert mixed.status is Status.SOLVED
+    assert qp.objective(mixed.x) == pytest.approx(qp.objective(plain.x), rel=1e-8)
+    assert mix.T @ mixed.y == pytest.approx(qp.A.T @ plain.y, abs=1e-7)
+
+
+def test_rows_that_contradict_each_other_are_reported():
+    qp = bounded(np.eye(3), np.ones(3), [[1, 1, 0], [2, 2, 0]], [1, 3])
+    s = SMALBE().prepare(qp, 1e-8)()
+
+    assert s.status is Status.INFEASIBLE
+    assert "contradict" in s.message
+
+
+def test_every_product_with_F_is_counted(dual):
+    qp = dual(271828)
+    products = []
+
+    class Counting:
+        shape, dtype = qp.P.shape, qp.P.dtype
+
+        def __matmul__(self, v):
+            products.append(v)
+            return qp.P @ v
+
+    s = SMALBE().prepare(replace(qp, P=Counting()), 1e-8)()
+
+    assert s.counts["P_products"] == len(products)
+
+
+def test_products_are_explained_by_the_steps(dual):
+    """10 Lanczos, homogenisation, start gradient; 1 per c or p, 2 per e, 3 per f; the
+    residual on the original problem and its check."""
+    s = SMALBE().prepare(dual(271828), 1e-8)()
+    c = s.counts
+
+    steps = c.get("cg", 0) + c.get("proportioning", 0)
+    steps += 2 * c.get("expansion", 0) + 3 * c.get("fallback", 0)
+    assert c["P_products"] == 10 + 1 + 1 + steps + 2
+
+
+def test_with_equalities_only_it_agrees_with_the_saddle_point_system():
+    rng = np.random.default_rng(271828)
+    W, A, b = rng.standard_normal((12, 12)), rng.standard_normal((3, 12)), rng.random(3)
+    qp = bounded(W @ W.T, rng.standard_normal(12), A, b)
+    K = np.block([[qp.P, A.T], [A, np.zeros((3, 3))]])
+    exact = np.linalg.solve(K, np.concatenate([-qp.q, b]))
+
+    s = SMALBE().prepare(qp, 1e-11)()
+
+    assert s.x == pytest.approx(exact[:12], abs=1e-8)
+    assert s.y == pytest.approx(exact[12:], abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("qp", "x"),
+    [
+        (bounded([[1.0]], [-10.0], lb=0.0, ub=1.0), [1.0]),
+        (bounded(np.eye(3), np.zeros(3), lb=0.0), [0, 0, 0]),
+        (bounded(np.eye(3), np.zeros(3), lb=[1.0, -1.0, -np.inf]), [1, 0, 0]),
+        (bounded(np.eye(3), np.ones(3), lb=0.0), [0, 0, 0]),
+        (bounded(np.eye(3), -np.ones(3), lb=0.0), [1, 1, 1]),
+        # x̃ = (0.2, −0.6) lies outside the bounds
+        (bounded(np.diag([1.0, 4.0]), [0, 0], [[1.0, -3.0]], [2.0], lb=0.0), [2, 0]),
+        # e = 0 with the solution at the corner
+        (bounded(np.eye(2), [1.0, 1.0], [[1.0, -1.0]], [0.0], lb=0.0), [0, 0]),
+    ],
+    ids=["two-sided", "q = 0", "q = 0, shifted bound", "all active", "none active",
+         "infeasible shift", "e = 0"],
+)  # fmt: skip
+def test_degenerate_problems_have_their_solutions(qp, x):
+    s = SMALBE().prepare(qp, 1e-10)()
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx(x, abs=1e-8)
+    assert kkt_residuals(qp, s).worst <= 1e-9
+
+
+def test_too_few_steps_are_not_called_solved(dual):
+    qp = dual(271828)
+    needed = SMALBE().prepare(qp, 1e-8)().iterations
+    s = SMALBE(max_steps=needed // 2).prepare(qp, 1e-8)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.iterations == needed // 2
+    assert "step limit" in s.message
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_M_shrinks_while_the_lagrangian_grows_too_little(dual, seed):
+    """And at no other time; checked from the recorded L, ‖Cν‖ and M."""
+    problem, options = projected_problem(dual(seed), 10), SMALBE(M=1e3, eta=1e9)
+    outer = smalbe(problem, options, 1e-8, first_iterate(problem, options)).outer
+
+    needed = [options.rho / 2 * o.infeasibility**2 for o in outer[1:]]
+    grown = np.diff([o.lagrangian for o in outer])
+    cut = [later.M < o.M for o, later in pairwise(outer[1:])]
+    assert cut == (grown < needed)[:-1].tolist()
+    assert True in cut
+    assert False in cut
+
+
+def test_the_carried_gradient_is_the_gradient(dual):
+    problem = projected_problem(dual(271828), 10)
+    options = SMALBE()
+    end = smalbe(problem, options, 1e-6, first_iterate(problem, options))
+    C = problem.rows.C
+
+    fresh = problem.H(end.nu, options.rho) - problem.b + C.T @ end.mu
+    assert end.g == pytest.approx(fresh, abs=1e-13)
+
+
+def test_the_projected_problem_is_normalised_and_projected(dual):
+    qp = dual(271828)
+    problem = projected_problem(qp, 30)
+    C = problem.rows.C
+    H = np.column_stack([problem.H(v, 0.0) for v in np.eye(30)])
+
+    assert C @ C.T == pytest.approx(np.eye(3), abs=1e-14)
+    assert np.linalg.norm(H, 2) == pytest.approx(1, rel=1e-6)
+    assert abs(H @ C.T).max() < 1e-14
+    assert abs(C @ problem.b).max() < 1e-14
+    assert qp.A @ problem.rows.x_tilde == pytest.approx(qp.b)
+
+
+def test_rank_is_found_among_badly_scaled_rows():
+    G = np.array([[1e8, 0, 0, 0], [1e-8, 1e-8, 0, 0], [1, 1, 0, 0]])
+    rows = orthonormal_rows(G, G @ np.array([1.0, 2.0, 3.0, 4.0]))
+
+    assert len(rows.C) == 2
+    assert rows.consistent
+    assert rows.x_tilde == pytest.approx([1, 2, 0, 0])
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+def test_a_short_lanczos_process_bounds_the_norm_closely_from_above(seed):
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((60, 60))
+    H = W @ W.T
+    norm = np.linalg.norm(H, 2)
+
+    assert norm * (1 - 1e-12) <= norm_estimate(lambda v: H @ v, 60, 12) <= 1.25 * norm
+
+
+def test_the_norm_of_a_low_rank_operator_ends_early():
+    u = np.arange(1.0, 6.0)
+
+    assert norm_estimate(lambda v: u * (u @ v), 5, 10) == pytest.approx(u @ u)
+
+
+def test_inequality_rows_are_declined_with_a_way_out(planted):
+    qp, _ = planted("inequalities")
+
+    assert "dualise" in SMALBE().declines(qp)

@@ -1,0 +1,54 @@
+#!/usr/bin/env bash
+# Make .venv ready: system packages, virtual environment, pinned Python packages.
+# Usage: tools/setup.sh PYTHON   (called by make; does only what is missing)
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=$1
+
+die() { echo "setup: $*" >&2; exit 1; }
+has_package() { dpkg-query -W -f='${Status}' "$1" 2>/dev/null | grep -q ' installed$'; }
+has_python() { "$python" -c "$1" >/dev/null 2>&1; }
+has_headers='import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")'
+
+missing_packages() {
+    local package
+    for package in libsuitesparse-dev libopenblas0-pthread gcc g++; do
+        has_package "$package" || echo "$package"
+    done
+    command -v "$python" >/dev/null || echo python3
+    has_python 'import ensurepip, venv' || echo python3-venv
+    has_python "$has_headers" || echo python3-dev
+}
+
+install_packages() {
+    local install=(apt-get install -y --no-install-recommends "$@") as_root=()
+    if [ "$(id -u)" -ne 0 ]; then
+        as_root=(sudo -n)
+        sudo -n true 2>/dev/null ||
+            die "missing system packages; run: sudo ${install[*]}"
+    fi
+    echo "setup: installing $*"
+    "${as_root[@]}" apt-get update -qq || echo "setup: apt-get update failed; going on" >&2
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq >/dev/null ||
+        die "could not install system packages; run: sudo ${install[*]}"
+}
+
+if command -v dpkg-query >/dev/null; then
+    mapfile -t missing < <(missing_packages)
+    [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
+else
+    echo "setup: no dpkg here; needed from this system: SuiteSparse 5.x with headers," \
+        "an optimised BLAS (OpenBLAS), a C and C++ compiler, Python headers"
+fi
+
+has_python 'import sys; assert sys.version_info >= (3, 11)' ||
+    die "need Python >= 3.11, got $("$python" --version 2>&1 || true);" \
+        "name another one: make PYTHON=python3.12"
+.venv/bin/python -m pip --version >/dev/null 2>&1 ||
+    "$python" -m venv --clear .venv ||
+    die "could not make .venv with $python"
+
+# The variables pin what wheels are built with, too (new pip reads the second).
+echo "setup: installing Python packages into .venv"
+export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_BUILD_CONSTRAINT="$PWD/constraints.txt"
+.venv/bin/python -m pip install -q --disable-pip-version-check -e '.[dev]'
