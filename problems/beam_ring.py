@@ -19,16 +19,16 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csc_array
 
-from harness import Case, InputError, Reference, Value
-from problems.bodies import Bodies, assemble, floating
-from problems.dual import Transformed, dualise
+from harness import Case, InputError, Reference, Value, Vector
+from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.contact import ContactRows, node_to_segment
 from problems.elasticity import Material, Plane
-from problems.inverse import GeneralisedInverse, regular_inverse
-from problems.mesh import half_ring, rectangle
-from problems.results import fields, quantities
-from problems.stepping import LoadPath, dual_bounds
+from problems.emit import FORMS, contact_case
+from problems.inverse import GeneralisedInverse
+from problems.mesh import dofs_of, half_ring, join, rectangle
+from problems.results import quantities
+from problems.stepping import LoadPath
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -48,7 +48,7 @@ class BeamRing:
         }),
         hash=False,
     )  # fmt: skip
-    forms: tuple[str, ...] = ("primal", "dual", "dual-bounds")
+    forms: tuple[str, ...] = FORMS
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in the keys left out; radial defaults to 2·Nh, step to steps."""
@@ -81,25 +81,16 @@ class BeamRing:
         p: Any = params
         geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
         bodies = model(*geometry)
-        path = _path(geometry, p["steps"], p["relin"], reference)
-        primal = path.primal(p["step"])
-        match form:
-            case "primal":
-                new = Transformed(primal, lambda s: s, 1.0, 0.0)
-            case "dual":
-                new = dualise(primal, _floating(*geometry))
-            case _:
-                new = dual_bounds(primal, _clamped(*geometry))
-        tip = np.intersect1d(bodies.mesh.boundaries["top"],
-                             bodies.mesh.boundaries["right"])  # fmt: skip
-        return Case(
-            qp=new.qp,
-            recover=lambda s: new.recover(s).x * LENGTH,
-            quantities=lambda s: quantities(bodies, primal, new.recover(s), tip),
-            fields=lambda s: fields(bodies, primal, new.recover(s)),
-            scale=new.sign * LOAD * LENGTH,
-            constant=new.constant * LOAD * LENGTH,
-        )
+        primal = _path(geometry, p["steps"], p["relin"], reference).primal(p["step"])
+        sides = bodies.mesh.boundaries
+        tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+        return contact_case(
+            bodies, primal, form,
+            floating=lambda: _floating(*geometry),
+            clamped=lambda: _clamped(*geometry),
+            quantities=lambda s: quantities(bodies, primal, s)
+            | {"tip": (s.x[tip] * LENGTH).tolist()},
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=4)
@@ -107,12 +98,15 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     """Mesh and assemble beam (8Nr × Nr) and ring (12Nh × radial)."""
     beam = rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr))
     ring = half_ring((1.0, 0.0), (0.3, 0.49), (12 * Nh, radial))
+    mesh, body = join((beam, ring))
+    sides = mesh.boundaries
+    clamps = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
+    load = np.zeros(mesh.dofs)
+    load[2 * np.intersect1d(sides["top"], sides["right"]) + 1] = -LOAD
     return assemble(
-        (beam, ring), ("beam", "ring"), (BEAM, RING), plane=plane,
-        units=(LENGTH, LOAD),
-        fixed=("left", "left_foot", "right_foot"),
-        load=("top", "right", (0.0, -LOAD)),
-        contact=("outer", "bottom"),
+        mesh, body, names=("beam", "ring"), materials=(BEAM, RING), plane=plane,
+        units=(LENGTH, LOAD), fixed=np.concatenate(clamps), load=load,
+        pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
 
 
@@ -123,13 +117,16 @@ def _floating(*geometry: Any) -> GeneralisedInverse:
 
 @lru_cache(maxsize=4)
 def _clamped(*geometry: Any) -> GeneralisedInverse:
-    bodies = model(*geometry)
-    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
-    return regular_inverse(csc_array(bodies.K)[free][:, free])
+    return clamped(model(*geometry))
 
 
 @lru_cache(maxsize=4)
 def _path(
     geometry: tuple[Any, ...], steps: int, relin: int, reference: Reference
 ) -> LoadPath:
-    return LoadPath(model(*geometry), _clamped(*geometry), reference, steps, relin)
+    bodies = model(*geometry)
+
+    def linearise(u: Vector) -> ContactRows:
+        return node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
+
+    return LoadPath(bodies, linearise, _clamped(*geometry), reference, steps, relin)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array
+from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-from harness import Vector
+from harness import InputError, Vector
 from problems.elasticity import (
     Material,
     Plane,
@@ -20,8 +22,16 @@ from problems.inverse import (
     GeneralisedInverse,
     fixing_nodes,
     floating_inverse,
+    regular_inverse,
 )
-from problems.mesh import Mesh, Nodes, dofs_of, join
+from problems.mesh import Mesh, Nodes
+
+
+class ContactPair(NamedTuple):
+    """Two sides that may touch."""
+
+    slave: Nodes  #: chain of nodes; each may get a contact row
+    master: Nodes  #: chain of nodes, its body on the left
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,8 +52,7 @@ class Bodies:
     K: csc_array  #: (n, n)
     f: Vector  #: (n,) full load
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component
-    slave: Nodes  #: each gets a contact row
-    master: Nodes  #: chain of nodes, its body on the left
+    pairs: tuple[ContactPair, ...]  #: sides that may touch
 
     @property
     def body_of_node(self) -> NDArray[np.int64]:
@@ -54,38 +63,35 @@ class Bodies:
 
 
 def assemble(
-    meshes: tuple[Mesh, ...],
+    mesh: Mesh,
+    body: NDArray[np.int64],
+    *,
     names: tuple[str, ...],
     materials: tuple[Material, ...],
-    *,
     plane: Plane,
     units: tuple[float, float],
-    fixed: tuple[str, ...],
-    load: tuple[str, str, tuple[float, float]],
-    contact: tuple[str, str],
+    fixed: Nodes,
+    load: Vector,
+    pairs: tuple[ContactPair, ...],
 ) -> Bodies:
-    """Assemble bodies from meshes whose boundaries have distinct names.
+    """Assemble the bodies of a joined mesh.
 
     Parameters
     ----------
+    body : (E,) of each cell
+    names, materials : per body
     units : (l, F₀) of the non-dimensional QPs, m and N/m
-    fixed : boundaries clamped in both components
-    load : two boundaries whose common node carries the force (F_x, F_y) in N/m
-    contact : slave and master boundary
+    fixed : displacement components that are zero
+    load : (2N,) nodal forces, N/m
 
     """
-    mesh, body = join(meshes)
     length, force = units
     D = np.stack([elasticity_matrix(m, plane) for m in materials])[body]
-    clamped = np.concatenate([dofs_of(mesh.boundaries[b]) for b in fixed])
-    f = np.zeros(mesh.dofs)
-    corner = np.intersect1d(mesh.boundaries[load[0]], mesh.boundaries[load[1]])
-    f[dofs_of(corner)] = np.asarray(load[2]) / force
     return Bodies(
         mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-        length=length, force=force, K=stiffness(mesh, D) * (length / force), f=f,
-        B_D=csr_array(eye_array(mesh.dofs, format="csr")[clamped]),
-        slave=mesh.boundaries[contact[0]], master=mesh.boundaries[contact[1]],
+        length=length, force=force, K=stiffness(mesh, D) * (length / force),
+        f=load / force, B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]),
+        pairs=pairs,
     )  # fmt: skip
 
 
@@ -95,3 +101,22 @@ def floating(bodies: Bodies) -> GeneralisedInverse:
     parts = [points[owner == b] for b in range(len(bodies.names))]
     kernels = [rigid_modes(part) for part in parts]
     return floating_inverse(bodies.K, kernels, [fixing_nodes(part) for part in parts])
+
+
+def clamped(bodies: Bodies) -> GeneralisedInverse:
+    """Factorise K without the prescribed components, which must hold every body.
+
+    Raises
+    ------
+    InputError
+        When a rigid motion of some body is left.
+
+    """
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
+    try:
+        return regular_inverse(bodies.K[free][:, free])
+    except CholmodNotPositiveDefiniteError:
+        raise InputError(
+            "the supports leave a rigid motion of some body, so dual-bounds does not "
+            "exist; expected form primal or dual"
+        ) from None

@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from harness import QP, Fields, Solution, Vector
 from problems.bodies import Bodies
 from problems.elasticity import elasticity_matrix
-from problems.mesh import Nodes, as_vectors, dofs_of
+from problems.mesh import as_vectors
 from problems.stress import centre_stress, recover, von_mises
 
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
 
-def quantities(bodies: Bodies, primal: QP, s: Solution, tip: Nodes) -> dict[str, Any]:
-    """Report counts, energy, displacement at `tip`, contact forces and stresses.
+def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
+    """Report counts, energy, contact forces and stresses.
 
-    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the master, −ΣBᵀλ over its
-    side, N/m. max_von_mises: per body, of the patch-recovered stress, Pa.
+    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master,
+    −ΣBᵀλ, N/m. max_von_mises: per body, of the patch-recovered stress, Pa.
     """
     l, F = bodies.length, bodies.force
-    beam = bodies.body_of_node[bodies.master[0]]
-    forces = as_vectors(-(primal.G.T @ s.z) * F)
+    held = bodies.body_of_node == bodies.body_of_node[bodies.pairs[0].master[0]]
+    forces = contact_forces(bodies, primal, s)
     stress = nodal_von_mises(bodies, s.x * l)
     return {
         "nodes": len(bodies.mesh.points),
@@ -34,8 +34,7 @@ def quantities(bodies: Bodies, primal: QP, s: Solution, tip: Nodes) -> dict[str,
         "contact_rows": primal.h.size,
         "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
         "energy": primal.objective(s.x) * F * l,
-        "tip": (s.x[dofs_of(tip)] * l).tolist(),
-        "contact_force": forces[bodies.body_of_node == beam].sum(axis=0).tolist(),
+        "contact_force": forces[held].sum(axis=0).tolist(),
         "multiplier_sum": float(s.z.sum() * F),
         "max_von_mises": {
             name: float(stress[bodies.body_of_node == b].max())
@@ -47,16 +46,21 @@ def quantities(bodies: Bodies, primal: QP, s: Solution, tip: Nodes) -> dict[str,
 def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
     """Collect the deformed state for pictures."""
     u = s.x * bodies.length
-    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force)
+    slaves = np.concatenate([pair.slave for pair in bodies.pairs])
     return Fields(
         points=bodies.mesh.points,
         cells=bodies.mesh.cells,
         bodies=bodies.body,
         displacement=as_vectors(u),
         nodal={"von_mises": nodal_von_mises(bodies, u)},
-        contact_nodes=bodies.slave,
-        contact_forces=forces[bodies.slave],
+        contact_nodes=slaves,
+        contact_forces=contact_forces(bodies, primal, s)[slaves],
     )
+
+
+def contact_forces(bodies: Bodies, primal: QP, s: Solution) -> NDArray[np.float64]:
+    """Return the contact forces −Bᵀλ on the nodes (N, 2), N/m."""
+    return as_vectors(-(primal.G.T @ s.z) * bodies.force)
 
 
 def nodal_von_mises(bodies: Bodies, u: Vector) -> NDArray[np.float64]:

@@ -7,15 +7,19 @@ With relin = 1 this is the paper's scheme, of first order in 1/steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from harness import QP, Reference, Vector
 from problems.bodies import Bodies
-from problems.contact import node_to_segment
+from problems.contact import ContactRows
 from problems.dual import Transformed, dualise, eliminate
 from problems.inverse import GeneralisedInverse
+
+
+Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +27,7 @@ class LoadPath:
     """The load steps of one analysis; what was solved once is remembered."""
 
     bodies: Bodies
+    linearise: Linearise
     clamped: GeneralisedInverse  #: of K without the prescribed components
     reference: Reference
     steps: int
@@ -33,8 +38,8 @@ class LoadPath:
         """Emit the QP of step k (1 … steps), as last linearised."""
         u = self.solution(k - 1)
         for _ in range(self.relin - 1):
-            u = self._solve(primal_qp(self.bodies, u, k / self.steps))
-        return primal_qp(self.bodies, u, k / self.steps)
+            u = self._solve(self._linearised(u, k))
+        return self._linearised(u, k)
 
     def solution(self, k: int) -> Vector:
         """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
@@ -43,19 +48,22 @@ class LoadPath:
             self._solutions.append(self._solve(following))
         return self._solutions[k - 1] if k else np.zeros(self.bodies.mesh.dofs)
 
+    def _linearised(self, u: Vector, k: int) -> QP:
+        rows = self.linearise(u * self.bodies.length)
+        return primal_qp(self.bodies, rows, k / self.steps)
+
     def _solve(self, primal: QP) -> Vector:
         dual = dual_bounds(primal, self.clamped)
         return dual.recover(self.reference(dual.qp)).x
 
 
-def primal_qp(bodies: Bodies, u: Vector, load_factor: float) -> QP:
-    """Emit  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M,  linearised at u; (1)."""
-    l, n = bodies.length, bodies.mesh.dofs
-    rows = node_to_segment(bodies.mesh.points, u * l, bodies.slave, bodies.master)
+def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
+    """Emit  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M  without dimensions; (1)."""
+    n = bodies.mesh.dofs
     return QP(
         P=bodies.K, q=-load_factor * bodies.f,
         A=bodies.B_D, b=np.zeros(bodies.B_D.shape[0]),
-        G=rows.B, h=rows.c / l,
+        G=rows.B, h=rows.c / bodies.length,
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
 

@@ -28,12 +28,12 @@ def physical(case, solver, tol):
 
 def test_counts_of_table_1():
     bodies = model(30, 15, 30, "strain")
-    beam = bodies.body == 0
+    beam, (pair,) = bodies.body == 0, bodies.pairs
 
     assert len(bodies.mesh.points) == 7471 + 5611 == 13082
     assert (beam.sum(), (~beam).sum()) == (7200, 5400)
     assert bodies.mesh.dofs == 14942 + 11222 == 26164
-    assert (len(bodies.master) - 1, len(bodies.slave) - 1) == (240, 180)
+    assert (len(pair.master) - 1, len(pair.slave) - 1) == (240, 180)
     assert bodies.B_D.shape[0] == 186
 
 
