@@ -102,8 +102,7 @@ def stiffness(mesh: Mesh, D: NDArray[np.float64]) -> csc_array:
 
 def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
     """List the dofs of each cell, (E, 8)."""
-    dofs: NDArray[np.int64] = dofs_of(mesh.cells.ravel()).reshape(-1, 8)
-    return dofs
+    return dofs_of(mesh.cells.ravel()).reshape(-1, 8)
 
 
 def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -116,4 +115,5 @@ def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     R = np.zeros((points.size, 3))
     R[0::2, 0] = R[1::2, 1] = 1
     R[0::2, 2], R[1::2, 2] = -y, x
-    return R / np.linalg.norm(R, axis=0)
+    R /= np.linalg.norm(R, axis=0)
+    return R

@@ -18,7 +18,6 @@ from problems.contact import ContactRows
 from problems.dual import Transformed, dualise, eliminate
 from problems.inverse import GeneralisedInverse
 
-
 Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
 
 
