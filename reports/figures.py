@@ -1,0 +1,225 @@
+"""One style for all figures, the scaling and accuracy plots, and saving them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from harness.kkt import VERIFIED_FACTOR
+from reports.data import Evidence, Outcome
+from reports.scaling import Ladder
+from reports.wording import clean, exponent
+
+INK = "#20242a"  #: text and axes; the page replaces it by its own text colour
+PAPER = "white"
+#: Okabe & Ito's colours without yellow and black: distinct for colour-blind readers.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)), (0, (1, 1)))
+
+STYLE: Any = {
+    "font.family": ["STIXGeneral", "DejaVu Sans"],
+    "mathtext.fontset": "stix",
+    "font.size": 9.5,
+    "axes.titlesize": 9.5,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.facecolor": "none",
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 4.5,
+    "figure.facecolor": "none",
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 220,
+    "svg.hashsalt": "mortarbench",
+    "svg.fonttype": "path",
+    "pdf.fonttype": 42,
+}
+_METADATA: dict[str, dict[str, Any]] = {
+    ".pdf": {"CreationDate": None},
+    ".svg": {"Date": None},
+}
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure in the format of the file's ending, the same bytes every time."""
+    with rc_context(STYLE):
+        figure.savefig(path, facecolor=PAPER, metadata=_METADATA.get(path.suffix, {}))
+    return path
+
+
+def inline_svg(figure: Figure, name: str) -> str:
+    """Draw a figure as an <svg> element that takes its ink from the page around it.
+
+    Identifiers get the prefix `name`, so that several figures fit in one page.
+    """
+    buffer = StringIO()
+    with rc_context(STYLE):
+        figure.savefig(buffer, format="svg", facecolor="none", metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
+    svg = re.sub(r"<(metadata|style)\b.*?</\1>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = svg.replace("url(#", f"url(#{name}-")
+    return re.sub(r'href="#', f'href="#{name}-', svg)
+
+
+def legible(label: str) -> str:
+    """Make a foreign name fit for a figure: letters that the font has, no mathematics.
+
+    matplotlib reads $…$ as a formula and hides labels that begin with an underscore.
+    """
+    known = "".join(
+        c if c.isascii() or "\u00a0" < c <= "\u00ff" else "?" for c in clean(label, 32)
+    )
+    escaped = known.replace("$", r"\$")
+    return f" {escaped}" if escaped.startswith("_") else escaped
+
+
+def look(index: int, *, line: bool = True) -> dict[str, Any]:
+    """Colour, marker and dashes of the index-th solver; distinct in grey print too."""
+    return {
+        "color": COLOURS[index % len(COLOURS)],
+        "marker": MARKERS[index % len(MARKERS)],
+        "linestyle": DASHES[index % len(DASHES)] if line else "none",
+    }
+
+
+def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
+    """Draw total time and iterations against n on logarithmic axes."""
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.9, 3.1))
+        left, right = figure.subplots(1, 2)
+        for solver in ladder.solvers:
+            style = look(solvers.index(solver))
+            _times(left, ladder, solver, style=style)
+            counted = [
+                (n, sum(o.iterations) / 2)
+                for n, o in ladder.curve(solver)
+                if o.iterations is not None
+            ]
+            if counted:
+                right.plot(*zip(*counted, strict=True), **style)
+        _finish(left, "degrees of freedom $n$", "total time in s")
+        _slopes(left)
+        _finish(right, "degrees of freedom $n$", "iterations")
+        handles, labels = left.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    return figure
+
+
+def _times(axes: Axes, ladder: Ladder, solver: str, *, style: dict[str, Any]) -> None:
+    """Plot medians with their intervals, and the exponent in the legend."""
+    timed = [(n, o.seconds("total")) for n, o in ladder.curve(solver)]
+    points = [(n, t.value, t.low, t.high) for n, t in timed if t is not None]
+    if not points:
+        return
+    n, t, low, high = np.array(points, dtype=float).T
+    law = ladder.time_law(solver)
+    label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
+    axes.plot(n, t, label=label, **style)
+    axes.errorbar(
+        n, t, yerr=[t - low, high - t], fmt="none", color=style["color"], capsize=2,
+        elinewidth=0.7,
+    )  # fmt: skip
+
+
+def _finish(axes: Axes, xlabel: str, ylabel: str) -> None:
+    """Make both axes logarithmic, with labels that leave each other room."""
+    axes.loglog()
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(visible=True, which="major", color="#8a93a0", alpha=0.3, linewidth=0.4)
+    axes.set_axisbelow(True)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        decades = np.log10(high / low)
+        axis.set_minor_formatter(NullFormatter())
+        if decades < 1.8:
+            few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
+            axis.set_major_locator(few)
+            axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+
+
+def _slopes(axes: Axes) -> None:
+    """Draw guides of slopes 1 and 3/2 through the lower right of the plot."""
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    start, stop = x0 * (x1 / x0) ** 0.62, x0 * (x1 / x0) ** 0.9
+    base = y0 * (y1 / y0) ** 0.04
+    for slope, name in ((1.0, "$n$"), (1.5, "$n^{3/2}$")):
+        end = base * (stop / start) ** slope
+        axes.plot([start, stop], [base, end], color=INK, linewidth=0.6, zorder=1)
+        axes.annotate(
+            name, (stop, end), xytext=(2, 0), textcoords="offset points", va="center",
+            fontsize=8.5,
+        )  # fmt: skip
+    axes.set(xlim=(x0, x1), ylim=(y0, y1))
+
+
+def accuracy_figure(evidence: Evidence) -> Figure | None:
+    """Draw the accuracy reached against the time spent, verified answers filled."""
+    shown = [o for o in evidence.flat if o.worst is not None and o.seconds("total")]
+    if not shown:
+        return None
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.9, 3.2))
+        axes = figure.subplots()
+        for index, solver in enumerate(evidence.solvers):
+            mine = [o for o in shown if o.solver == solver]
+            style = look(index, line=False)
+            _scatter(axes, [o for o in mine if o.verified], style=style)
+            refuted = {**style, "markerfacecolor": "none"}
+            _scatter(axes, [o for o in mine if not o.verified], style=refuted)
+        axes.axhline(VERIFIED_FACTOR, color=INK, linewidth=0.8)
+        axes.annotate(
+            "verified below",
+            (0.995, VERIFIED_FACTOR),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, -3),
+            textcoords="offset points",
+            va="top",
+            ha="right",
+            fontsize=8.5,
+        )
+        _finish(axes, "median total time in s", "worst residual / tolerance")
+        names = list(dict.fromkeys(o.solver for o in shown))
+        keys = [
+            Line2D([], [], **look(evidence.solvers.index(s), line=False)) for s in names
+        ]
+        figure.legend(
+            keys,
+            [legible(s) for s in names],
+            loc="outside right upper",
+        )
+    return figure
+
+
+def _scatter(axes: Axes, outcomes: list[Outcome], *, style: dict[str, Any]) -> None:
+    """Plot (median time, worst residual / tolerance), zero raised to 1e-10."""
+    points = [
+        (t.value, max((o.worst or 0.0) / o.tol, 1e-10))
+        for o in outcomes
+        if (t := o.seconds("total")) is not None
+    ]
+    if points:
+        axes.plot(*zip(*points, strict=True), alpha=0.85, **style)

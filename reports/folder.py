@@ -1,0 +1,174 @@
+"""Write the report of a result folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from harness import Fields
+from harness.errors import unknown
+from harness.store import load_fields
+from reports.data import Evidence, Outcome, read_evidence
+from reports.figures import accuracy_figure, save, scaling_figure
+from reports.latex import latex
+from reports.layout import Page, Picture, Section
+from reports.markdown import markdown
+from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
+from reports.page import html
+from reports.physics import agreement, physics
+from reports.results import claims, errors, iterations, times
+from reports.scaling import Ladder, ladders, scaling
+from reports.setting import definitions, environment
+from reports.sheets import sheets
+from reports.summary import dateline, summary
+from reports.wording import clean, tolerance
+
+FORMATS = ("html", "md", "tex", "csv")
+
+
+def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
+    """Write DIR/report from DIR's journal; the same journal gives the same bytes.
+
+    html: index.html. md: report.md. tex, csv: tables/. Figures (pdf, svg, png) go to
+    figures/ along with html, md or tex.
+
+    Raises
+    ------
+    InputError
+        For an unknown format, or a folder that holds no measurements.
+
+    """
+    for name in formats:
+        if name not in FORMATS:
+            raise unknown("report format", name, FORMATS)
+    evidence = read_evidence(directory)
+    target = directory / "report"
+    written: list[Path] = []
+    if {"html", "md", "tex"} & set(formats):
+        page = compose(evidence)
+        if "html" in formats:
+            written.append(_write(target / "index.html", html(page)))
+        if "md" in formats:
+            written.append(_write(target / "report.md", markdown(page)))
+        if "tex" in formats:
+            written += [
+                _write(target / "tables" / f"{s.name}.tex", latex(s.tables))
+                for s in page.sections
+                if s.tables
+            ]
+        written += _figures(page, target / "figures")
+    if "csv" in formats:
+        written += [
+            _write(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
+            for name, frame in sheets(evidence).items()
+        ]
+    return written
+
+
+def compose(evidence: Evidence) -> Page:
+    """Put the report together, summary first."""
+    found = ladders(evidence)
+    sections = (
+        summary(evidence),
+        claims(evidence),
+        replace(times(evidence), pictures=_accuracy(evidence)),
+        iterations(evidence),
+        errors(evidence),
+        agreement(evidence),
+        _grown(found, evidence),
+        physics(evidence),
+        deformed(evidence),
+        environment(evidence),
+        definitions(),
+    )
+    return Page(
+        title=clean(evidence.name),
+        dateline=dateline(evidence),
+        sections=tuple(s for s in sections if s is not None),
+    )
+
+
+def _accuracy(evidence: Evidence) -> tuple[Picture, ...]:
+    figure = accuracy_figure(evidence)
+    if figure is None:
+        return ()
+    caption = (
+        "Accuracy reached against time spent, one mark per case, tolerance and solver. "
+        "Filled: verified; hollow: not."
+    )
+    return (Picture(name="accuracy", caption=caption, figure=figure),)
+
+
+def _grown(found: Sequence[Ladder], evidence: Evidence) -> Section | None:
+    """Tables and figures of every ladder of sizes; None where there is none."""
+    section = scaling(found)
+    if section is None:
+        return None
+    pictures = tuple(
+        Picture(
+            name=f"scaling-{i}",
+            caption=f"Growth of time and iterations: {ladder.title}. Bars: interval of "
+            "the median. p: exponent of the time with its 95 % interval.",
+            figure=scaling_figure(ladder, evidence.solvers),
+        )
+        for i, ladder in enumerate(found, 1)
+    )
+    return replace(section, pictures=pictures)
+
+
+def deformed(evidence: Evidence) -> Section | None:
+    """Draw the largest verified case; None where no deformed state was stored."""
+    drawable = [o for o in evidence.flat if o.verified and o.first.fields]
+    if not drawable:
+        return None
+    chosen = max(drawable, key=_importance)
+    fields = load_fields(evidence.directory, chosen.first.fields or "")
+    picture = Picture(
+        name="deformed",
+        caption=_caption(chosen, fields),
+        figure=deformed_figure(fields),
+    )
+    return Section(name="deformed", title="Deformed bodies", pictures=(picture,))
+
+
+def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
+    """Order by size, then load step, then accuracy; names break ties."""
+    step = outcome.first.params.get("step", 0)
+    size = outcome.size("dofs") or 0
+    last = float(step) if isinstance(step, int | float) else 0.0
+    return (size, last, -outcome.tol, outcome.first.form, outcome.solver)
+
+
+def _caption(outcome: Outcome, fields: Fields) -> str:
+    caption = (
+        f"{clean(outcome.case)}: the largest verified case, as answered by "
+        f"{clean(outcome.solver, 40)} at tol {tolerance(outcome.tol)} (run "
+        f"{clean(outcome.run_ids[0], 40)}). Displacements are drawn to scale "
+        f"(factor {SCALE:g})."
+    )
+    limits = clipped_at(fields)
+    if limits is None:
+        return caption
+    return (
+        f"{caption} Colours: patch-recovered von Mises stress, one scale for all "
+        f"bodies, clipped at the {PERCENTILE:g} % quantile of the nodal values "
+        f"({limits[0] / 1e9:.3g} GPa), since stresses are singular at clamped and "
+        f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
+    )
+
+
+def _figures(page: Page, folder: Path) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = [p for section in page.sections for p in section.pictures]
+    return [
+        save(p.figure, folder / f"{p.name}.{ending}")
+        for p in pictures
+        for ending in ("pdf", "svg", "png")
+    ]
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path

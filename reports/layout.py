@@ -1,0 +1,95 @@
+"""The report as data: sections of prose, tables and figures; renderers do the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from reports.data import Outcome
+from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One entry of a table: plain text and what it means, never markup."""
+
+    text: str = ABSENT
+    symbol: str = ""  #: before the text, where the medium has it
+    after: str = ""  #: small print behind the text
+    kind: str = ""  #: a verdict, "best", "tied", "void" (not to be compared) or "total"
+    title: str = ""  #: shown when pointed at: where the number comes from
+    value: float | None = None  #: what to sort by; the text, if None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table in the booktabs manner."""
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    text_columns: int = 1  #: how many columns from the left hold names, not numbers
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Picture:
+    """A figure, its file name without ending, and its caption."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Section:
+    """One part of the report; `name` is its anchor and the stem of its files."""
+
+    name: str
+    title: str
+    prose: tuple[str, ...] = ()
+    points: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Page:
+    """The whole report, summary first."""
+
+    title: str
+    dateline: str
+    sections: tuple[Section, ...]
+
+
+def source(outcome: Outcome) -> str:
+    """Name the measurements behind a cell."""
+    return clean("run " + ", ".join(outcome.run_ids), 400)
+
+
+def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
+    """Show a verdict with symbol and words, and how many repeats it holds for."""
+    symbol, words = VERDICTS[outcome.verdict]
+    alike = sum(r.status is outcome.verdict for r in outcome.records)
+    if alike < len(outcome.records):
+        words += f" ({alike} of {plural(len(outcome.records), 'repeat')})"
+    return Cell(
+        text=words,
+        symbol=symbol,
+        after=after,
+        kind=outcome.verdict.value,
+        title=source(outcome),
+    )
+
+
+def case_cells(outcome: Outcome | Mapping[str, Outcome]) -> tuple[Cell, Cell]:
+    """Make the two leading cells of a row: case and tolerance."""
+    one = outcome if isinstance(outcome, Outcome) else next(iter(outcome.values()))
+    return name_cell(one.case), Cell(text=tolerance(one.tol), value=one.tol)
+
+
+def name_cell(name: str) -> Cell:
+    """Show a name that may be long; all of it appears when pointed at."""
+    shown = clean(name)
+    return Cell(text=shown, title="" if shown == name else clean(name, 2000))

@@ -1,0 +1,51 @@
+"""The report as Markdown."""
+
+from __future__ import annotations
+
+import re
+
+from reports.layout import Cell, Page, Section, Table
+
+
+def markdown(page: Page) -> str:
+    """Render the whole report; figures are linked, tables are pipes."""
+    parts = [f"# {escaped(page.title)}", escaped(page.dateline)]
+    for section in page.sections:
+        parts += _section(section)
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(section: Section) -> list[str]:
+    parts = [f"## {escaped(section.title)}"]
+    parts += [escaped(p) for p in section.prose]
+    if section.points:
+        parts.append("\n".join(f"- {escaped(p)}" for p in section.points))
+    for table in section.tables:
+        parts += [_table(table), f"*{escaped(table.caption)}*"]
+    for picture in section.pictures:
+        caption = escaped(picture.caption)
+        parts += [f"![{picture.name}](figures/{picture.name}.png)", f"*{caption}*"]
+    return parts
+
+
+def _table(table: Table) -> str:
+    heads = [escaped(c) for c in table.columns]
+    names = table.text_columns
+    rule = ["---" if i < names else "--:" for i in range(len(heads))]
+    rows = [[_cell(c) for c in row] for row in table.rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (heads, rule, *rows))
+
+
+def _cell(cell: Cell) -> str:
+    text = escaped(f"{cell.symbol} {cell.text}".strip())
+    if cell.kind == "void":
+        text = f"~~{text}~~"
+    elif text and cell.kind in {"best", "total", "over"}:
+        text = f"**{text}**"
+    return f"{text} {escaped(cell.after)}".strip()
+
+
+def escaped(text: str) -> str:
+    """Escape what Markdown or HTML would read as markup."""
+    safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", safe)

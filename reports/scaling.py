@@ -1,0 +1,173 @@
+"""Time and iterations against size, with fitted exponents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from reports.data import Evidence, Outcome
+from reports.intervals import PowerLaw, power_law
+from reports.layout import Cell, Section, Table, source
+from reports.wording import ABSENT, clean, exponent, seconds, span, tolerance
+
+SIZES = 3  #: fewer different sizes make no table
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ladder:
+    """Cases that differ in size only, and the verified answers on each."""
+
+    title: str  #: family, the parameters held, form, tolerance
+    solvers: tuple[str, ...]
+    rungs: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+
+    def curve(self, solver: str) -> list[tuple[int, Outcome]]:
+        """Sizes n and verified answers of one solver, smallest first."""
+        return [(n, row[solver]) for n, _, row in self.rungs if solver in row]
+
+    def time_law(self, solver: str) -> PowerLaw | None:
+        """Fit median total time ~ nᵖ; None with fewer than three sizes."""
+        timed = [(n, o.seconds("total")) for n, o in self.curve(solver)]
+        return _law([(n, t.value) for n, t in timed if t is not None])
+
+    def iteration_law(self, solver: str) -> PowerLaw | None:
+        """Fit iterations ~ nᵖ, repeats averaged; None with fewer than three sizes."""
+        counted = [(n, o.iterations) for n, o in self.curve(solver)]
+        return _law([(n, sum(i) / 2) for n, i in counted if i is not None])
+
+
+def _law(points: list[tuple[int, float]]) -> PowerLaw | None:
+    kept = [(n, v) for n, v in points if n > 0 and v > 0]
+    if len({n for n, _ in kept}) < SIZES:
+        return None
+    return power_law(*zip(*kept, strict=True))
+
+
+def ladders(evidence: Evidence) -> list[Ladder]:
+    """Find the cases that form a ladder of at least three sizes.
+
+    n is the number of dofs, m the rows of equalities and contact. A key of the case
+    name is held fixed within a ladder if cases of equal n differ in it (the load step,
+    say); the others are what makes a case larger.
+    """
+    sized = [(o, n) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
+    held = _held(sized)
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Outcome]]] = {}
+    for o, n in sized:
+        kept = tuple((k, o.first.params.get(k)) for k in held[o.first.family])
+        key = (o.first.family, kept, o.first.form, o.tol)
+        groups.setdefault(key, {}).setdefault(n, {})[o.solver] = o
+    return [
+        _ladder(key, rungs, evidence.solvers)
+        for key, rungs in groups.items()
+        if len(rungs) >= SIZES
+    ]
+
+
+def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
+    """Name, per family, the keys in which cases of equal size differ."""
+    seen: dict[tuple[str, int, str], set[Any]] = {}
+    for o, n in sized:
+        for key, value in o.first.params.items():
+            seen.setdefault((o.first.family, n, key), set()).add(value)
+    held: dict[str, dict[str, None]] = {o.first.family: {} for o, _ in sized}
+    for (family, _, key), values in seen.items():
+        if len(values) > 1:
+            held[family][key] = None
+    return {family: tuple(keys) for family, keys in held.items()}
+
+
+def _ladder(
+    key: tuple[Any, ...],
+    rungs: dict[int, dict[str, Outcome]],
+    solvers: tuple[str, ...],
+) -> Ladder:
+    family, kept, form, tol = key
+    names = [family, *(f"{k}={v}" for k, v in kept), *([form] if form else [])]
+    present = {s for row in rungs.values() for s in row}
+    rows = []
+    for n, row in sorted(rungs.items()):
+        m = next(iter(row.values())).size("equality_rows", "contact_rows")
+        rows.append((n, m, row))
+    return Ladder(
+        title=f"{clean('/'.join(names))}, tol {tolerance(tol)}",
+        solvers=tuple(s for s in solvers if s in present),
+        rungs=tuple(rows),
+    )
+
+
+def scaling(found: Sequence[Ladder]) -> Section | None:
+    """Tabulate every ladder; None where there is none."""
+    if not found:
+        return None
+    return Section(
+        name="scaling",
+        title="Scaling",
+        prose=(
+            "Verified answers only. n: degrees of freedom; m: rows of equality and "
+            "contact constraints. The exponent p of t = c·nᵖ is fitted by least "
+            "squares on logarithms, one point (the median of the repeats) per size; "
+            "its 95 % interval is Student's with two degrees of freedom fewer than "
+            "sizes, exact if the logarithms scatter normally about the line. It is a "
+            "statement about the sizes in the table, not beyond them.",
+        ),
+        tables=tuple(t for ladder in found for t in _tables(ladder)),
+    )
+
+
+def _tables(ladder: Ladder) -> tuple[Table, Table]:
+    heads = ("n", "m", *(clean(s, 40) for s in ladder.solvers))
+    times, counts = [], []
+    for n, m, row in ladder.rungs:
+        size = (Cell(text=str(n), value=n), Cell(text=_rows(m), value=m))
+        present = [row.get(s) for s in ladder.solvers]
+        times.append((*size, *map(_time, present)))
+        counts.append((*size, *map(_iterations, present)))
+    label = (Cell(text="p [95 %]", kind="total"), Cell(text="", kind="total"))
+    laws = [ladder.time_law(s) for s in ladder.solvers]
+    growth = [ladder.iteration_law(s) for s in ladder.solvers]
+    times.append((*label, *map(_exponent, laws)))
+    counts.append((*label, *map(_exponent, growth)))
+    return (
+        Table(
+            caption=f"Total time against size: {ladder.title}.",
+            columns=heads,
+            rows=tuple(times),
+            text_columns=0,
+        ),
+        Table(
+            caption=f"Iterations against size: {ladder.title}.",
+            columns=heads,
+            rows=tuple(counts),
+            text_columns=0,
+        ),
+    )
+
+
+def _rows(m: int | None) -> str:
+    return ABSENT if m is None else str(m)
+
+
+def _time(outcome: Outcome | None) -> Cell:
+    if outcome is None:
+        return Cell(text="not verified", kind="quiet")
+    interval = outcome.seconds("total")
+    return Cell(
+        text=seconds(interval),
+        title=source(outcome),
+        value=interval.value if interval else None,
+    )
+
+
+def _iterations(outcome: Outcome | None) -> Cell:
+    if outcome is None:
+        return Cell(text="not verified", kind="quiet")
+    its = outcome.iterations
+    return Cell(text=span(its), title=source(outcome), value=its[0] if its else None)
+
+
+def _exponent(law: PowerLaw | None) -> Cell:
+    if law is None:
+        return Cell(text=ABSENT, kind="total", title="fewer than three verified sizes")
+    return Cell(text=exponent(law), kind="total", value=law.exponent)

@@ -1,0 +1,169 @@
+"""The first page: what was measured, and which solvers do not reach what was asked."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from harness import Verdict
+from reports.data import Evidence, Outcome
+from reports.layout import Cell, Section, Table, name_cell
+from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
+
+_LIMITS = (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
+_GROUPS: dict[str, tuple[Verdict, ...]] = {
+    "verified": (Verdict.VERIFIED,),
+    "inaccurate": (Verdict.INACCURATE,),
+    "wrong": (Verdict.WRONG,),
+    "infeasible claim": (Verdict.INFEASIBLE_CLAIM,),
+    "limit": _LIMITS,
+    "failed": (Verdict.CRASHED, Verdict.FAILED),
+    "declined": (Verdict.DECLINED,),
+}
+
+_ENDINGS = {
+    Verdict.INACCURATE: "claimed solved but inaccurate",
+    Verdict.WRONG: "claimed solved but wrong",
+    Verdict.INFEASIBLE_CLAIM: "claimed infeasible",
+    Verdict.ITERATION_LIMIT: "ended at the iteration limit",
+    Verdict.TIME_LIMIT: "ended at the time limit",
+    Verdict.MEMORY_LIMIT: "ended at the memory limit",
+    Verdict.CRASHED: "crashed",
+    Verdict.FAILED: "failed",
+}
+
+
+def summary(evidence: Evidence) -> Section:
+    """Say in a few sentences and one table how the comparison ended."""
+    cases = len({o.case for o in evidence.flat})
+    tols = sorted({o.tol for o in evidence.flat}, reverse=True)
+    prose = [
+        f"{plural(len(evidence.records), 'measurement')}: "
+        f"{plural(len(evidence.solvers), 'solver')}, {plural(cases, 'case')}, "
+        f"tolerance {', '.join(map(tolerance, tols))}. A solver claims; the harness "
+        "verifies: every verdict below comes from residuals that we evaluated at the "
+        "returned point, and only verified answers enter a comparison of times.",
+    ]
+    digests = sorted({r.environment for r in evidence.records})
+    if len(digests) > 1:
+        prose.append(
+            f"Warning: the measurements come from {len(digests)} different "
+            f"environments ({listing(digests)}); their times are not comparable."
+        )
+    points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
+    return Section(
+        name="summary",
+        title="Summary",
+        prose=tuple(prose),
+        points=tuple(points),
+        tables=(_counts(evidence),),
+    )
+
+
+def _counts(evidence: Evidence) -> Table:
+    rows = []
+    for solver in evidence.solvers:
+        mine = [r for r in evidence.records if r.solver == solver]
+        count = Counter(r.status for r in mine)
+        row = [name_cell(solver), Cell(text=str(len(mine)), value=len(mine))]
+        for verdicts in _GROUPS.values():
+            n = sum(count[v] for v in verdicts)
+            symbol, _ = VERDICTS[verdicts[0]]
+            kind, symbol = (verdicts[0].value, symbol) if n else ("none", "")
+            row.append(Cell(text=str(n), symbol=symbol, kind=kind, value=n))
+        rows.append(tuple(row))
+    return Table(
+        caption="Measurements by verdict. Inaccurate and wrong: the solver claimed "
+        "success and its point refutes the claim.",
+        columns=("solver", "measurements", *_GROUPS),
+        rows=tuple(rows),
+    )
+
+
+def sentences(evidence: Evidence, solver: str) -> list[str]:
+    """Say plainly where one solver does not reach the tolerance, one per tolerance."""
+    mine = [o for o in evidence.flat if o.solver == solver]
+    name = clean(solver, 40)
+    said = []
+    for tol in sorted({o.tol for o in mine}, reverse=True):
+        at_tol = [o for o in mine if o.tol == tol]
+        tried = [o for o in at_tol if o.verdict is not Verdict.DECLINED]
+        missed = _missed(tried, tol) if tried else []
+        if tried and not missed:
+            worst = max((o.worst or 0.0 for o in tried), default=0.0)
+            missed = [
+                f"verified on all {plural(len(tried), 'case')} at tol "
+                f"{tolerance(tol)}; worst residual {power(worst)}"
+            ]
+        missed += _unclaimed(tried) + _declined(at_tol)
+        said.append(f"{name}: {'; '.join(missed)}.")
+    return said
+
+
+def _missed(tried: Sequence[Outcome], tol: float) -> list[str]:
+    """Say how many cases ended in each verdict other than verified, and which."""
+    said = []
+    for verdict in _ENDINGS:
+        those = [o for o in tried if o.verdict is verdict]
+        if not those:
+            continue
+        known = [o.worst for o in those if o.worst is not None]
+        worst = f"worst residual {power(max(known))}, " if known else ""
+        said.append(
+            f"{len(those)} of {plural(len(tried), 'case')} {_ENDINGS[verdict]} at tol "
+            f"{tolerance(tol)} ({worst}on {listing([o.case for o in those])})"
+        )
+    return said
+
+
+def _unclaimed(tried: Sequence[Outcome]) -> list[str]:
+    """Count the verified answers that the solver itself did not call solved."""
+    n = sum(o.verified and "solved" not in o.claims for o in tried)
+    return [f"{plural(n, 'verified answer')} not claimed to be solved"] if n else []
+
+
+def _declined(outcomes: Sequence[Outcome]) -> list[str]:
+    """Say what a solver declined, and why in its own words."""
+    those = [o for o in outcomes if o.verdict is Verdict.DECLINED]
+    reasons = list(dict.fromkeys(o.first.message for o in those if o.first.message))
+    why = f": {listing(reasons, 2)}" if reasons else ""
+    return [f"declined {plural(len(those), 'case')}{why}"] if those else []
+
+
+def dateline(evidence: Evidence) -> str:
+    """Say when and on which machine, in one line."""
+    days = sorted({r.started[:10] for r in evidence.records if r.started})
+    when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
+    return f"{when} · {machine(evidence.environment)}"
+
+
+def machine(environment: Mapping[str, Any]) -> str:
+    """Name the machine in one line, from what environment.json says of it."""
+    facts = environment.get("machine")
+    if not isinstance(facts, Mapping):
+        return "machine unknown"
+    parts = [str(facts["cpu"]) if facts.get("cpu") else "processor unknown"]
+    if facts.get("usable_cores"):
+        parts.append(plural(facts["usable_cores"], "usable core"))
+    if isinstance(facts.get("memory_mib"), int | float):
+        parts.append(f"{facts['memory_mib'] / 1024:.0f} GiB")
+    if facts.get("system"):
+        parts.append(f"{facts['system']} {facts.get('architecture') or ''}".strip())
+    return clean(", ".join(parts), 160)
+
+
+def flatten(data: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """List the leaves of nested plain data with dotted names."""
+    match data:
+        case Mapping():
+            items = [(str(k), v) for k, v in data.items()]
+        case list() | tuple() if any(isinstance(v, Mapping | list) for v in data):
+            items = [(str(i), v) for i, v in enumerate(data)]
+        case _:
+            return [(prefix, data)]
+    return [
+        leaf
+        for key, value in items
+        for leaf in flatten(value, f"{prefix}.{key}" if prefix else key)
+    ]

@@ -1,0 +1,120 @@
+"""Numbers and names as the report prints them: plain text, escaped by the renderers."""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from collections.abc import Sequence
+
+from harness import Verdict
+from reports.intervals import Interval, PowerLaw
+
+ABSENT = "–"  #: what was not or cannot be measured
+
+#: Symbol and words of every verdict: colour alone says nothing to many readers.
+VERDICTS = {
+    Verdict.VERIFIED: ("✓", "verified"),
+    Verdict.INACCURATE: ("≈", "inaccurate"),
+    Verdict.WRONG: ("✗", "wrong"),
+    Verdict.INFEASIBLE_CLAIM: ("∅", "infeasible claim"),
+    Verdict.ITERATION_LIMIT: ("↻", "iteration limit"),
+    Verdict.TIME_LIMIT: ("↻", "time limit"),
+    Verdict.MEMORY_LIMIT: ("↻", "memory limit"),
+    Verdict.CRASHED: ("†", "crashed"),
+    Verdict.FAILED: ("†", "failed"),
+    Verdict.DECLINED: ("○", "declined"),
+}
+
+_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
+
+
+def clean(text: str, limit: int = 96) -> str:
+    """Make foreign text fit for a table: one line, no control characters, not longer.
+
+    The middle is left out of what is too long, since names differ at their ends.
+    """
+    line = " ".join(text.split())
+    shown = "".join("\ufffd" if _invisible(c) else c for c in line)
+    if len(shown) <= limit:
+        return shown
+    tail = limit // 3
+    return f"{shown[: limit - tail - 1]}…{shown[-tail:]}"
+
+
+def _invisible(char: str) -> bool:
+    """Whether a character is a control, a direction override or a lone surrogate."""
+    return unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co"}
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Print `digits` significant digits without an exponent where that is short."""
+    if value is None or not math.isfinite(value):
+        return ABSENT
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -3 <= exponent < max(digits, 6):
+        return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+    return _short(f"{value:.{digits - 1}e}")
+
+
+def power(value: float | None) -> str:
+    """Print an order of magnitude with one decimal: 3.2e-9."""
+    if value is None or not math.isfinite(value):
+        return ABSENT
+    return "0" if value == 0 else _short(f"{value:.1e}")
+
+
+def _short(text: str) -> str:
+    """Write an exponent as one does: 1e-08 becomes 1e-8."""
+    mantissa, _, exponent = text.partition("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def tolerance(value: float) -> str:
+    """Print a tolerance as one writes it: 1e-8."""
+    mantissa, _, exponent = f"{value:.6e}".partition("e")
+    return _short(f"{float(mantissa):g}e{exponent}")
+
+
+def seconds(interval: Interval | None) -> str:
+    """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
+
+    Both ends are printed to the digit of the median. A single run has no uncertainty
+    that one could know, and the text says so.
+    """
+    if interval is None:
+        return ABSENT
+    unit, name = next((u for u in _UNITS if interval.value >= u[0]), _UNITS[-1])
+    scaled = interval.value / unit
+    exponent = math.floor(math.log10(scaled)) if scaled > 0 else 0
+    decimals = max(2 - exponent, 0)
+    low, high = (f"{v / unit:.{decimals}f}" for v in (interval.low, interval.high))
+    ends = f"{low}, {high}" if interval.samples > 1 else "1 run"
+    return f"{scaled:.{decimals}f} {name} [{ends}]"
+
+
+def exponent(fit: PowerLaw) -> str:
+    """Print the exponent of a power law with its 95 % interval."""
+    p, low, high = (round(v, 2) + 0.0 for v in (fit.exponent, fit.low, fit.high))
+    return f"{p:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def span(least_most: tuple[int, int] | None) -> str:
+    """Print a count, or its range where repeats differ."""
+    if least_most is None:
+        return ABSENT
+    least, most = least_most
+    return str(least) if least == most else f"{least}–{most}"
+
+
+def listing(names: Sequence[str], limit: int = 3) -> str:
+    """Name the first few of a list and count the others."""
+    shown = ", ".join(clean(n) for n in names[:limit])
+    more = len(names) - limit
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def plural(count: int, noun: str) -> str:
+    """Count a noun: "1 case", "3 cases"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,63 @@
+"""The interval of a median and the exponent of a power law against known truths."""
+
+import numpy as np
+import pytest
+
+from reports.intervals import median_interval, power_law
+
+
+@pytest.mark.parametrize(
+    ("n", "low", "high", "coverage"),
+    [
+        (1, 1, 1, 0.0),
+        (2, 1, 2, 0.5),
+        (3, 1, 3, 0.75),
+        (5, 1, 5, 1 - 2 / 32),
+        (6, 1, 6, 1 - 2 / 64),
+        (9, 2, 8, 1 - 2 * 10 / 512),  # P(X < 2) = (1 + 9)/2⁹
+    ],
+)
+def test_the_interval_runs_between_the_right_order_statistics(n, low, high, coverage):
+    shuffled = np.random.default_rng(86).permutation(np.arange(1, n + 1))
+    interval = median_interval(shuffled)
+    assert interval == ((n + 1) / 2, low, high, pytest.approx(coverage), n)
+
+
+@pytest.mark.parametrize("n", [3, 5, 9])
+def test_the_interval_covers_the_median_of_a_skewed_law_as_often_as_it_says(n):
+    samples = np.random.default_rng(4711).exponential(size=(4000, n))
+    intervals = [median_interval(s) for s in samples]
+    hits = np.mean([i.low <= np.log(2) <= i.high for i in intervals])
+    assert hits == pytest.approx(intervals[0].coverage, abs=0.025)  # > 3 σ
+
+
+def test_a_power_law_without_noise_is_recovered():
+    n = np.array([100, 300, 800, 5000])
+    fit = power_law(n, 3e-6 * n**1.4)
+    assert fit.exponent == pytest.approx(1.4)
+    assert fit.factor == pytest.approx(3e-6)
+    assert fit.low == pytest.approx(1.4)
+    assert fit.high == pytest.approx(1.4)
+
+
+def test_counts_that_do_not_grow_have_exponent_zero():
+    assert power_law([100, 300, 800], [12, 12, 12])[:3] == pytest.approx((0, 0, 0))
+
+
+@pytest.mark.parametrize("sizes", [3, 6])
+def test_the_interval_of_the_exponent_covers_at_its_nominal_rate(sizes):
+    rng = np.random.default_rng(1729)
+    n = np.geomspace(500, 40_000, sizes)
+    fits = [
+        power_law(n, 2e-6 * n**1.2 * rng.lognormal(0, 0.2, sizes)) for _ in range(2000)
+    ]
+    hits = np.mean([f.low <= 1.2 <= f.high for f in fits])
+    assert hits == pytest.approx(0.95, abs=0.015)  # 3 σ
+
+
+@pytest.mark.parametrize(
+    ("n", "t"), [([1, 2], [1, 2]), ([5, 5, 9], [1, 2, 3]), ([1, 2, 3], [1, 0, 2])]
+)
+def test_what_does_not_determine_a_power_law_is_refused(n, t):
+    with pytest.raises(ValueError, match="three different sizes"):
+        power_law(n, t)

@@ -1,0 +1,173 @@
+"""Pictures of two rectangles: what is drawn is where and what the fields say."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from matplotlib.collections import TriMesh
+from matplotlib.quiver import Quiver
+
+from harness import Fields, InputError
+from reports.mechanics import deformed_figure, draw_deformed, outlines
+
+LOWER, UPPER = 3, 6  # columns of cells
+
+
+def rectangle(columns, width, height, bottom):
+    """One row of cells: (2·columns + 2, 2) points and (columns, 4) cells."""
+    x = np.linspace(0, width, columns + 1)
+    points = [
+        np.column_stack([x, np.full_like(x, y)]) for y in (bottom, bottom + height)
+    ]
+    i = np.arange(columns)
+    cells = np.column_stack([i, i + 1, i + columns + 2, i + columns + 1])
+    return np.vstack(points), cells
+
+
+@pytest.fixture
+def bodies():
+    low, low_cells = rectangle(LOWER, 2.0, 0.4, 0.0)
+    up, up_cells = rectangle(UPPER, 2.0, 0.3, 0.45)
+    points = np.vstack([low, up])
+    stress = np.linspace(0, 4e9, len(points))
+    stress[-1] = 1e12  # a corner singularity
+    return Fields(
+        points=points,
+        cells=np.vstack([low_cells, up_cells + len(low)]),
+        bodies=np.repeat([0, 1], [LOWER, UPPER]),
+        displacement=np.column_stack([0 * points[:, 0], -0.05 * points[:, 0]]),
+        nodal={"von_mises": stress},
+        contact_nodes=np.arange(LOWER + 1, 2 * LOWER + 2),
+        contact_forces=np.array([[0, 0], [0, -1e6], [1e6, -2e6], [0, 0]]),
+    )
+
+
+def unloaded(fields):
+    return Fields(
+        **{k: v for k, v in vars(fields).items() if not k.startswith("contact")}
+    )
+
+
+def artists(axes, kind):
+    return [a for a in axes.get_children() if isinstance(a, kind)]
+
+
+def test_the_outline_of_a_strip_is_one_closed_loop_through_its_boundary():
+    _, cells = rectangle(2, 1.0, 1.0, 0.0)
+    (loop,) = outlines(cells)
+    assert loop[0] == loop[-1]
+    start = list(loop).index(0)
+    assert list(np.roll(loop[:-1], -start)) == [0, 1, 2, 5, 4, 3]  # counter-clockwise
+
+
+def test_every_body_and_every_hole_has_a_loop_of_its_own(bodies):
+    assert sorted(len(loop) - 1 for loop in outlines(bodies.cells)) == [8, 14]
+    i = np.arange(6)  # an annulus of six cells
+    annulus = np.column_stack([i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6])
+    assert sorted(len(loop) - 1 for loop in outlines(annulus)) == [6, 6]
+
+
+def test_cells_that_meet_in_one_node_only_keep_their_sides():
+    cells = np.array([[0, 1, 2, 3], [2, 4, 5, 6]])
+    sides = {frozenset(pair) for loop in outlines(cells) for pair in pairwise(loop)}
+    assert len(sides) == 8
+
+
+def test_bodies_are_drawn_where_the_displacement_puts_them(bodies):
+    axes = deformed_figure(bodies).axes[0]
+    moved = bodies.points + bodies.displacement
+    for mesh, nodes in zip(artists(axes, TriMesh), (8, 14), strict=True):
+        drawn = mesh._triangulation
+        used = np.unique(drawn.triangles)
+        assert len(used) == nodes
+        np.testing.assert_allclose(np.column_stack([drawn.x, drawn.y]), moved)
+    corners = {tuple(np.round(p, 12)) for p in moved}
+    outline = [line for line in axes.lines if line.get_linestyle() == "-"]
+    assert {tuple(np.round(p, 12)) for line in outline for p in line.get_xydata()} == (
+        corners
+    )
+    assert axes.get_aspect() == 1
+
+
+def test_two_triangles_cover_each_quadrilateral(bodies):
+    meshes = artists(deformed_figure(bodies).axes[0], TriMesh)
+    # The shear by −0.05 x keeps areas and takes the centre (1, y) to (1, y − 0.05).
+    for mesh, area, middle in zip(meshes, (0.8, 0.6), (0.15, 0.55), strict=True):
+        t = mesh._triangulation
+        corners = np.column_stack([t.x, t.y])[t.triangles]
+        sides = corners[:, 1:] - corners[:, :1]
+        areas = np.linalg.det(sides) / 2
+        centre = areas @ corners.mean(axis=1) / areas.sum()
+        assert (areas > 0).all()
+        assert areas.sum() == pytest.approx(area)
+        np.testing.assert_allclose(centre, [1, middle])
+
+
+def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
+    calm = bodies.nodal["von_mises"].copy()
+    many = np.concatenate([calm, np.full(600, 2e9)])  # one node in 600 is singular
+    points = np.vstack([bodies.points, np.zeros((600, 2))])
+    fields = Fields(
+        points=points, cells=bodies.cells, bodies=bodies.bodies,
+        displacement=np.zeros_like(points), nodal={"von_mises": many},
+    )  # fmt: skip
+    meshes = artists(deformed_figure(fields).axes[0], TriMesh)
+    limits = {mesh.get_clim() for mesh in meshes}
+    assert len(limits) == 1
+    low, high = limits.pop()
+    assert low == 0
+    assert 1 < high <= 4  # GPa, not 1000
+    assert meshes[0].get_array().max() == 1000  # GPa: clipped in colour, not in value
+
+
+def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
+    overview, zoom = deformed_figure(bodies).axes[:2]
+    assert not artists(overview, Quiver)
+    (arrows,) = artists(zoom, Quiver)
+    moved = bodies.points + bodies.displacement
+    np.testing.assert_allclose(arrows.XY, moved[bodies.contact_nodes[1:3]])
+    assert arrows.pivot == "tip"
+    drawn = np.column_stack([arrows.U, arrows.V])
+    forces = bodies.contact_forces[1:3]
+    np.testing.assert_allclose(drawn / drawn[0, 1], forces / forces[0, 1])
+    assert "2.24 MN/m" in zoom.get_title(loc="left")
+    (x0, x1), (y0, y1) = zoom.get_xlim(), zoom.get_ylim()
+    tails = arrows.XY - drawn
+    assert ((x0 < tails[:, 0]) & (tails[:, 0] < x1)).all()
+    assert ((y0 < tails[:, 1]) & (tails[:, 1] < y1)).all()
+
+
+def test_without_contact_forces_there_is_one_panel(bodies):
+    figure = deformed_figure(unloaded(bodies))
+    assert len(figure.axes) == 2  # bodies and colour bar
+    assert "displacement × 1" in figure.axes[0].get_title(loc="left")
+
+
+def test_without_stress_the_bodies_are_drawn_plain(bodies):
+    fields = Fields(**{**vars(unloaded(bodies)), "nodal": {}})
+    figure = deformed_figure(fields)
+    assert len(figure.axes) == 1
+    assert len(artists(figure.axes[0], TriMesh)) == 2
+
+
+@pytest.mark.parametrize(
+    ("ending", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")]
+)
+def test_a_picture_is_the_same_bytes_every_time(bodies, tmp_path, ending, start):
+    first, second = tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"
+    draw_deformed(unloaded(bodies), first)
+    draw_deformed(unloaded(bodies), second)
+    assert first.read_bytes().startswith(start)
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_an_unknown_kind_of_picture_is_bad_input(bodies, tmp_path):
+    with pytest.raises(InputError, match=r"'\.gif'.*known: \.pdf, \.png, \.svg$"):
+        draw_deformed(bodies, tmp_path / "a.gif")
+
+
+def test_a_state_without_numbers_is_not_drawn(bodies, tmp_path):
+    broken = Fields(**{**vars(bodies), "displacement": bodies.displacement * np.nan})
+    with pytest.raises(InputError, match="NaN"):
+        draw_deformed(broken, tmp_path / "a.png")
+    assert not (tmp_path / "a.png").exists()
