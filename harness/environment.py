@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from threadpoolctl import threadpool_info  # type: ignore[import-untyped]
+from threadpoolctl import threadpool_info
 
 PACKAGES = (
     "mortarbench", "numpy", "scipy", "scikit-sparse", "qpsolvers", "osqp", "clarabel",

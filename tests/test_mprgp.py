@@ -71,8 +71,8 @@ def test_an_expansion_projects_the_cg_step():
 
 
 def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one():
-    """In a tilted valley the second CG step ends at (−1, 0); cut at x₁ = 0 it climbs the
-    wall. One product for each c, three for the fallback."""
+    """In a tilted valley the second CG step ends at (−1, 0); cut at x₁ = 0 it climbs.
+    One product for each c, three for the fallback."""
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     run, products = minimise(A, b, lower, x=[1.0, 0.2])
     before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1)

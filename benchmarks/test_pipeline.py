@@ -1,0 +1,72 @@
+"""Where the time of an analysis goes, at the size of the paper's Table 1 and below."""
+
+import numpy as np
+import pytest
+
+from problems.beam_ring import BEAM, BeamRing, model
+from problems.bodies import clamped, floating
+from problems.contact import node_to_segment
+from problems.dual import dualise
+from problems.elasticity import elasticity_matrix, stiffness
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+SIZES = pytest.mark.parametrize(("Nr", "Nh"), [(12, 6), (30, 15)])
+
+
+def bodies_of(Nr, Nh):
+    return model(Nr, Nh, 2 * Nh, "strain")
+
+
+@SIZES
+def test_assembly(benchmark, Nr, Nh):
+    mesh = bodies_of(Nr, Nh).mesh
+    D = elasticity_matrix(BEAM, "strain")
+
+    K = benchmark(stiffness, mesh, D)
+
+    assert K.shape == (mesh.dofs, mesh.dofs)
+
+
+@SIZES
+def test_linearisation(benchmark, Nr, Nh):
+    bodies = bodies_of(Nr, Nh)
+    u = np.zeros(bodies.mesh.dofs)
+
+    rows = benchmark(node_to_segment, bodies.mesh.points, u, *bodies.pairs[0])
+
+    assert len(rows.c) == 12 * Nh + 1
+
+
+@SIZES
+@pytest.mark.parametrize("factorise", [clamped, floating])
+def test_factorisation(benchmark, factorise, Nr, Nh):
+    bodies = bodies_of(Nr, Nh)
+
+    inverse = benchmark(factorise, bodies)
+
+    assert inverse.kernel.shape[1] == (6 if factorise is floating else 0)
+
+
+@SIZES
+def test_dualisation(benchmark, Nr, Nh):
+    family = BeamRing()
+    params = family.complete({"Nr": Nr, "Nh": Nh, "steps": 1})
+    primal = family.build("primal", params, reference_solution).qp
+    inverse = floating(bodies_of(Nr, Nh))
+
+    dual = benchmark(dualise, primal, inverse)
+
+    assert dual.qp.q.size == primal.b.size + primal.h.size
+
+
+@SIZES
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_smalbe(benchmark, form, Nr, Nh):
+    family = BeamRing()
+    params = family.complete({"Nr": Nr, "Nh": Nh, "steps": 1})
+    qp = family.build(form, params, reference_solution).qp
+
+    solution = benchmark(lambda: SMALBE().prepare(qp, 1e-8)())
+
+    assert solution.status == "solved"
