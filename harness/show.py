@@ -90,8 +90,8 @@ def outcome(r: Record) -> str:
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),
-        ("prepare", _text(r.prepare_seconds, "s", digits=3)),
-        ("solve", _text(r.solve_seconds, "s", digits=3)),
+        ("prepare", _text(r.prepare_seconds, "s (one run)", digits=3)),
+        ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
         *(
             (f"{name} residual", _text(getattr(r, name), digits=2))
