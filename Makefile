@@ -19,7 +19,7 @@ test: setup check  ## check, then run the tests
 	$(BIN)/pytest -q
 
 bench: setup  ## time our own kernels (pytest-benchmark)
-	$(BIN)/pytest benchmarks --benchmark-only --benchmark-warmup=on \
+	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
 
 check: setup  ## format, lint, types, import contracts

@@ -18,20 +18,20 @@ from problems.elasticity import (
     rigid_modes,
     stiffness,
 )
+from problems.fixing import fixing_nodes
 from problems.inverse import (
     GeneralisedInverse,
-    fixing_nodes,
     floating_inverse,
     regular_inverse,
 )
-from problems.mesh import Mesh, Nodes
+from problems.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):
     """Two sides that may touch."""
 
     slave: Nodes  #: chain of nodes; each may get a contact row
-    master: Nodes  #: chain of nodes, its body on the left
+    master: Nodes  #: chain of nodes, its body on the left; empty for a rigid one
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,6 +61,18 @@ class Bodies:
         owner[self.mesh.cells.ravel()] = np.repeat(self.body, 4)
         return owner
 
+    @property
+    def interface(self) -> Nodes:
+        """Displacement components that contact rows can touch, ascending."""
+        return np.unique(
+            dofs_of(np.concatenate([np.concatenate(p) for p in self.pairs]))
+        )
+
+    @property
+    def D(self) -> NDArray[np.float64]:
+        """Elasticity matrix of each cell, (E, 3, 3), Pa."""
+        return _elasticity_matrices(self.materials, self.plane)[self.body]
+
 
 def assemble(
     mesh: Mesh,
@@ -86,21 +98,27 @@ def assemble(
 
     """
     length, force = units
-    D = np.stack([elasticity_matrix(m, plane) for m in materials])[body]
+    D = _elasticity_matrices(materials, plane)
     return Bodies(
         mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-        length=length, force=force, K=stiffness(mesh, D) * (length / force),
+        length=length, force=force, K=stiffness(mesh, D * (length / force), body),
         f=load / force, B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]),
         pairs=pairs,
     )  # fmt: skip
 
 
-def floating(bodies: Bodies) -> GeneralisedInverse:
-    """Factorise K with all its rigid modes, as Dirichlet rows in B need it."""
+def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
+    """Factorise K with all its rigid modes, as Dirichlet rows in B need it.
+
+    Condensed onto what constraints can touch, or else (the paper's way) with one solve
+    per constraint row of each load step.
+    """
     owner, points = bodies.body_of_node, bodies.mesh.points
     parts = [points[owner == b] for b in range(len(bodies.names))]
     kernels = [rigid_modes(part) for part in parts]
-    return floating_inverse(bodies.K, kernels, [fixing_nodes(part) for part in parts])
+    fixing = [fixing_nodes(part) for part in parts]
+    touched = np.union1d(bodies.interface, bodies.B_D.indices) if condense else None
+    return floating_inverse(bodies.K, kernels, fixing, touched)
 
 
 def clamped(bodies: Bodies) -> GeneralisedInverse:
@@ -114,9 +132,15 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
     """
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
     try:
-        return regular_inverse(bodies.K[free][:, free])
+        return regular_inverse(bodies.K, free, bodies.interface)
     except CholmodNotPositiveDefiniteError:
         raise InputError(
             "the supports leave a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"
         ) from None
+
+
+def _elasticity_matrices(
+    materials: tuple[Material, ...], plane: Plane
+) -> NDArray[np.float64]:
+    return np.stack([elasticity_matrix(m, plane) for m in materials])

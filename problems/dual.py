@@ -1,4 +1,4 @@
-"""Dualisation and elimination: transforms of a QP, each with its way back (Section 3).
+"""Dualisation: transforms of a QP, each with its way back (paper, Section 3).
 
 The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I.  Each transform
 returns the new problem together with a function that takes a solution of the new
@@ -8,12 +8,13 @@ problem to a solution (point and all multipliers) of the old one.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, vstack
+from scipy.sparse import csr_array, vstack
 
-from harness import QP, Solution, Vector, no_rows
+from harness import QP, Matrix, Solution, Vector, no_rows
 from problems.inverse import GeneralisedInverse
 
 
@@ -26,7 +27,9 @@ class Transformed(NamedTuple):
     constant: float
 
 
-def dualise(primal: QP, inverse: GeneralisedInverse) -> Transformed:
+def dualise(
+    primal: QP, inverse: GeneralisedInverse, free: Vector | None = None
+) -> Transformed:
     """Turn the primal QP into its dual, equations (2)-(5) of the paper.
 
     ::
@@ -40,72 +43,66 @@ def dualise(primal: QP, inverse: GeneralisedInverse) -> Transformed:
 
     Parameters
     ----------
-    primal : sparse P = K; no finite bounds
+    primal : P = K; no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
+    free : K⁺f (n,), where it is known already
 
     """
     f, m_E = -primal.q, primal.b.size
     B, c = csr_array(vstack([primal.A, primal.G])), np.append(primal.b, primal.h)
-    R, m = inverse.kernel, c.size
-    W = inverse.half(B)
-    w = inverse.half(f[None])[:, 0]
-    F, BR = W.T @ W, B @ R
-    F = (F + F.T) / 2
-    qp = QP(
-        P=F, q=c - W.T @ w,
-        A=BR.T if R.shape[1] else no_rows(m), b=R.T @ f,
-        G=no_rows(m), h=np.zeros(0),
-        lb=np.append(np.full(m_E, -np.inf), np.zeros(m - m_E)), ub=np.full(m, np.inf),
-    )  # fmt: skip
+    R = inverse.kernel
+    free = inverse(f) if free is None else free
+    qp = _dual(B, c, inverse, free, np.where(np.arange(c.size) < m_E, -np.inf, 0.0))
+    if R.shape[1]:
+        qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
 
     def recover(s: Solution) -> Solution:
-        u = inverse(f - B.T @ s.x) - R @ s.y
-        return _like(s, u, s.x[:m_E], s.x[m_E:])
+        u = inverse(f - B.T @ s.x)
+        if R.shape[1]:
+            u = u - R @ s.y
+        return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(w @ w))
+    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free))
 
 
-def eliminate(primal: QP) -> Transformed:
-    """Take out the unknowns that single-entry equality rows prescribe.
+def dual_bounds(
+    primal: QP, clamped: GeneralisedInverse, free: Vector | None = None
+) -> Transformed:
+    """Dualise the contact rows alone: λ ≥ 0 is the only constraint.
 
     ::
 
-        u = [u_f; u_D],  u_D given:  min ½u_fᵀK_ff u_f − (f_f − K_fD u_D)ᵀu_f
+        min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,    F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The multipliers of the rows taken out are the reactions, from stationarity.
+    The way back is  u = K⁺(f − B_Iᵀλ);  the multipliers of the supports are the
+    reactions, from stationarity.
 
-    Raises
-    ------
-    ValueError
-        When an equality row has more than one entry.
+    Parameters
+    ----------
+    primal : its equality rows hold single components at zero, by unit entries
+    clamped : K⁺ that is zero on these components
+    free : K⁺f (n,), where it is known already
 
     """
-    rows = csr_array(primal.A)
-    if (np.diff(rows.indptr) != 1).any():
-        raise ValueError("elimination needs equality rows with exactly one entry each")
-    fixed, n = rows.indices, primal.q.size
-    free = np.setdiff1d(np.arange(n), fixed)
-    u0 = np.zeros(n)
-    u0[fixed] = primal.b / rows.data
-    K, G, Ku0 = csc_array(primal.P), csc_array(primal.G), primal.P @ u0
-    reduced = QP(
-        P=K[free][:, free], q=(primal.q + Ku0)[free],
-        A=no_rows(free.size), b=np.zeros(0),
-        G=csr_array(G[:, free]), h=primal.h - primal.G @ u0,
-        lb=np.full(free.size, -np.inf), ub=np.full(free.size, np.inf),
-    )  # fmt: skip
+    f, B = -primal.q, csr_array(primal.G)
+    free = clamped(f) if free is None else free
+    qp = _dual(B, primal.h, clamped, free, np.zeros(primal.h.size))
 
     def recover(s: Solution) -> Solution:
-        u = u0.copy()
-        u[free] = s.x
-        gradient = primal.P @ u + primal.q + primal.G.T @ s.z
-        return _like(s, u, -gradient[fixed] / rows.data, s.z)
+        u = clamped(f - B.T @ s.x)
+        reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
+        return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
-    constant = float(0.5 * u0 @ Ku0 + primal.q @ u0)
-    return Transformed(reduced, recover, 1.0, constant)
+    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free))
 
 
-def _like(s: Solution, u: Vector, y: Vector, z: Vector) -> Solution:
-    return Solution(status=s.status, x=u, y=y, z=z, z_box=np.zeros(u.size),
-                    iterations=s.iterations, counts=s.counts,
-                    message=s.message)  # fmt: skip
+def _dual(
+    B: Matrix, c: Vector, inverse: GeneralisedInverse, free: Vector, lb: Vector
+) -> QP:
+    """Emit  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  λ ≥ lb."""
+    m = c.size
+    return QP(
+        P=inverse.congruence(B), q=c - B @ free,
+        A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
+        lb=lb, ub=np.full(m, np.inf),
+    )  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array
+from scipy.sparse import csc_array
 
 from harness import Vector
 from problems.mesh import Mesh, dofs_of
@@ -79,25 +79,53 @@ def strain_matrix(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
     return B
 
 
-def stiffness(mesh: Mesh, D: NDArray[np.float64]) -> csc_array:
+def stiffness(
+    mesh: Mesh,
+    D: NDArray[np.float64],
+    material: NDArray[np.int64] | None = None,
+    pattern: Pattern | None = None,
+) -> csc_array:
     """Assemble K = Σ_e ∫ BᵀDB (2N, 2N) by 2×2 Gauss quadrature, Pa.
 
     Parameters
     ----------
     mesh : the body or bodies
-    D : (3, 3), or (E, 3, 3) where bodies differ in material
+    D : (3, 3), or (k, 3, 3) of k materials
+    material : (E,) of each cell, 0 … k − 1; left out: all 0
+    pattern : of the mesh, where it is known
 
     """
-    corners = mesh.points[mesh.cells]
-    Ke = np.zeros((len(mesh.cells), 8, 8))
-    for point in GAUSS:
-        gradients, det = shape_gradients(corners, point)
-        B = strain_matrix(gradients)
-        Ke += np.swapaxes(B, 1, 2) @ (D @ B) * det[:, None, None]
-    dof = cell_dofs(mesh)
-    i, j = np.repeat(dof, 8, axis=1), np.tile(dof, 8)
+    from problems.kernels import add_stiffness  # late: importing numba takes a while
+
+    pattern = pattern or sparsity(mesh)
+    if material is None:
+        material = np.zeros(len(mesh.cells), dtype=np.int64)
+    data = add_stiffness(
+        mesh.points, pattern.cells, D.reshape(-1, 3, 3), material.astype(np.int32),
+        pattern.ptr, pattern.slot,
+    )  # fmt: skip
     n = mesh.dofs
-    return csc_array(coo_array((Ke.ravel(), (i.ravel(), j.ravel())), shape=(n, n)))
+    return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Where the entries of a stiffness matrix are; depends on the cells alone."""
+
+    cells: NDArray[np.int32]  #: (E, 4)
+    ptr: NDArray[np.int32]  #: (N + 1,) of the neighbours of each node
+    slot: NDArray[np.int32]  #: (E, 4, 4) of node b among the neighbours of node a
+    indptr: NDArray[np.int32]  #: (2N + 1,) of K
+    indices: NDArray[np.int32]
+
+
+def sparsity(mesh: Mesh) -> Pattern:
+    """Find the pattern of K, once for all values."""
+    from problems.kernels import dof_pattern, node_pattern, slots
+
+    cells = mesh.cells.astype(np.int32)
+    ptr, idx = node_pattern(cells, len(mesh.points))
+    return Pattern(cells, ptr, slots(cells, ptr, idx), *dof_pattern(ptr, idx))
 
 
 def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:

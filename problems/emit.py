@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from harness import QP, Case, Solution
+import numpy as np
+from scipy.sparse import csr_array, vstack
+
+from harness import QP, Case, Solution, Vector
 from problems.bodies import Bodies
-from problems.dual import Transformed, dualise
+from problems.dual import Transformed, dual_bounds, dualise
 from problems.inverse import GeneralisedInverse
 from problems.results import fields
-from problems.stepping import dual_bounds
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -35,13 +37,20 @@ def contact_case(
     quantities : physical results from a solution of the primal QP
 
     """
+    matrices: Mapping[str, Any] = {}
     match form:
         case "primal":
             new = Transformed(primal, lambda s: s, 1.0, 0.0)
         case "dual":
-            new = dualise(primal, floating())
+            inverse = floating()
+            new = dualise(primal, inverse)
+            B = csr_array(vstack([primal.A, primal.G]))
+            matrices = _paper(new.qp, B, np.append(primal.b, primal.h), inverse)
         case _:
-            new = dual_bounds(primal, clamped())
+            inverse = clamped()
+            new = dual_bounds(primal, inverse)
+            free = np.setdiff1d(np.arange(primal.q.size), bodies.B_D.indices)
+            matrices = _paper(new.qp, csr_array(primal.G)[:, free], primal.h, inverse)
     energy = bodies.force * bodies.length
     return Case(
         qp=new.qp,
@@ -50,4 +59,12 @@ def contact_case(
         fields=lambda s: fields(bodies, primal, new.recover(s)),
         scale=new.sign * energy,
         constant=new.constant * energy,
+        matrices=matrices,
     )
+
+
+def _paper(
+    dual: QP, B: csr_array, c: Vector, inverse: GeneralisedInverse
+) -> dict[str, Any]:
+    """Name the matrices of the dual as the paper does, (2)-(5); u_D = 0."""
+    return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": inverse.kernel}

@@ -1,58 +1,116 @@
-"""Generalised inverse of a floating body's stiffness by Cholesky with fixing nodes.
+"""Generalised inverses of the stiffness by sparse Cholesky, and their condensation.
 
-Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos (2011), the paper's reference [8]: a
-few fixing nodes spread over each body keep the factorisation well conditioned. With
-R* the rows of the rigid modes at these nodes (orthonormalised, zero elsewhere) and
-ρ > 0,
+A floating body's K is made positive definite by fixing nodes (Brzobohatý, Dostál,
+Kozubek, Kovář, Markopoulos 2011, the paper's reference [8]): with R* the rows of the
+rigid modes at a few nodes (orthonormalised, zero elsewhere) and ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
 so K⁺ = K_ρ⁻¹ is a symmetric generalised inverse, one sparse Cholesky factor away. It is
 not the Moore-Penrose inverse; on loads that balance (Rᵀf = 0) the two give solutions
-that differ by a rigid motion only.
+that differ by a rigid motion only. For supported bodies, K⁺ is K_ff⁻¹ on the free
+components and zero on the prescribed ones.
+
+Constraints touch only the components c of contact sides and supports. Ordered last,
+they leave a trailing block L_cc in the factor, and  (K⁺)_cc = (L_cc L_ccᵀ)⁻¹  gives
+F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  for every load step by one small product.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_array, csc_array, csc_matrix, csr_array
-from sksparse.cholmod import Factor, cholesky
+from scipy.linalg import lapack
+from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
+from sksparse.cholmod import Factor, analyze
 
 from harness import Matrix, Vector
 from problems.mesh import Nodes, dofs_of
 
-FIXING_NODES = 4  #: per body; fewer condition worse, more fill the factor
 
+class GeneralisedInverse(Protocol):
+    """A symmetric K⁺ (n, n) with K K⁺ K = K on the components it acts on."""
 
-@dataclass(frozen=True, eq=False)
-class GeneralisedInverse:
-    """A symmetric generalised inverse K⁺ = K_ρ⁻¹ of a semidefinite K (n, n)."""
-
-    factor: Factor  #: L Lᵀ = Π K_ρ Πᵀ with CHOLMOD's permutation Π
-    kernel: NDArray[np.float64]  #: R (n, r), orthonormal columns; r = 0 for regular K
+    @property
+    def kernel(self) -> NDArray[np.float64]:
+        """Orthonormal basis R (n, r) of ker K; no columns for a regular K."""
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ to one vector (n,) or to several (n, k)."""
-        return np.asarray(self.factor.solve_A(b))
 
-    def half(self, B: Matrix) -> NDArray[np.float64]:
-        """Return W = L⁻¹ΠBᵀ (n, m), so that WᵀW = BK⁺Bᵀ, symmetric to the last bit."""
-        columns = B.T.toarray() if hasattr(B, "toarray") else np.asarray(B).T
-        permuted = self.factor.apply_P(columns)
-        return np.asarray(self.factor.solve_L(permuted, use_LDLt_decomposition=False))
+    def congruence(self, B: Matrix) -> NDArray[np.float64]:
+        """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n), exactly symmetric."""
 
 
-def regular_inverse(K: Matrix) -> GeneralisedInverse:
-    """Factorise a positive definite K; its generalised inverse is the inverse."""
-    return GeneralisedInverse(cholesky(csc_matrix(K)), np.zeros((K.shape[0], 0)))
+@dataclass(frozen=True, eq=False)
+class Factorised:
+    """K⁺ through a Cholesky factor; BK⁺Bᵀ by one solve per row, the paper's way."""
+
+    factor: Factor
+    order: Nodes  #: components in the order of the factor; K⁺ is zero on the others
+    kernel: NDArray[np.float64]
+
+    def __call__(self, b: Vector) -> Vector:
+        """Solve."""
+        x = np.zeros_like(b)
+        x[self.order] = self.factor.solve_A(b[self.order])
+        return x
+
+    def congruence(self, B: Matrix) -> NDArray[np.float64]:
+        """Solve for all rows of B in one block."""
+        F = B @ self(B.T.toarray())
+        return np.asarray((F + F.T) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """K⁺ with its block on the components that constraints can touch."""
+
+    whole: Factorised
+    interface: Nodes  #: (c,) components
+    compliance: NDArray[np.float64]  #: (K⁺)_cc, zero where a component is prescribed
+
+    @property
+    def kernel(self) -> NDArray[np.float64]:
+        """Orthonormal basis R (n, r) of ker K."""
+        return self.whole.kernel
+
+    def __call__(self, b: Vector) -> Vector:
+        """Solve with the whole factor."""
+        return self.whole(b)
+
+    def congruence(self, B: Matrix) -> NDArray[np.float64]:
+        """Return BK⁺Bᵀ; ValueError where B touches other components."""
+        B_c = csr_array(B)[:, self.interface]
+        if B_c.count_nonzero() != B.count_nonzero():
+            raise ValueError("rows touch components outside the condensed interface")
+        F = B_c @ (B_c @ self.compliance).T
+        return np.asarray((F + F.T) / 2)
+
+
+def regular_inverse(
+    K: Matrix, free: Nodes, interface: Nodes | None = None
+) -> GeneralisedInverse:
+    """Factorise K_ff, condensed onto the free part of `interface` where it is given.
+
+    Raises
+    ------
+    sksparse.cholmod.CholmodNotPositiveDefiniteError
+        When K_ff is singular.
+
+    """
+    return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)
 
 
 def floating_inverse(
-    K: Matrix, kernels: Sequence[NDArray[np.float64]], fixing: Sequence[Nodes]
+    K: Matrix,
+    kernels: Sequence[NDArray[np.float64]],
+    fixing: Sequence[Nodes],
+    interface: Nodes | None = None,
 ) -> GeneralisedInverse:
     """Factorise the stiffness of floating bodies numbered one after another.
 
@@ -62,43 +120,40 @@ def floating_inverse(
     kernels : per body, an orthonormal basis (2N_body, r_body) of its rigid modes
     fixing : per body, the numbers (within it) of nodes that no rigid motion leaves all
         at rest: at least two that are apart
+    interface : components to condense onto
 
     """
-    R = block_array([[csr_array(k) if i == j else None for j in range(len(kernels))]
-                     for i, k in enumerate(kernels)])  # fmt: skip
     starred = []
-    for k, nodes in zip(kernels, fixing, strict=True):
+    for R, nodes in zip(kernels, fixing, strict=True):
         rows = dofs_of(nodes)
-        Q = np.zeros_like(k)
-        Q[rows] = np.linalg.qr(k[rows])[0]
+        Q = np.zeros_like(R)
+        Q[rows] = np.linalg.qr(R[rows])[0]
         starred.append(csr_array(Q))
-    blocks = [[s if i == j else None for j in range(len(starred))]
-              for i, s in enumerate(starred)]  # fmt: skip
-    R_star = csc_array(block_array(blocks))
+    R_star = csc_array(block_diag(starred))
     rho = K.diagonal().max()
-    K_rho = K + rho * (R_star @ R_star.T)
-    # R is dense per body; the QP's G = RᵀBᵀ needs it whole
-    return GeneralisedInverse(cholesky(csc_matrix(K_rho)), R.toarray())
+    K_rho = csc_array(K + rho * (R_star @ R_star.T))
+    whole = np.asarray(block_diag([csr_array(R) for R in kernels]).toarray())
+    return _inverse(K_rho, np.arange(K.shape[0]), whole, interface)
 
 
-def fixing_nodes(points: NDArray[np.float64], parts: int = FIXING_NODES) -> Nodes:
-    """Choose `parts` (a power of two) nodes (N, 2) spread over one body.
-
-    Recursive bisection across the longest principal axis; of each part, the node
-    nearest to its centroid.
-    """
-    groups = [np.arange(len(points))]
-    while len(groups) < parts:
-        groups = [half for group in groups for half in _halves(points, group)]
-    chosen = []
-    for group in groups:
-        offset = points[group] - points[group].mean(axis=0)
-        chosen.append(group[np.linalg.norm(offset, axis=1).argmin()])
-    return np.array(chosen, dtype=np.int64)
-
-
-def _halves(points: NDArray[np.float64], group: Nodes) -> tuple[Nodes, Nodes]:
-    offset = points[group] - points[group].mean(axis=0)
-    axis = np.linalg.svd(offset, full_matrices=False)[2][0]
-    order = group[np.argsort(offset @ axis, kind="stable")]
-    return order[: len(order) // 2], order[len(order) // 2 :]
+def _inverse(
+    K: csc_array, free: Nodes, kernel: NDArray[np.float64], interface: Nodes | None
+) -> GeneralisedInverse:
+    touched = np.zeros(0, np.int64) if interface is None else np.unique(interface)
+    held = ~np.isin(touched, free)
+    last = touched[~held]
+    first = np.setdiff1d(free, last, assume_unique=True)
+    inner = csc_matrix(K[first][:, first])
+    fill_reducing = analyze(inner, mode="supernodal", ordering_method="nesdis").P()
+    order = np.concatenate([first[fill_reducing], last])
+    ordered = csc_matrix(K[order][:, order])
+    factor = analyze(ordered, mode="supernodal", ordering_method="natural")
+    factor.cholesky_inplace(ordered)
+    whole = Factorised(factor, order, kernel)
+    if interface is None:
+        return whole
+    L = factor.L()[len(first) :, len(first) :].toarray()
+    lower, _ = lapack.dpotri(L, lower=1, overwrite_c=1)
+    compliance = np.zeros((touched.size, touched.size))
+    compliance[np.ix_(~held, ~held)] = np.tril(lower) + np.tril(lower, -1).T
+    return Condensed(whole, touched, compliance)

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from harness import QP, Reference, Vector
 from problems.bodies import Bodies
 from problems.contact import ContactRows
-from problems.dual import Transformed, dualise, eliminate
+from problems.dual import Transformed, dual_bounds
 from problems.inverse import GeneralisedInverse
 
 Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
+Transform = Callable[[QP, GeneralisedInverse, Vector], Transformed]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,33 +29,39 @@ class LoadPath:
 
     bodies: Bodies
     linearise: Linearise
-    clamped: GeneralisedInverse  #: of K without the prescribed components
+    inverse: GeneralisedInverse  #: K⁺ that `transform` needs
     reference: Reference
     steps: int
-    relin: int
+    relin: int = 1
+    transform: Transform = dual_bounds
     _solutions: list[Vector] = field(default_factory=list)  #: of steps 1, 2, …
 
     def primal(self, k: int) -> QP:
         """Emit the QP of step k (1 … steps), as last linearised."""
         u = self.solution(k - 1)
         for _ in range(self.relin - 1):
-            u = self._solve(self._linearised(u, k))
+            u = self._solve(self._linearised(u, k), k / self.steps)
         return self._linearised(u, k)
 
     def solution(self, k: int) -> Vector:
         """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
         while len(self._solutions) < k:
-            following = self.primal(len(self._solutions) + 1)
-            self._solutions.append(self._solve(following))
+            j = len(self._solutions) + 1
+            self._solutions.append(self._solve(self.primal(j), j / self.steps))
         return self._solutions[k - 1] if k else np.zeros(self.bodies.mesh.dofs)
 
     def _linearised(self, u: Vector, k: int) -> QP:
         rows = self.linearise(u * self.bodies.length)
         return primal_qp(self.bodies, rows, k / self.steps)
 
-    def _solve(self, primal: QP) -> Vector:
-        dual = dual_bounds(primal, self.clamped)
+    def _solve(self, primal: QP, load_factor: float) -> Vector:
+        dual = self.transform(primal, self.inverse, self._free * load_factor)
         return dual.recover(self.reference(dual.qp)).x
+
+    @cached_property
+    def _free(self) -> Vector:
+        """K⁺f: the full load without contact."""
+        return self.inverse(self.bodies.f)
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
@@ -65,15 +73,3 @@ def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP
         G=rows.B, h=rows.c / bodies.length,
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
-
-
-def dual_bounds(primal: QP, clamped: GeneralisedInverse) -> Transformed:
-    """Eliminate the Dirichlet rows, then dualise: λ_I ≥ 0 is the only constraint."""
-    first = eliminate(primal)
-    second = dualise(first.qp, clamped)
-    return Transformed(
-        second.qp,
-        lambda s: first.recover(second.recover(s)),
-        first.sign * second.sign,
-        first.sign * second.constant + first.constant,
-    )

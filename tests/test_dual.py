@@ -1,28 +1,36 @@
-"""Generalised inverse, dualisation and elimination: identities of linear algebra."""
+"""Generalised inverses, condensation and dualisation: identities of linear algebra."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.sparse import csc_array, csr_array
 
 from harness import QP, Solution, Status, kkt_residuals, no_rows
-from problems.dual import dualise, eliminate
+from problems.dual import dual_bounds, dualise
 from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.inverse import fixing_nodes, floating_inverse, regular_inverse
-from problems.mesh import half_ring, join, rectangle
+from problems.fixing import fixing_nodes, spectral_fixing_nodes
+from problems.inverse import floating_inverse, regular_inverse
+from problems.mesh import dofs_of, half_ring, join, rectangle
+from solvers.clarabel_ import Clarabel
 from solvers.reference import reference_solution
 
 D = elasticity_matrix(Material(E=2e3, nu=0.3), "strain")
 BEAM = rectangle((0, 0.5), (2, 0.25), (24, 3))
 RING = half_ring((1, 0), (0.3, 0.49), (24, 4))
+MESH, _ = join((BEAM, RING))
+TOUCHED = dofs_of(np.concatenate([MESH.boundaries[b] for b in ("outer", "bottom")]))
 
 
-@pytest.fixture(scope="module")
-def floating():
-    mesh, _ = join((BEAM, RING))
+@pytest.fixture(scope="module", params=[None, TOUCHED], ids=["factor", "condensed"])
+def floating(request):
     parts = [BEAM.points, RING.points]
-    K = stiffness(mesh, D)
+    K = stiffness(MESH, D)
     inverse = floating_inverse(
-        K, [rigid_modes(p) for p in parts], [fixing_nodes(p) for p in parts]
+        K,
+        [rigid_modes(p) for p in parts],
+        [fixing_nodes(p) for p in parts],
+        request.param,
     )
     return K, inverse
 
@@ -40,29 +48,90 @@ def test_the_kernel_is_the_whole_kernel(floating):
     R = inverse.kernel
 
     assert R.shape[1] == 6
+    assert R.T @ R == pytest.approx(np.eye(6), abs=1e-14)
     assert abs(K @ R).max() <= 1e-12 * abs(K).max()
     assert np.linalg.eigvalsh(K.toarray())[6] > 1e-8 * abs(K).max()
 
 
-def test_half_products_give_the_congruence_with_the_inverse(floating):
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_the_congruence_is_that_of_a_dense_inverse(floating, seed):
     K, inverse = floating
-    B = csr_array(np.random.default_rng(271828).standard_normal((5, K.shape[0])))
-    W = inverse.half(B)
+    rng = np.random.default_rng(seed)
+    B = np.zeros((5, K.shape[0]))
+    B[:, TOUCHED] = rng.standard_normal((5, TOUCHED.size))
+    K_plus = inverse(np.eye(K.shape[0]))
 
-    assert W.T @ W == pytest.approx(B @ inverse(B.T.toarray()), rel=1e-9)
+    F = inverse.congruence(csr_array(B))
+
+    assert (F == F.T).all()
+    assert pytest.approx(B @ K_plus @ B.T, rel=1e-9) == F
 
 
-def test_fixing_nodes_keep_the_reduced_stiffness_well_conditioned():
-    """K without the fixing nodes' dofs: far better than without one corner's edge."""
-    K = stiffness(BEAM, D).toarray()
-
-    def condition(nodes):
-        free = np.setdiff1d(
-            np.arange(BEAM.dofs), np.concatenate([2 * nodes, 2 * nodes + 1])
+@pytest.mark.parametrize("interface", [None, TOUCHED], ids=["factor", "condensed"])
+def test_a_supported_body_has_its_inverse_on_the_free_components(interface):
+    K = stiffness(MESH, D)
+    fixed = dofs_of(
+        np.concatenate(
+            [MESH.boundaries[b] for b in ("left", "left_foot", "right_foot")]
         )
-        return np.linalg.cond(K[np.ix_(free, free)])
+    )
+    free = np.setdiff1d(np.arange(MESH.dofs), fixed)
+    exact = np.zeros(K.shape)
+    exact[np.ix_(free, free)] = np.linalg.inv(K.toarray()[np.ix_(free, free)])
+    B = np.zeros((TOUCHED.size, MESH.dofs))
+    B[np.arange(TOUCHED.size), TOUCHED] = 1  # prescribed components among them
 
-    assert condition(fixing_nodes(BEAM.points)) < condition(np.array([0, 1])) / 100
+    inverse = regular_inverse(K, free, interface)
+
+    scale = abs(exact).max()
+    assert inverse(np.eye(MESH.dofs)) == pytest.approx(exact, abs=1e-10 * scale)
+    assert inverse.congruence(csr_array(B)) == pytest.approx(
+        B @ exact @ B.T, abs=1e-10 * scale
+    )
+
+
+def test_rows_outside_the_condensed_interface_are_refused():
+    K = stiffness(MESH, D)
+    fixed = dofs_of(MESH.boundaries["left"])
+    parts = [BEAM.points, RING.points]
+    inverse = floating_inverse(
+        K, [rigid_modes(p) for p in parts], [fixing_nodes(p) for p in parts], TOUCHED
+    )
+    B = csr_array((np.ones(1), ([0], [fixed[0]])), shape=(1, MESH.dofs))
+
+    with pytest.raises(ValueError, match="outside the condensed interface"):
+        inverse.congruence(B)
+
+
+def condition(mesh, nodes):
+    """Of the stiffness without the components of `nodes`."""
+    K = stiffness(mesh, D).toarray()
+    free = np.setdiff1d(np.arange(mesh.dofs), dofs_of(np.asarray(nodes)))
+    return np.linalg.cond(K[np.ix_(free, free)])
+
+
+@pytest.mark.parametrize("mesh", [BEAM, RING], ids=["beam", "ring"])
+def test_well_spread_fixing_nodes_condition_the_stiffness_well(mesh):
+    """Close to K on its range; two neighbouring nodes cost a digit and more."""
+    eigenvalues = np.linalg.eigvalsh(stiffness(mesh, D).toarray())
+    effective = eigenvalues[-1] / eigenvalues[3]
+    spectral = spectral_fixing_nodes(mesh.cells, len(mesh.points))
+
+    assert len(set(spectral)) == len(set(fixing_nodes(mesh.points))) == 4
+    assert condition(mesh, fixing_nodes(mesh.points)) < effective
+    assert condition(mesh, spectral) < effective
+    assert condition(mesh, [0, 1]) > 20 * effective
+
+
+def test_spectral_bisection_of_a_strip_finds_the_centres_of_its_quarters():
+    """The Fiedler vector of a long strip rises along it: x ≈ ¼, ¾, … of its length."""
+    strip = rectangle((0, 0), (8, 1), (32, 4))
+
+    nodes = spectral_fixing_nodes(strip.cells, len(strip.points))
+
+    x, y = strip.points[nodes].T
+    assert np.sort(x) == pytest.approx([1, 3, 5, 7], abs=0.3)
+    assert y == pytest.approx(0.5, abs=0.3)
 
 
 def clamped_bar(n=12):
@@ -73,44 +142,56 @@ def clamped_bar(n=12):
     f = np.linspace(0.1, 0.3, n)
     return QP(
         P=csc_array(K), q=-f,
-        A=csr_array(np.eye(n)[:1] * 2.0), b=np.array([0.5]),
+        A=csr_array(np.eye(n)[:1]), b=np.zeros(1),
         G=csr_array(G), h=np.full(6, 4.0),
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
 
 
-def test_elimination_and_dualisation_carry_a_solution_all_the_way_back():
+def test_the_duals_carry_a_solution_all_the_way_back():
     """The recovered point satisfies the KKT conditions of the original problem, and
-    the objectives are related as promised."""
+    the objectives are related as promised; with one support dualised or eliminated."""
     primal = clamped_bar()
-    reduced = eliminate(primal)
-    dual = dualise(reduced.qp, regular_inverse(reduced.qp.P))
+    inverse = regular_inverse(primal.P, np.arange(1, 12))
+    dual = dual_bounds(primal, inverse)
     s = reference_solution(dual.qp)
 
-    middle = dual.recover(s)
-    back = reduced.recover(middle)
+    back = dual.recover(s)
 
     assert kkt_residuals(dual.qp, s).worst < 1e-12
-    assert kkt_residuals(reduced.qp, middle).worst < 1e-12
     assert kkt_residuals(primal, back).worst < 1e-12
-    assert back.x[0] == pytest.approx(0.25)
+    assert back.x[0] == 0
     assert (back.z > 0).any()
-    energy = primal.objective(back.x)
     assert dual.sign * dual.qp.objective(s.x) + dual.constant == pytest.approx(
-        reduced.qp.objective(middle.x)
-    )
-    assert reduced.sign * reduced.qp.objective(middle.x) + reduced.constant == (
-        pytest.approx(energy)
+        primal.objective(back.x)
     )
 
 
-def test_elimination_refuses_rows_that_couple_unknowns():
-    qp = clamped_bar()
-    coupled = QP(P=qp.P, q=qp.q, A=csr_array(np.ones((1, 12))), b=qp.b,
-                 G=qp.G, h=qp.h, lb=qp.lb, ub=qp.ub)  # fmt: skip
+def test_equality_rows_become_free_multipliers():
+    primal = clamped_bar()
+    stiffer = replace(primal, P=csc_array(primal.P.toarray() + 0.1 * np.eye(12)))
+    dual = dualise(stiffer, regular_inverse(stiffer.P, np.arange(12)))
+    s = Clarabel().prepare(dual.qp, 1e-12)()
 
-    with pytest.raises(ValueError, match="exactly one entry"):
-        eliminate(coupled)
+    back = dual.recover(s)
+
+    assert np.isinf(dual.qp.lb).tolist() == [True] + 6 * [False]
+    assert kkt_residuals(stiffer, back).worst < 1e-10
+    assert dual.sign * dual.qp.objective(s.x) + dual.constant == pytest.approx(
+        stiffer.objective(back.x)
+    )
+
+
+def test_a_known_free_displacement_changes_nothing():
+    primal = clamped_bar()
+    inverse = regular_inverse(primal.P, np.arange(1, 12))
+    plain, told = (
+        dual_bounds(primal, inverse),
+        dual_bounds(primal, inverse, inverse(-primal.q)),
+    )
+
+    assert (plain.qp.q == told.qp.q).all()
+    assert plain.constant == told.constant
 
 
 def test_the_reference_finds_the_planted_active_set():
@@ -136,9 +217,9 @@ def test_the_reference_refuses_what_it_cannot_take():
 
 def test_recovery_keeps_the_claim():
     primal = clamped_bar()
-    reduced = eliminate(primal)
-    claim = Solution.without_point(reduced.qp, Status.TIME_LIMIT, "too slow")
+    dual = dual_bounds(primal, regular_inverse(primal.P, np.arange(1, 12)))
+    claim = Solution.without_point(dual.qp, Status.TIME_LIMIT, "too slow")
 
-    back = reduced.recover(claim)
+    back = dual.recover(claim)
 
     assert (back.status, back.message) == (Status.TIME_LIMIT, "too slow")

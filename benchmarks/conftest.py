@@ -1,0 +1,47 @@
+"""Races: several ways to do one thing, timed in turn in one process.
+
+Interleaving makes a drift of the machine hit all alike; what is printed at the end are
+medians, their spread, and ratios to the first.
+"""
+
+from statistics import median, quantiles
+from time import perf_counter
+
+import pytest
+
+RACES = pytest.StashKey[list]()
+
+
+def pytest_configure(config):
+    config.stash[RACES] = []
+
+
+@pytest.fixture
+def race(request):
+    """``race(first=f, second=g, rounds=9)``: call each in turn, return the medians."""
+
+    def run(*, rounds=9, **contestants):
+        for function in contestants.values():
+            function()  # warm: compilation and caches are not what is compared
+        seconds = {name: [] for name in contestants}
+        for _ in range(rounds):
+            for name, function in contestants.items():
+                start = perf_counter()
+                function()
+                seconds[name].append(perf_counter() - start)
+        request.config.stash[RACES].append((request.node.name, rounds, seconds))
+        return {name: median(times) for name, times in seconds.items()}
+
+    return run
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    for title, rounds, seconds in config.stash[RACES]:
+        terminalreporter.section(f"{title}: medians of {rounds} interleaved rounds")
+        first = median(next(iter(seconds.values())))
+        for name, times in seconds.items():
+            low, _, high = quantiles(times, n=4) if len(times) > 1 else 3 * times
+            terminalreporter.write_line(
+                f"{name:<32} {1e3 * median(times):10.2f} ms"
+                f"   [{1e3 * low:.2f}, {1e3 * high:.2f}]   × {median(times) / first:.2f}"
+            )

@@ -1,0 +1,50 @@
+"""Contact linearisation at the paper's size, and what the search costs per segment."""
+
+import numpy as np
+import pytest
+
+from problems.beam_ring import model
+from problems.contact import node_to_segment
+from problems.mortar import mortar
+from problems.polyline import polyline
+from problems.search import nearest
+
+
+@pytest.mark.parametrize("method", [node_to_segment, mortar])
+def test_ten_linearisations(benchmark, method):
+    bodies = model(30, 15, 30, "strain")
+    points, (pair,) = bodies.mesh.points, bodies.pairs
+    # a beam that sags by up to 0.1 m, as in the paper's ten steps
+    sag = np.column_stack([np.zeros(len(points)), -0.025 * points[:, 0] ** 2]).ravel()
+
+    def linearise():
+        return [method(points, k / 10 * sag, *pair) for k in range(1, 11)]
+
+    assert len(benchmark(linearise)) == 10
+
+
+@pytest.mark.parametrize("segments", [100, 1000, 10_000])
+def test_search(benchmark, segments):
+    """As many nodes on a half ring as segments on a bent beam, far on the flanks."""
+    theta = np.pi * np.arange(segments) / (segments - 1)
+    ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
+    x = 2 * np.arange(segments + 1) / segments
+    beam = np.column_stack([x, 0.5 - 0.025 * x**2])
+
+    found = benchmark(lambda: nearest(ring, polyline(beam, "master")))
+
+    assert len(found.segment) == segments
+
+
+@pytest.mark.parametrize("segments", [100, 1000, 10_000])
+@pytest.mark.parametrize("method", [node_to_segment, mortar])
+def test_linearisation_of_many_segments(benchmark, method, segments):
+    theta = np.pi * np.arange(segments + 1) / segments
+    ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
+    x = 2 * np.arange(segments + 1) / segments
+    points = np.concatenate([ring, np.column_stack([x, 0.5 - 0.025 * x**2])])
+    slave, master = np.arange(2 * segments + 2).reshape(2, -1)
+
+    rows = benchmark(method, points, np.zeros(points.size), slave, master)
+
+    assert rows.B.shape[1] == points.size

@@ -1,0 +1,37 @@
+"""F and d of all ten load steps: condensed, and by solves for the rows of each step."""
+
+import numpy as np
+import pytest
+
+from problems.beam_ring import BeamRing, model
+from problems.bodies import floating
+from problems.dual import dualise
+from solvers.reference import reference_solution
+
+
+@pytest.fixture(scope="module")
+def steps():
+    family = BeamRing()
+    given = [{"Nr": 30, "Nh": 15, "step": k} for k in range(1, 11)]
+    return [
+        family.build("primal", family.complete(g), reference_solution).qp for g in given
+    ]
+
+
+def test_dualisation_of_ten_steps(race, steps):
+    bodies = model(30, 15, 30, "strain")
+    factor, condensed = floating(bodies, condense=False), floating(bodies)
+
+    def all_steps(inverse):
+        return [dualise(primal, inverse).qp for primal in steps]
+
+    race(
+        condensed_with_setup=lambda: all_steps(floating(bodies)),
+        condensed_without_setup=lambda: all_steps(condensed),
+        blocked_solves_factor_given=lambda: all_steps(factor),
+        rounds=5,
+    )
+
+    for a, b in zip(all_steps(condensed), all_steps(factor), strict=True):
+        assert abs(a.P - b.P).max() <= 1e-9 * abs(b.P).max()
+        assert abs(a.q - b.q).max() <= 1e-9 * np.abs(b.q).max()

@@ -1,0 +1,86 @@
+"""Where to fix a floating body: a few nodes spread over it.
+
+The better they are spread, the better K without them is conditioned; two neighbouring
+corners cost three digits, four nodes at the centres of as many parts next to none.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import laplacian
+from scipy.sparse.linalg import eigsh
+
+from harness import Matrix
+from problems.mesh import Nodes
+
+PARTS = 4  #: per body; fewer condition worse, more fill the factor
+
+
+def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
+    """Choose `parts` (a power of two) of the nodes (N, 2) of one body by geometry.
+
+    Recursive bisection across the longest principal axis; of each part, the node
+    nearest to its centroid.
+    """
+    groups = [np.arange(len(points))]
+    while len(groups) < parts:
+        groups = [half for group in groups for half in _halves(points, group)]
+    chosen = []
+    for group in groups:
+        offset = points[group] - points[group].mean(axis=0)
+        chosen.append(group[np.linalg.norm(offset, axis=1).argmin()])
+    return np.array(chosen, dtype=np.int64)
+
+
+def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes:
+    """Choose them by the spectra of the mesh graph, as the paper and its [8] do.
+
+    Recursive bisection at the median of the Fiedler vector (the second eigenvector of
+    the graph Laplacian); of each part, the node with the largest entry of the Perron
+    vector of its adjacency matrix, its most central one.
+
+    Parameters
+    ----------
+    cells : (E, 4) node numbers of one body, 0 … nodes − 1
+
+    """
+    graph = _graph(cells, nodes)
+    groups = [np.arange(nodes)]
+    while len(groups) < parts:
+        groups = [half for group in groups for half in _bisected(graph, group)]
+    return np.array([_central(graph, group) for group in groups], dtype=np.int64)
+
+
+def _graph(cells: Nodes, nodes: int) -> csr_array:
+    """Adjacency of nodes that share an edge."""
+    a, b = cells.ravel(), np.roll(cells, -1, axis=1).ravel()
+    ones = np.ones(2 * a.size)
+    ends = (np.concatenate([a, b]), np.concatenate([b, a]))
+    graph = csr_array(coo_array((ones, ends), shape=(nodes, nodes)))
+    graph.data[:] = 1.0
+    return graph
+
+
+def _bisected(graph: Matrix, group: Nodes) -> tuple[Nodes, Nodes]:
+    part = laplacian(graph[group][:, group]).tocsc()
+    shift = -1e-3 / group.size  # just below the zero eigenvalue: L − σI is definite
+    start = np.linspace(-1, 1, group.size)  # eigsh draws one at random otherwise
+    values, vectors = eigsh(part, k=2, sigma=shift, which="LM", v0=start)
+    order = group[np.argsort(vectors[:, values.argmax()], kind="stable")]
+    return order[: len(order) // 2], order[len(order) // 2 :]
+
+
+def _central(graph: Matrix, group: Nodes) -> int:
+    if group.size < 3:
+        return int(group[0])
+    _, vector = eigsh(graph[group][:, group], k=1, which="LA", v0=np.ones(group.size))
+    return int(group[np.abs(vector[:, 0]).argmax()])
+
+
+def _halves(points: NDArray[np.float64], group: Nodes) -> tuple[Nodes, Nodes]:
+    offset = points[group] - points[group].mean(axis=0)
+    axis = np.linalg.svd(offset, full_matrices=False)[2][0]
+    order = group[np.argsort(offset @ axis, kind="stable")]
+    return order[: len(order) // 2], order[len(order) // 2 :]
