@@ -7,22 +7,42 @@ order in the total displacement u, with slave and parameters held,
 
     (x_s − x_c)·n ≥ 0    ⟺    B u ≤ c,    B = [−n at s, +N_a n at a],  c = g + B u^k
 
-(the paper's B_M u ≤ c_M; its "Mortar" is this pointwise condition). Where the closest
-point is a vertex of the master, n is the averaged normal of the segments that meet.
+(the paper's B_M u ≤ c_M; its "Mortar" is this pointwise condition, which fails the
+contact patch test; problems.mortar passes it). The normal is
+
+* "segment": of the segment that holds the closest point, and where that is a vertex the
+  averaged normal of the segments that meet. Where the closest point is inside a
+  segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment;
+* "averaged": interpolated between the averaged normals of the segment's ends,
+  n ∥ Σ N_a n_a, which does not jump when a node slides over a vertex.
+
+Beyond the end of the master its last node is the closest point, with the normal of the
+last segment.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from harness import Vector
-from problems.mesh import Nodes, as_vectors
+from problems.mesh import Nodes
+from problems.polyline import (
+    Points,
+    Polyline,
+    current_polyline,
+    current_positions,
+    polyline,
+    unit,
+)
+from problems.search import Reach, nearest
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
+
+Normals = Literal["segment", "averaged"]
 
 
 class ContactRows(NamedTuple):
@@ -33,62 +53,99 @@ class ContactRows(NamedTuple):
 
 
 class ClosestPoints(NamedTuple):
-    """Closest points on a polyline."""
+    """Closest points on a chain of nodes."""
 
-    segment: Nodes  #: (s,) segment that holds the closest point
-    xi: Vector  #: (s,) its position there, 0 at the first node and 1 at the second
-    normal: NDArray[np.float64]  #: (s, 2) outward unit normal of the master there
+    segment: Nodes  #: (s,) the closest point lies between this node and the next
+    xi: Vector  #: (s,) its place there, 0 at the first node and 1 at the second
+    normal: Points  #: (s, 2) outward unit normal of the master there
 
 
 def node_to_segment(
-    points: NDArray[np.float64], u: Vector, slave: Nodes, master: Nodes
+    points: Points,
+    u: Vector,
+    slave: Nodes,
+    master: Nodes,
+    *,
+    normals: Normals = "segment",
+    reach: Reach | None = None,
 ) -> ContactRows:
     """Linearise the non-penetration of the slave nodes into the master boundary at u.
 
     Parameters
     ----------
-    points : (N, 2) reference positions X
-    u : (2N,) displacement u^k at which to linearise
-    slave : (s,) nodes; each gets one row
+    points : (N, 2) reference positions X, m
+    u : (2N,) displacement u^k at which to linearise, m
+    slave : (s,) chain of nodes, its body on the left
     master : (v,) chain of nodes, its body on the left
+    normals : "segment" or "averaged", of the master
+    reach : drops the nodes that do not face their closest point or are too far from
+        it; None keeps a row for every slave node
+
+    Raises
+    ------
+    InputError
+        When a position is not finite or a chain needed has no segment.
 
     """
-    x = points + as_vectors(u)
-    at = closest_points(x[slave], x[master])
-    N = np.stack([1 - at.xi, at.xi])
-    ends = np.stack([master[at.segment], master[at.segment + 1]])
-    foot = np.einsum("as,asx->sx", N, x[ends])
-    gap = np.einsum("sx,sx->s", x[slave] - foot, at.normal)
+    x = current_positions(points, u, slave, "slave")
+    line = current_polyline(points, u, master, "master")
+    at = closest_points(x, line, normals)
+    N = np.stack([1 - at.xi, at.xi], axis=1)
+    ends = np.stack([at.segment, at.segment + 1], axis=1)
+    foot = np.einsum("sa,sax->sx", N, line.x[ends])
+    gap = np.einsum("sx,sx->s", x - foot, at.normal)
 
-    weight = np.concatenate([-np.ones((1, len(slave))), N])  # of s, 1, 2
-    node = np.concatenate([slave[None], ends])
-    values = weight[:, :, None] * at.normal
-    columns = np.stack([2 * node, 2 * node + 1], axis=-1)
-    rows = np.broadcast_to(np.arange(len(slave))[None, :, None], columns.shape)
-    shape = (len(slave), points.size)
-    B = csr_array(coo_array((values.ravel(), (rows.ravel(), columns.ravel())), shape))
-    B.eliminate_zeros()
-    return ContactRows(B, gap + B @ u)
+    node = np.column_stack([slave, master[ends]])  # s, 1, 2
+    weight = np.column_stack([-np.ones(len(slave)), N])
+    rows = normal_rows(node, weight, at.normal, points.size)
+    c = gap + rows @ u
+    if reach is None:
+        return ContactRows(rows, c)
+    kept = _in_reach(polyline(x, "slave"), line, at, foot, reach)
+    return ContactRows(rows[kept], c[kept])
 
 
 def closest_points(
-    x: NDArray[np.float64], polyline: NDArray[np.float64]
+    x: Points, line: Polyline, normals: Normals = "segment"
 ) -> ClosestPoints:
-    """Find the closest points on a polyline (v, 2) and its outward normals there."""
-    start, edge = polyline[:-1], np.diff(polyline, axis=0)
-    length = np.linalg.norm(edge, axis=1)
-    offset = x[:, None] - start  # (s, segments, 2)
-    xi = np.clip(np.einsum("sex,ex->se", offset, edge) / length**2, 0, 1)
-    distance = np.linalg.norm(offset - xi[..., None] * edge, axis=-1)
-    segment = distance.argmin(axis=1)
-    xi = xi[np.arange(len(x)), segment]
+    """Find the closest points of x (s, 2) on a chain and its outward normals there."""
+    segment, xi = nearest(x, line)
+    first = line.first[segment]
+    at_first, at_second = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
+    xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
+    n_1, n_2 = line.node_normal[first], line.node_normal[first + 1]
+    normal = line.normal[segment]
+    if normals == "averaged":
+        normal = unit((1 - xi)[:, None] * n_1 + xi[:, None] * n_2, normal)
+    else:
+        normal = np.where(at_first[:, None], n_1, normal)
+        normal = np.where(at_second[:, None], n_2, normal)
+    return ClosestPoints(first, xi, normal)
 
-    normals = np.column_stack([edge[:, 1], -edge[:, 0]]) / length[:, None]
-    padded = np.concatenate([normals[:1], normals, normals[-1:]])
-    vertex = padded[:-1] + padded[1:]
-    vertex /= np.linalg.norm(vertex, axis=1)[:, None]
-    first, last = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
-    normal = normals[segment]
-    normal[first] = vertex[segment[first]]
-    normal[last] = vertex[segment[last] + 1]
-    return ClosestPoints(segment, np.where(first, 0, np.where(last, 1, xi)), normal)
+
+def normal_rows(node: Nodes, weight: Vector, normal: Points, size: int) -> csr_array:
+    """Build the rows of B that weight the normal displacements of equally many nodes.
+
+    Row r is Σ_a weight_ra · normal_r at the components of node_ra: node and weight are
+    (m, k), normal is (m, 2), the result (m, size) without stored zeros.
+    """
+    m, k = node.shape
+    columns = np.stack([2 * node, 2 * node + 1], axis=-1)
+    values = weight[:, :, None] * normal[:, None, :]
+    indptr = 2 * k * np.arange(m + 1)
+    B = csr_array((values.ravel(), columns.ravel(), indptr), shape=(m, size))
+    B.sum_duplicates()
+    B.eliminate_zeros()
+    return B
+
+
+def _in_reach(
+    slave: Polyline, master: Polyline, at: ClosestPoints, foot: Points, reach: Reach
+) -> NDArray[np.bool_]:
+    """Say which slave nodes face their closest point and are near enough, (s,)."""
+    cosine = np.einsum("sx,sx->s", slave.node_normal, at.normal)
+    distance = np.linalg.norm(slave.x - foot, axis=1)
+    kept: NDArray[np.bool_] = (cosine <= reach.cosine) & (
+        distance <= reach.within(slave, master)
+    )
+    return kept

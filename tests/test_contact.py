@@ -3,17 +3,32 @@
 import numpy as np
 import pytest
 
-from problems.contact import closest_points, node_to_segment
+from harness import InputError
+from problems import contact
+from problems.contact import node_to_segment
+from problems.polyline import polyline
+from problems.search import Reach
 
 #: a master below the slave: body under the chain means the chain runs right to left
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
 
 
-def rows(slave, master, u=None):
+#: above MASTER, its body on the left: it runs from left to right
+FLAT = np.array([[0.5, 0.25], [1.5, 0.25], [2.5, 0.25]])
+ROOF = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
+ANY_ANGLE = 1.0
+
+
+def rows(slave, master, u=None, **options):
     points = np.concatenate([slave, master])
     n = len(slave)
     u = np.zeros(points.size) if u is None else u
-    return node_to_segment(points, u, np.arange(n), np.arange(n, len(points)))
+    chains = np.arange(n), np.arange(n, len(points))
+    return node_to_segment(points, u, *chains, **options)
+
+
+def closest_points(x, chain, *normals):
+    return contact.closest_points(x, polyline(chain, "master"), *normals)
 
 
 def test_a_node_above_a_segment_may_descend_by_its_gap():
@@ -31,13 +46,20 @@ def test_a_penetrated_node_has_a_negative_gap():
 
 
 def test_at_a_vertex_the_normal_is_averaged_and_the_vertex_carries_the_force():
-    roof = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
-    B, c = rows(np.array([[1.0, 1.5]]), roof)
+    B, c = rows(np.array([[1.0, 1.5]]), ROOF)
 
     assert c == pytest.approx([0.5])
     assert B.toarray() == pytest.approx(
         np.array([[0, -1, 0, 0, 0, 1, 0, 0]]), abs=1e-15
     )
+
+
+@pytest.mark.parametrize("aside", [-1e-10, 1e-10])
+def test_a_node_next_to_a_vertex_is_on_it(aside):
+    at = closest_points(np.array([[1.0 + aside, 1.0 - abs(aside)]]), ROOF)
+
+    assert at.xi[0] in (0, 1)
+    assert at.normal == pytest.approx(np.array([[0, 1]]))
 
 
 def test_beyond_the_end_of_the_chain_the_last_node_is_the_closest_point():
@@ -103,3 +125,146 @@ def test_the_linearised_gap_is_exact_to_first_order():
         errors.append(abs(true_gap - (c - B @ du)).max())
 
     assert errors[1] < errors[0] / 50
+
+
+def test_a_node_exactly_on_a_vertex_has_no_gap_and_the_averaged_normal():
+    B, c = rows(ROOF[1:2], ROOF)
+
+    assert c == pytest.approx([0], abs=1e-15)
+    assert B.toarray() == pytest.approx(
+        np.array([[0, -1, 0, 0, 0, 1, 0, 0]]), abs=1e-15
+    )
+
+
+def test_a_node_on_an_end_of_the_master_has_the_normal_of_the_last_segment():
+    B, c = rows(ROOF[2:], ROOF)
+
+    n = np.array([-1, 1]) / np.sqrt(2)
+    assert c == pytest.approx([0], abs=1e-15)
+    assert B.toarray() == pytest.approx(np.array([[*-n, 0, 0, 0, 0, *n]]))
+
+
+def test_a_master_of_one_segment_has_an_inside_and_two_ends():
+    at = closest_points(np.array([[3.0, 1.0], [-1.0, 0.0], [9.0, 0.5]]), MASTER[::2])
+
+    assert at.segment.tolist() == [0, 0, 0]
+    assert at.xi.tolist() == [0.25, 1, 0]
+    assert at.normal == pytest.approx(np.array([[0, 1]] * 3))
+
+
+@pytest.mark.parametrize("normals", ["segment", "averaged"])
+def test_segments_without_length_change_nothing(normals):
+    """Every node of the roof occurs twice; forces go to one node of each place."""
+    slave = np.array([[0.2, 0.5], [0.6, 1.1], [1.0, 1.2], [1.0, 1.2], [2.5, 0.0]])
+    once = rows(slave, ROOF, normals=normals)
+    twice = rows(slave, np.repeat(ROOF, 2, axis=0), normals=normals)
+
+    place = twice.B.toarray()[:, 10:].reshape(5, 3, 2, 2).sum(axis=2)
+    assert twice.c == pytest.approx(once.c)
+    assert place.reshape(5, 6) == pytest.approx(once.B.toarray()[:, 10:])
+
+
+def test_slave_segments_without_length_keep_their_nodes_in_reach():
+    near = Reach(distance=0.3)
+    B, c = rows(np.repeat(FLAT, 2, axis=0), MASTER, reach=near)
+
+    assert B.shape[0] == 6
+    assert c == pytest.approx(0.25)
+
+
+def test_a_master_that_folds_back_onto_itself_has_finite_rows():
+    needle = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
+    for normals in ("segment", "averaged"):
+        B, c = rows(np.array([[1.0, 0.0], [1.5, 0.0], [0.5, 0.1]]), needle,
+                    normals=normals)  # fmt: skip
+
+        assert np.isfinite(c).all()
+        on_slaves = B.toarray()[:, :6].reshape(3, 3, 2).sum(axis=1)
+        assert np.linalg.norm(on_slaves, axis=1) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("master", "message"),
+    [(MASTER[:1], "master: 1 node"), (MASTER[[0, 0]], "master: 2 node"),
+     (MASTER * np.nan, "master: node 1 is at")],
+)  # fmt: skip
+def test_a_master_without_a_segment_or_a_place_is_refused(master, message):
+    with pytest.raises(InputError, match=message):
+        rows(np.array([[1.0, 0.25]]), master)
+
+
+def test_a_slave_that_has_flown_away_is_refused():
+    with pytest.raises(InputError, match=r"slave: node 0 is at \[inf, 0.25\]"):
+        rows(np.array([[np.inf, 0.25]]), MASTER)
+
+
+def test_averaged_normals_are_interpolated_along_a_segment():
+    """Half way from the apex (0, 1) to the foot of the roof (1, 1)/√2."""
+    at = closest_points(np.array([[2.0, 1.0]]), ROOF, "averaged")
+    mean = np.array([np.sqrt(0.5), 1 + np.sqrt(0.5)])
+
+    assert at.xi == pytest.approx([0.5])
+    assert at.normal[0] == pytest.approx(mean / np.linalg.norm(mean))
+
+
+def test_averaged_normals_do_not_jump_where_a_node_slides_over_a_vertex():
+    sides = 1.0 + np.array([-1e-6, 1e-6])  # just above either slope
+    x = np.column_stack([sides, 1.0 - abs(sides - 1) + 1e-7])
+    by_segment = closest_points(x, ROOF).normal
+    averaged = closest_points(x, ROOF, "averaged").normal
+
+    assert np.linalg.norm(by_segment[1] - by_segment[0]) == pytest.approx(np.sqrt(2))
+    assert np.linalg.norm(averaged[1] - averaged[0]) < 1e-5
+
+
+def test_averaged_normals_of_a_flat_master_are_its_normal():
+    slave = np.array([[0.3, 0.2], [2.0, 0.3], [4.5, 0.1]])
+    one, other = rows(slave, MASTER), rows(slave, MASTER, normals="averaged")
+
+    assert (one.B != other.B).nnz == 0
+    assert (one.c == other.c).all()
+
+
+@pytest.mark.parametrize(
+    ("reach", "kept"),
+    [(None, 3), (Reach(), 3), (Reach(distance=0.3), 3), (Reach(distance=0.2), 0)],
+)
+def test_nodes_farther_than_the_reach_get_no_row(reach, kept):
+    B, c = rows(FLAT, MASTER, reach=reach)
+
+    assert B.shape == (kept, 12)
+    assert c.shape == (kept,)
+
+
+def test_the_distance_is_to_the_closest_point_and_not_along_the_normal():
+    beside = np.array([[4.5, 0.25], [5.5, 0.25]])  # 0.56 and 1.52 off the end
+
+    assert rows(beside, MASTER, reach=Reach(distance=1.0)).B.shape[0] == 1
+
+
+def test_nodes_that_do_not_face_their_closest_point_get_no_row():
+    """The left flank of a box, its corner and its underside above a flat master."""
+    box = np.array([[1.0, 2.0], [1.0, 1.5], [1.0, 1.0], [2.0, 1.0], [3.0, 1.0]])
+
+    def slaves(reach):
+        return np.unique(rows(box, MASTER, reach=reach).B[:, :10].nonzero()[1] // 2)
+
+    assert slaves(Reach()).tolist() == [2, 3, 4]  # the corner is 45° off
+    assert slaves(Reach(cosine=-0.8)).tolist() == [3, 4]
+    assert slaves(Reach(cosine=ANY_ANGLE)).tolist() == [0, 1, 2, 3, 4]
+
+
+def test_a_slave_that_runs_the_wrong_way_is_out_of_reach_everywhere():
+    assert rows(FLAT[::-1], MASTER, reach=Reach()).B.shape == (0, 12)
+
+
+def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
+    """Self-contact: the closest point of a master node is that node."""
+    points = np.concatenate([MASTER, [[1.0, 0.25]]])
+    B, c = node_to_segment(points, np.zeros(8), np.array([1, 3]), np.arange(3))
+
+    assert B.has_canonical_format
+    assert B.toarray() == pytest.approx(
+        np.array([[0] * 8, [0, 0, 0, 0.5, 0, 0.5, 0, -1]])
+    )
+    assert c == pytest.approx([0, 0.25])

@@ -1,0 +1,131 @@
+"""What holds for every pair of sides, in random shapes and motions."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from problems.contact import closest_points, node_to_segment
+from problems.mortar import mortar
+from problems.polyline import polyline
+from problems.search import Reach
+
+quick = settings(derandomize=True, max_examples=40, deadline=None)
+
+
+def numbers(shape, low, high):
+    return arrays(float, shape, elements=st.floats(low, high))
+
+
+@st.composite
+def sides(draw):
+    """Wavy slave above a wavy master that may be longer, shorter or penetrated."""
+    s, m = draw(st.integers(2, 9)), draw(st.integers(2, 9))
+    left, width = draw(st.floats(-0.4, 0.4)), draw(st.floats(0.5, 1.5))
+    distance = draw(st.floats(-0.1, 0.4))
+    x = left + width * np.linspace(0, 1, s)
+    slave = np.column_stack([x, distance + draw(numbers(s, -0.1, 0.1))])
+    x = np.linspace(1, 0, m)
+    master = np.column_stack([x, draw(numbers(m, -0.1, 0.1))])
+    u = draw(numbers(2 * (s + m), -0.02, 0.02))
+    return np.concatenate([slave, master]), u, np.arange(s), s + np.arange(m)
+
+
+METHODS = {
+    "segment": node_to_segment,
+    "averaged": lambda *side: node_to_segment(*side, normals="averaged"),
+    "reach": lambda *side: node_to_segment(*side, reach=Reach()),
+    "dual": mortar,
+    "standard": lambda *side: mortar(*side, basis="standard"),
+}
+every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+
+
+@every_method
+@quick
+@given(side=sides())
+def test_rows_are_blind_to_translations(method, side):
+    B, c = method(*side)
+    forces = B.toarray().reshape(len(c), len(side[0]), 2)
+
+    assert np.isfinite(c).all()
+    # a sliver of cover extrapolates with large entries that cancel
+    size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
+    assert forces.sum(axis=1) / size == pytest.approx(0, abs=1e-14)
+
+
+@quick
+@given(side=sides())
+def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
+    points, u, slave, master = side
+    B, _ = node_to_segment(*side)
+    x = points + u.reshape(-1, 2)
+    at = closest_points(x[slave], polyline(x[master], "master"))
+    inside = (at.xi > 0) & (at.xi < 1)
+
+    forces = B.toarray().reshape(len(slave), -1, 2)
+    moment = forces[..., 1] @ x[:, 0] - forces[..., 0] @ x[:, 1]
+    assert moment[inside] == pytest.approx(0, abs=1e-14)
+
+
+@every_method
+@quick
+@given(side=sides(), seed=st.integers(10, 10**6))
+def test_the_dual_hessian_is_symmetric_positive_semidefinite(method, side, seed):
+    points = side[0]
+    root = np.random.default_rng(seed).standard_normal((points.size, points.size))
+    compliance = root @ root.T / points.size + 0.1 * np.eye(points.size)
+    B, c = method(*side)
+    F = B @ compliance @ B.T.toarray()
+
+    scale = 1 + np.abs(F).max(initial=0.0)
+    assert pytest.approx(F.T, abs=1e-13 * scale) == F
+    if len(c):
+        assert np.linalg.eigvalsh(F).min() > -1e-12 * scale
+
+
+@every_method
+@quick
+@given(side=sides(), seed=st.integers(10, 10**6))
+def test_numbering_of_the_nodes_does_not_matter(method, side, seed):
+    points, u, slave, master = side
+    number = np.random.default_rng(seed).permutation(len(points))
+    renamed, v = np.empty_like(points), np.empty_like(points)
+    renamed[number], v[number] = points, u.reshape(-1, 2)
+    B, c = method(*side)
+    B_renamed, c_renamed = method(renamed, v.ravel(), number[slave], number[master])
+
+    columns = (2 * number[:, None] + [0, 1]).ravel()
+    assert c_renamed == pytest.approx(c, rel=1e-12, abs=1e-13)
+    assert (B_renamed[:, columns] - B).toarray() == pytest.approx(0, abs=1e-14)
+
+
+@pytest.mark.parametrize("normals", ["segment", "averaged"])
+@quick
+@given(side=sides(), seed=st.integers(10, 10**6))
+def test_the_order_of_the_slave_nodes_only_orders_the_rows(normals, side, seed):
+    points, u, slave, master = side
+    order = np.random.default_rng(seed).permutation(len(slave))
+    B, c = node_to_segment(*side, normals=normals)
+    B_o, c_o = node_to_segment(points, u, slave[order], master, normals=normals)
+
+    assert (B_o != B[order]).nnz == 0
+    assert (c_o == c[order]).all()
+
+
+@quick
+@given(side=sides())
+def test_the_gap_is_what_the_inequality_leaves_at_the_linearisation_point(side):
+    """c − B u is the signed distance where the closest point is inside a segment."""
+    points, u, slave, master = side
+    B, c = node_to_segment(*side)
+    x = points + u.reshape(-1, 2)
+    at = closest_points(x[slave], polyline(x[master], "master"))
+    inside = (at.xi > 0) & (at.xi < 1)
+
+    edge = np.diff(x[master], axis=0)
+    offset = x[slave][:, None] - x[master][:-1]
+    xi = np.clip(np.einsum("sex,ex->se", offset, edge) / (edge**2).sum(axis=1), 0, 1)
+    distance = np.linalg.norm(offset - xi[..., None] * edge, axis=-1).min(axis=1)
+    assert abs(c - B @ u)[inside] == pytest.approx(distance[inside], abs=1e-14)

@@ -1,0 +1,382 @@
+"""Mortar integrals against exact numbers, invariants and rates."""
+
+import numpy as np
+import pytest
+
+from harness import InputError
+from problems import mortar as module
+from problems.beam_ring import model
+from problems.mortar import cast_rays, integrate, mortar, overlaps, project
+from problems.polyline import polyline
+from problems.search import Reach
+
+BASES = ["dual", "standard"]
+ANY_ANGLE = Reach(cosine=1.0)
+
+
+def sides(slave, master):
+    return polyline(np.asarray(slave, float), "s"), polyline(
+        np.asarray(master, float), "m"
+    )
+
+
+def rows(slave, master, u=None, **options):
+    points = np.concatenate([slave, master])
+    u = np.zeros(points.size) if u is None else u
+    s = len(slave)
+    return mortar(points, u, np.arange(s), np.arange(s, len(points)), **options)
+
+
+def flat(n, y, *, rightwards, left=0.0, right=1.0):
+    x = np.linspace(left, right, n + 1)
+    return np.column_stack([x if rightwards else x[::-1], np.full(n + 1, y)])
+
+
+def arcs(n, master_share=0.9):
+    """A slave bump of radius 1 in a master groove of radius 1.05, 10:9 segments."""
+
+    def bow(n, radius, start, stop):
+        t = np.linspace(start, stop, n + 1)
+        return radius * np.column_stack([np.sin(t), -np.cos(t)])
+
+    master = bow(round(master_share * n), 1.05, 0.8, -0.8)
+    return bow(n, 1.0, -0.7, 0.7), master
+
+
+# exact numbers --------------------------------------------------------------------
+
+
+def test_normals_of_a_known_polyline():
+    normal = polyline(np.array([[0.0, 0], [4, 3], [7, 7]]), "slave").node_normal
+
+    expected = [[3 / 5, -4 / 5], [np.sqrt(0.5), -np.sqrt(0.5)], [4 / 5, -3 / 5]]
+    assert normal == pytest.approx(np.array(expected))
+
+
+def test_a_master_node_is_projected_along_the_normal_field():
+    x = np.array([[[0.0, 0.0]], [[4.0, 3.0]]])
+    n = np.array([[[3 / 5, -4 / 5]], [[np.sqrt(0.5), -np.sqrt(0.5)]]])
+
+    xi = project(x, n, np.array([[4.0, -2.0]]))
+    assert xi == pytest.approx([-0.281575016087237], abs=1e-15)
+
+
+def test_a_ray_meets_the_master_where_the_lines_cross():
+    """From the middle of (0,0)-(2,0) down to the line through (0,-1) and (2,-3)."""
+    s, m = sides([[0, 0], [2, 0]], [[2, -3], [0, -1]])
+    at = cast_rays(s, m, overlaps(s, m), Reach())
+
+    assert at.xi[0, 1] == pytest.approx(0)
+    assert at.beta[0, 1] == pytest.approx(0.5)
+    assert at.gap[0, 1] == pytest.approx(2)
+
+
+def test_integrals_of_a_half_covered_segment():
+    s, m = sides([[1, 2], [3, 2]], [[2, 2], [0, 2]])
+    part = overlaps(s, m)
+    I = integrate(s, m, "standard", Reach())
+
+    assert part.xi == pytest.approx(np.array([[-1, 0]]))
+    assert I.D.toarray() == pytest.approx(np.array([[14, 4], [4, 2]]) / 24)
+    assert I.M.toarray() == pytest.approx(np.array([[13, 5], [5, 1]]) / 24)
+    assert I.cover == pytest.approx([18 / 24, 6 / 24])
+    assert I.gap == pytest.approx([0, 0])
+
+
+def test_the_dual_basis_of_a_full_segment_is_2_minus_1():
+    s, m = sides([[0, 0], [2, 0]], [[2, -1], [0, -1]])
+    at = cast_rays(s, m, overlaps(s, m), Reach())
+
+    N = np.stack([(1 - at.xi) / 2, (1 + at.xi) / 2], axis=-1)
+    assert module._dual(at) == pytest.approx(N @ [[2, -1], [-1, 2]])
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_the_gap_of_parallel_sides_is_their_distance_in_every_row(basis):
+    B, c = rows(flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False),
+                basis=basis)  # fmt: skip
+
+    assert c == pytest.approx(np.full(8, 0.25))
+    assert B.shape == (8, 28)
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
+    """With Φ biorthogonal ∫Φ_j g/∫N_j is g_j; with N it is an average."""
+    slave, master = flat(4, 0.5, rightwards=True), np.array([[2.0, 0.2], [-1.0, -0.1]])
+    gap = 0.5 - 0.1 * slave[:, 0]
+    _, c = rows(slave, master, basis=basis)
+
+    if basis == "dual":
+        assert c == pytest.approx(gap)
+    else:
+        assert c[1:4] == pytest.approx(gap[1:4])
+        assert c[[0, 4]] == pytest.approx(0.5 - 0.1 * np.array([1 / 12, 11 / 12]))
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_the_constraint_is_on_the_total_displacement(basis):
+    """Pushing a flat slave down by u changes the true gap, not the inequality."""
+    slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
+    u = np.zeros((14, 2))
+    u[:8, 1] = -0.3
+    B, c = rows(slave, master, basis=basis)
+    B_moved, c_moved = rows(slave, master, u.ravel(), basis=basis)
+
+    assert B_moved.toarray() == pytest.approx(B.toarray())
+    assert c_moved == pytest.approx(c)
+    assert (c - B @ u.ravel()) == pytest.approx(-0.05)
+
+
+# invariants -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "right", [0.5, 0.2, 0.05, 1e-6], ids=lambda r: f"to {r} of the last"
+)
+def test_the_dual_basis_is_biorthogonal_on_what_is_covered(right):
+    """∫Φ_j N_k = δ_jk ∫N_k per segment, the last of four covered in part."""
+    slave = flat(4, 0.0, rightwards=True, right=4.0)
+    s, m = sides(slave, flat(7, -0.1, rightwards=False, left=-1.0, right=3 + right))
+    at = cast_rays(s, m, overlaps(s, m), Reach())
+    N = np.stack([(1 - at.xi) / 2, (1 + at.xi) / 2], axis=-1)
+    phi = module._dual(at)
+
+    for e in range(4):
+        on = at.slave == e
+        product = np.einsum("pg,pgj,pgk->jk", at.weight[on], phi[on], N[on])
+        measure = np.einsum("pg,pgk->k", at.weight[on], N[on])
+        assert product / measure[:, None] == pytest.approx(np.eye(2), abs=1e-8)
+        assert (product / measure)[[0, 1], [0, 1]] == pytest.approx(1, abs=1e-8)
+
+
+def test_D_of_the_dual_basis_is_diagonal_and_equals_the_cover():
+    I = integrate(*sides(*arcs(20)), "dual", Reach())
+
+    assert I.D.nnz == 21
+    assert I.D.diagonal() == pytest.approx(I.cover, rel=1e-13)
+
+
+def test_a_sliver_of_cover_keeps_D_equal_to_the_cover():
+    slave, master = flat(7, 0.0, rightwards=True), [[3 / 7 + 1e-7, 0], [-1, 0]]
+    I = integrate(*sides(slave, master), "dual", Reach())
+
+    assert I.cover[4] < 1e-12
+    assert I.D.diagonal() == pytest.approx(I.cover, rel=1e-7, abs=0)
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_a_flat_non_matching_side_carries_constants_and_linears(basis):
+    slave, master = flat(10, 0.0, rightwards=True), flat(9, 0.0, rightwards=False)
+    I = integrate(*sides(slave, master), basis, Reach())
+    carried = np.linalg.solve(I.D.toarray(), I.M.toarray())
+
+    assert carried @ np.ones(10) == pytest.approx(np.ones(11), abs=1e-13)
+    assert carried @ master[:, 0] == pytest.approx(slave[:, 0], abs=1e-13)
+
+
+def test_a_segment_covered_in_part_still_carries_linears():
+    slave = flat(4, 0.0, rightwards=True)
+    master = flat(3, 0.0, rightwards=False, left=0.1, right=0.8)
+    I = integrate(*sides(slave, master), "dual", Reach())
+
+    assert I.M @ master[:, 0] / I.cover == pytest.approx(slave[:, 0], abs=1e-13)
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_the_integrals_cover_a_flat_slave_once(basis):
+    s, m = sides(flat(10, 0.0, rightwards=True), flat(7, 0.0, rightwards=False))
+    I = integrate(s, m, basis, Reach())
+
+    assert I.cover.sum() == pytest.approx(1)
+    assert I.D.sum() == pytest.approx(1)
+    assert I.M.sum() == pytest.approx(1)
+
+
+def test_the_rays_of_a_curved_slave_cover_it_once():
+    s, m = sides(*arcs(20))
+    part = overlaps(s, m)
+
+    covered = np.bincount(part.slave, np.diff(part.xi, axis=1)[:, 0])
+    assert covered == pytest.approx(np.full(20, 2.0))
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+def test_the_search_loses_no_overlap(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    slave, master = arcs(70)
+    s, m = sides(slave + 0.02 * rng.standard_normal(slave.shape),
+                 master + 0.02 * rng.standard_normal(master.shape))  # fmt: skip
+    found = overlaps(s, m)
+    pairs = np.divmod(np.arange(70 * 63), 63)
+    monkeypatch.setattr(module, "facing", lambda s, m: pairs)
+
+    assert len(found.slave) > 100
+    for one, other in zip(found, overlaps(s, m), strict=True):
+        assert (one == other).all()
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_the_forces_of_a_row_are_in_equilibrium(basis):
+    slave, master = arcs(20)
+    B, _ = rows(slave, master, basis=basis)
+
+    forces = B.toarray().reshape(len(slave), -1, 2)
+    assert forces.sum(axis=1) == pytest.approx(0, abs=1e-14)
+    assert np.abs(forces).max() > 0.5
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_on_curved_sides_the_moment_of_a_pressure_vanishes_as_h_squared(basis):
+    """A circular slave over a parabolic master; moments are about the origin."""
+    moments = []
+    for n in (40, 80, 160, 320):
+        t, x = np.linspace(-0.6, 0.5, n + 1), np.linspace(1, -1, 9 * n // 10 + 1)
+        slave = np.column_stack([np.sin(t), -np.cos(t)])
+        master = np.column_stack([x, 0.1 * x**2 - 1.05])
+        B, _ = rows(slave, master, basis=basis)
+        nodal_forces = np.exp(3 * slave[:, 0]) / n
+        force = (B.T @ nodal_forces).reshape(-1, 2)
+        x = np.concatenate([slave, master])
+        moments.append(abs(x[:, 0] @ force[:, 1] - x[:, 1] @ force[:, 0]))
+
+    rates = np.log2(np.array(moments[:-1]) / moments[1:])
+    assert rates == pytest.approx(2, abs=0.1)
+
+
+# the paper's geometry and reach -------------------------------------------------------
+
+
+@pytest.mark.parametrize("basis", BASES)
+@pytest.mark.parametrize(
+    "mesh",
+    [(10, 5, 10), (30, 15, 30),
+     *((Nr, Nh, 1) for Nr in (1, 2, 5, 8) for Nh in (1, 2, 3, 7))],
+)  # fmt: skip
+def test_before_loading_no_weighted_gap_of_the_paper_is_negative(mesh, basis):
+    """Beam and ring are 0.01 m apart; a chord of the arc is farther, never nearer."""
+    bodies = model(*mesh, "strain")
+    points, (pair,) = bodies.mesh.points, bodies.pairs
+    B, c = mortar(points, np.zeros(points.size), *pair, basis=basis)
+
+    assert 0 < B.shape[0] < len(pair.slave)  # the flanks face nothing
+    assert c.min() > (0.0099 if mesh[1] > 1 else 0.0098)
+
+
+def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
+    """Three quarters of a circle 1 cm above a plate that ends 100 km away."""
+    theta = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 61)
+    arc = np.column_stack([np.sin(theta), -np.cos(theta)])
+    plate = np.array([[1e5, -1.01], [-1e5, -1.01]])
+
+    def least_gap(cosine, basis):
+        return rows(arc, plate, basis=basis, reach=Reach(cosine, 1e9))[1].min()
+
+    assert least_gap(1.0, "dual") < -1
+    assert least_gap(1.0, "standard") > 0.0099  # an average is not negative
+    assert least_gap(-0.5, "dual") > 0.0099
+
+
+@pytest.mark.parametrize(("distance", "kept"), [(0.3, 8), (0.2, 0)])
+def test_segments_farther_than_the_reach_do_not_count(distance, kept):
+    B, c = rows(flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False),
+                reach=Reach(distance=distance))  # fmt: skip
+
+    assert B.shape == (kept, 28)
+    assert c.shape == (kept,)
+
+
+def test_only_covered_nodes_get_a_row():
+    """The master ends in the fifth of ten segments: nodes 0 to 5 are covered."""
+    B, _ = rows(flat(10, 0.1, rightwards=True),
+                flat(3, 0.0, rightwards=False, right=0.45))  # fmt: skip
+
+    assert B.shape[0] == 6
+    assert np.unique(B[:, :22].nonzero()[1] // 2).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_sides_beside_each_other_have_no_row(basis):
+    slave = flat(3, 0.1, rightwards=True)
+    master = flat(3, 0.0, rightwards=False, left=2, right=3)
+    I = integrate(*sides(slave, master), basis, Reach())
+
+    assert rows(slave, master, basis=basis).B.shape == (0, 16)
+    assert (I.D.nnz, I.M.nnz) == (4 if basis == "dual" else 0, 0)
+    assert I.gap.dtype == I.cover.dtype == float
+
+
+# degenerate input -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_a_side_that_runs_the_wrong_way_faces_nothing(basis):
+    slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
+
+    assert rows(slave[::-1], master, basis=basis).B.shape == (0, 28)
+    assert rows(slave, master[::-1], basis=basis).B.shape == (0, 28)
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_segments_without_length_change_no_gap_and_no_force(basis):
+    slave, master = flat(2, 0.25, rightwards=True), flat(3, 0.0, rightwards=False)
+    once, c = rows(slave, master, basis=basis)
+    twice, c_twice = rows(np.repeat(slave, [1, 2, 1], axis=0),
+                          np.repeat(master, 2, axis=0), basis=basis)  # fmt: skip
+
+    assert np.isfinite(twice.toarray()).all()
+    assert c_twice == pytest.approx(np.full(4, 0.25))
+    on_master = twice.toarray()[[0, 3], 8:].reshape(2, 4, 2, 2).sum(axis=2)
+    assert on_master.reshape(2, 8) == pytest.approx(once.toarray()[[0, 2], 6:])
+    assert len(c) == 3
+
+
+@pytest.mark.parametrize("basis", BASES)
+@pytest.mark.parametrize("shape", ["needle", "zigzag", "touching", "focus"])
+def test_odd_shapes_give_finite_rows(shape, basis):
+    slave, master = {
+        "needle": ([[0, 0], [1, 0], [0, 0]], [[2, -1], [-1, -1]]),
+        "zigzag": ([[0, 0], [1, 0], [0.5, 0], [1.5, 0]],
+                   [[2, -1], [1, -1], [1.5, -1], [-1, -1]]),
+        "touching": ([[0, 0], [1, 0], [2, 0]], [[2, 0], [1, 0], [0, 0]]),
+        # beyond the point where the normals of a convex slave meet, inside its body
+        "focus": ([[-1, 0.2], [0, 0], [1, 0.2]], [[2, 9], [-2, 9]]),
+    }[shape]  # fmt: skip
+    B, c = rows(np.array(slave, float), np.array(master, float), basis=basis,
+                reach=ANY_ANGLE)  # fmt: skip
+
+    assert np.isfinite(B.toarray()).all()
+    assert np.isfinite(c).all()
+    assert B.toarray()[:, ::2].sum(axis=1) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_master_deeper_than_the_focus_of_the_normals_is_not_met():
+    s, m = sides([[-1, 0.2], [0, 0], [1, 0.2]], [[2, 20], [-2, 20]])
+
+    assert len(overlaps(s, m).slave) == 0
+
+
+@pytest.mark.parametrize("across", [-0.1, 0.1])
+@pytest.mark.parametrize("downwards", [True, False])
+def test_a_master_through_the_focus_of_the_normals_is_met_below_it(across, downwards):
+    """The normals of the middle segment lean by 22.5° and meet at (0, 1 + √2)."""
+    master = np.array([[across, 9.0], [across, -1.0]])
+    s, m = sides([[-2, 1], [-1, 0], [1, 0], [2, 1]],
+                 master if downwards else master[::-1])  # fmt: skip
+    part = overlaps(s, m)
+    below = across / np.sqrt(2)  # the ray of ξ is at √2 ξ where y = −1
+
+    (xi,) = part.xi[part.slave == 1]
+    assert xi == pytest.approx(sorted([below, np.sign(across)]))
+
+
+@pytest.mark.parametrize("side", ["slave", "master"])
+def test_a_side_without_a_segment_is_refused(side):
+    chains = {
+        "slave": flat(2, 0.1, rightwards=True),
+        "master": flat(2, 0.0, rightwards=False),
+    }
+    chains[side] = chains[side][[0, 0]]
+
+    with pytest.raises(InputError, match=f"contact {side}: 2 node"):
+        rows(chains["slave"], chains["master"])

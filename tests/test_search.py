@@ -1,0 +1,116 @@
+"""The search against all pairs, and what it visits."""
+
+import numpy as np
+import pytest
+
+from harness import InputError
+from problems import search
+from problems.polyline import polyline
+from problems.search import Reach, facing, nearest
+
+
+def all_pairs(x, chain):
+    """Distance of each point from each segment, (s, e)."""
+    edge = np.diff(chain, axis=0)
+    offset = x[:, None] - chain[:-1]
+    xi = np.einsum("sex,ex->se", offset, edge) / (edge**2).sum(axis=1)
+    return np.linalg.norm(offset - np.clip(xi, 0, 1)[..., None] * edge, axis=-1)
+
+
+def arc(n, radius=0.49, centre=(1.0, 0.0)):
+    theta = np.pi * np.arange(n + 1) / n
+    return centre + radius * np.column_stack([np.cos(theta), np.sin(theta)])
+
+
+def bent_beam(n):
+    x = 2 * np.arange(n + 1) / n
+    return np.column_stack([x, 0.5 - 0.05 * x**2])
+
+
+SIZES = [1, 2, 15, 16, 17, 64, 65, 257]
+
+
+@pytest.mark.parametrize("segments", SIZES)
+@pytest.mark.parametrize("roughness", [0.0, 1e-3, 0.2])
+def test_the_closest_segment_of_the_whole_chain_is_found(segments, roughness):
+    rng = np.random.default_rng(577215)
+    chain = arc(segments) + roughness * rng.standard_normal((segments + 1, 2))
+    x = rng.uniform(-1, 3, (200, 2))
+    found = nearest(x, polyline(chain, "master"))
+    distance = all_pairs(x, chain)
+
+    start, edge = chain[found.segment], np.diff(chain, axis=0)[found.segment]
+    reached = np.linalg.norm(x - start - found.xi[:, None] * edge, axis=1)
+    assert reached == pytest.approx(distance.min(axis=1), rel=1e-12)
+
+
+def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
+    theta = np.linspace(0, 2 * np.pi, 101)
+    circle = np.column_stack([np.cos(theta), np.sin(theta)])
+    circle[-1] = circle[0]
+    x = np.random.default_rng(141421).uniform(-2, 2, (100, 2))
+    found = nearest(x, polyline(circle, "master"))
+
+    distance = all_pairs(x, circle)
+    assert np.take_along_axis(distance, found.segment[:, None], 1)[:, 0] == (
+        pytest.approx(distance.min(axis=1), rel=1e-12)
+    )
+
+
+def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
+    """Every four segments return to their start: their chord has no direction."""
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])
+    found = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), polyline(loops, "m"))
+
+    assert found.segment.tolist() == [0, 1, 2]
+
+
+def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
+    down = np.column_stack([np.zeros(65), np.arange(64, -1, -1.0)])
+    corner = np.concatenate([down, down[-2::-1, ::-1]])  # (0, 64) → origin → (64, 0)
+    found = nearest(np.array([[20.5, 20.5]]), polyline(corner, "master"))
+
+    assert (found.segment.tolist(), found.xi.tolist()) == ([43], [0.5])
+
+
+@pytest.mark.parametrize("segments", [500, 2000])
+def test_far_queries_visit_few_chords_each(segments, monkeypatch):
+    """The flanks of the ring are 0.5 m from a beam of segments of 1 mm."""
+    visited = []
+    distances = search._to_chords
+
+    def counted(x, level, node):
+        visited.append(len(node))
+        return distances(x, level, node)
+
+    monkeypatch.setattr(search, "_to_chords", counted)
+    nearest(arc(segments), polyline(bent_beam(segments), "master"))
+
+    assert sum(visited) <= 60 * segments
+
+
+@pytest.mark.parametrize("segments", [500, 2000])
+def test_few_master_segments_face_a_slave_segment(segments):
+    slave, master = polyline(arc(segments), "s"), polyline(bent_beam(segments), "m")
+
+    assert len(facing(slave, master)[0]) <= 6 * segments
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"cosine": -1.5}, "cosine=-1.5"), ({"cosine": float("nan")}, "cosine=nan"),
+     ({"distance": 0.0}, "distance=0.0"), ({"distance": float("nan")}, "distance=nan")],
+)  # fmt: skip
+def test_a_reach_that_means_nothing_is_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        Reach(**wrong)
+
+
+def test_by_default_the_larger_side_bounds_the_distance():
+    small, large = polyline(arc(4, 0.1), "s"), polyline(arc(4, 2.0), "m")
+
+    expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
+    assert Reach().within(small, large) == pytest.approx(expected)
+    assert Reach().within(large, small) == pytest.approx(expected)
+    assert Reach(distance=0.25).within(small, large) == 0.25
