@@ -1,4 +1,8 @@
 PYTHON ?= python3
+
+# one thread in every library: what tests and benchmarks measure does not depend on it
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
 BIN := .venv/bin
 
 .PHONY: help setup demo test bench check clean

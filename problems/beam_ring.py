@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case, InputError, Reference, Value, Vector
+from harness import Case, InputError, Reference, Value
 from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
-from problems.contact import ContactRows, node_to_segment
 from problems.elasticity import Material, Plane
 from problems.emit import FORMS, contact_case
 from problems.inverse import GeneralisedInverse
+from problems.linearise import METHODS, linearisation
 from problems.mesh import dofs_of, half_ring, join, rectangle
 from problems.results import quantities
 from problems.stepping import LoadPath
@@ -44,7 +44,7 @@ class BeamRing:
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "Nr": 10, "Nh": 5, "radial": 0, "steps": 10, "step": 0,
-            "contact": "nts", "relin": 1, "plane": "strain",
+            "contact": "nts", "basis": "dual", "relin": 1, "plane": "strain",
         }),
         hash=False,
     )  # fmt: skip
@@ -66,7 +66,7 @@ class BeamRing:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
-        for key, known in {"contact": ("nts",), "plane": ("strain", "stress")}.items():
+        for key, known in (METHODS | {"plane": ("strain", "stress")}).items():
             if p[key] not in known:
                 raise InputError(
                     f"{self.name}: {key}={p[key]!r} is unknown, expected "
@@ -81,7 +81,9 @@ class BeamRing:
         p: Any = params
         geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
         bodies = model(*geometry)
-        primal = _path(geometry, p["steps"], p["relin"], reference).primal(p["step"])
+        method = (p["contact"], p["basis"])
+        path = _path(geometry, method, p["steps"], p["relin"], reference)
+        primal = path.primal(p["step"])
         sides = bodies.mesh.boundaries
         tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
         return contact_case(
@@ -122,11 +124,13 @@ def _clamped(*geometry: Any) -> GeneralisedInverse:
 
 @lru_cache(maxsize=4)
 def _path(
-    geometry: tuple[Any, ...], steps: int, relin: int, reference: Reference
+    geometry: tuple[Any, ...],
+    method: tuple[Any, Any],
+    steps: int,
+    relin: int,
+    reference: Reference,
 ) -> LoadPath:
-    bodies = model(*geometry)
-
-    def linearise(u: Vector) -> ContactRows:
-        return node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
-
-    return LoadPath(bodies, linearise, _clamped(*geometry), reference, steps, relin)
+    linearise = linearisation(model(*geometry), *method)
+    return LoadPath(
+        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin
+    )

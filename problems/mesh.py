@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,34 @@ def half_ring(centre: tuple[float, float], radii: tuple[float, float],
     return _structured(grid, ("outer", "left_foot", "inner", "right_foot"))
 
 
+def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
+    """Mesh half a disc by rings of cells that end in triangles at its centre.
+
+    Boundaries: arc (anticlockwise) and flat (through the centre). The triangles are
+    cells whose last two nodes coincide, which bilinear elements degenerate to.
+
+    Parameters
+    ----------
+    angles : increasing, over half a turn; the arc lies between the first and the last
+    radii : decreasing, all positive: those of the arc and of the rings of nodes within
+
+    """
+    direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    grid = np.asarray(centre) + radii[:, None, None] * direction
+    rings = _structured(grid, ("arc", "left", "inner", "right"))
+    sides, middle = rings.boundaries, np.array([len(rings.points)])
+    inner = sides["inner"][::-1]
+    triangles = [inner[:-1], inner[1:], *np.broadcast_to(middle, (2, inner.size - 1))]
+    return Mesh(
+        np.vstack([rings.points, centre]),
+        np.vstack([rings.cells, np.column_stack(triangles)]),
+        {
+            "arc": sides["arc"],
+            "flat": np.concatenate([sides["left"], middle, sides["right"]]),
+        },
+    )
+
+
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     """Put bodies into one mesh that shares no node; also return each cell's body.
 
@@ -71,6 +99,19 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     body = np.repeat(np.arange(len(meshes)), [len(m.cells) for m in meshes])
     points = np.concatenate([m.points for m in meshes])
     return Mesh(points, np.concatenate(cells), boundaries), body
+
+
+def prefixed(mesh: Mesh, prefix: str) -> Mesh:
+    """Put `prefix` before the name of each boundary, so that equal shapes can join."""
+    return replace(
+        mesh, boundaries={prefix + name: b for name, b in mesh.boundaries.items()}
+    )
+
+
+def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
+    """Return ∫N_j ds (v,) of the linear shape functions on a polyline (v, d)."""
+    half = np.linalg.norm(np.diff(chain, axis=0), axis=1) / 2
+    return np.asarray(np.append(half, 0) + np.append(0, half))
 
 
 def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:

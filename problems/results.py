@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from harness import QP, Fields, Solution, Vector
 from problems.bodies import Bodies
-from problems.elasticity import elasticity_matrix
 from problems.mesh import as_vectors
 from problems.stress import centre_stress, recover, von_mises
 
@@ -19,13 +18,16 @@ ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
     """Report counts, energy, contact forces and stresses.
 
-    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master,
-    −ΣBᵀλ, N/m. max_von_mises: per body, of the patch-recovered stress, Pa.
+    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
+    its slave where the master is rigid), −ΣBᵀλ, N/m. max_von_mises: per body, of the
+    patch-recovered stress, Pa.
     """
     l, F = bodies.length, bodies.force
-    held = bodies.body_of_node == bodies.body_of_node[bodies.pairs[0].master[0]]
+    slave, master = bodies.pairs[0]
+    side = master if master.size else slave
+    held = bodies.body_of_node == bodies.body_of_node[side[0]]
     forces = contact_forces(bodies, primal, s)
-    stress = nodal_von_mises(bodies, s.x * l)
+    stress = nodal_stresses(bodies, s.x * l)["von_mises"]
     return {
         "nodes": len(bodies.mesh.points),
         "elements": len(bodies.mesh.cells),
@@ -52,7 +54,7 @@ def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
         cells=bodies.mesh.cells,
         bodies=bodies.body,
         displacement=as_vectors(u),
-        nodal={"von_mises": nodal_von_mises(bodies, u)},
+        nodal=nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s)[slaves],
     )
@@ -63,10 +65,15 @@ def contact_forces(bodies: Bodies, primal: QP, s: Solution) -> NDArray[np.float6
     return as_vectors(-(primal.G.T @ s.z) * bodies.force)
 
 
-def nodal_von_mises(bodies: Bodies, u: Vector) -> NDArray[np.float64]:
-    """Recover σ_vM at the nodes (N,) from the displacement in m, Pa."""
-    matrices = [elasticity_matrix(m, bodies.plane) for m in bodies.materials]
-    D = np.stack(matrices)[bodies.body]
-    stress = recover(bodies.mesh, centre_stress(bodies.mesh, D, u))
+def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
+    """Recover the stresses at the nodes (N,) from the displacement in m, Pa.
+
+    sxx, syy, sxy; szz = ν(σ_x + σ_y) in plane strain, where it is not zero; von_mises
+    of these, so that it is recovered from no averages of its own.
+    """
+    stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))
     nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]
-    return von_mises(stress, nu, bodies.plane)
+    nodal = dict(zip(("sxx", "syy", "sxy"), stress.T, strict=True))
+    if bodies.plane == "strain":
+        nodal["szz"] = nu * (nodal["sxx"] + nodal["syy"])
+    return nodal | {"von_mises": von_mises(stress, nu, bodies.plane)}

@@ -1,4 +1,4 @@
-"""Stresses from displacements: at cell centres, and recovered at the nodes.
+"""Stresses from displacements: at cell centres, Gauss points, recovered at nodes.
 
 Superconvergent patch recovery after Zienkiewicz and Zhu (1992): bilinear quadrilaterals
 have their superconvergent stresses at the cell centres; a linear polynomial is fitted
@@ -13,13 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
-from problems.elasticity import Plane, cell_dofs, shape_gradients, strain_matrix
+from problems.elasticity import (
+    CORNERS,
+    Plane,
+    cell_dofs,
+    shape_gradients,
+    strain_matrix,
+)
 from problems.mesh import Mesh
+
+#: 2×2 Gauss points of the reference square [−1, 1]², all of weight 1
+GAUSS = CORNERS / np.sqrt(3)
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, 3) at the cell centres, Pa; u in m, D (3, 3) or (E, 3, 3)."""
-    gradients, _ = shape_gradients(mesh.points[mesh.cells], np.zeros(2))
+    return _stress_at(np.zeros(2), mesh, D, u)
+
+
+def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
+    """Return σ = DBu (E, 4, 3) at the 2×2 Gauss points, Pa; else as `centre_stress`."""
+    return np.stack([_stress_at(point, mesh, D, u) for point in GAUSS], axis=1)
+
+
+def _stress_at(
+    point: Vector, mesh: Mesh, D: NDArray[np.float64], u: Vector
+) -> NDArray[np.float64]:
+    gradients, _ = shape_gradients(mesh.points[mesh.cells], point)
     DB = D @ strain_matrix(gradients)
     stress: NDArray[np.float64] = np.einsum("esd,ed->es", DB, u[cell_dofs(mesh)])
     return stress

@@ -141,16 +141,66 @@ def test_the_load_of_a_step_is_its_share():
     assert abs(full).max() == pytest.approx(1)
 
 
-def test_relinearisation_closes_the_gap_that_load_steps_leave():
-    """Re-linearised five times, one load step is consistent with itself: the rows at
-    its own solution are those that it was solved with. Ten plain steps are not."""
+CONVERGED = [
+    # contact Nr plane: u(2, 0.5), u(1, 0.75) in m; ΣBᵀλ in 10⁷ N/m; active rows
+    ("nts 10", (-0.03723, -0.29317, 0.01777, -0.04142), (3.0963, 18.0797), 8),
+    ("nts 20", (-0.03739, -0.29423, 0.01782, -0.04148), (3.0632, 18.0928), 16),
+    ("nts 30", (-0.03742, -0.29446, 0.01783, -0.04151), (3.0771, 18.0904), 24),
+    ("nts 40", (-0.03743, -0.29455, 0.01784, -0.04152), (3.0862, 18.0887), 31),
+    ("mortar 30", (-0.03742, -0.29447, 0.01784, -0.04151), (3.0782, 18.0902), 24),
+    ("mortar 40", (-0.03743, -0.29455, 0.01784, -0.04152), (3.0793, 18.0893), 31),
+    ("nts 30 stress", (-0.04056, -0.31721, 0.01912, -0.04397), (3.3344, 18.0222), 26),
+    ("nts 40 stress", (-0.04057, -0.31729, 0.01913, -0.04398), (3.3386, 18.0208), 35),
+]  # fmt: skip
 
-    def mismatch(**given):
-        last = build("primal", Nr=10, Nh=5, **given)
-        again = build("primal", Nr=10, Nh=5, **given | {"relin": given["relin"] + 1})
-        return abs(last.qp.G - again.qp.G).max()
 
-    assert mismatch(steps=1, relin=7) < 1e-5 < mismatch(steps=10, relin=1)
+@pytest.mark.parametrize(("problem", "u", "force", "active"), CONVERGED)
+def test_linearised_to_convergence_it_has_the_reference_values(
+    problem, u, force, active
+):
+    """Computed with an independent prototype of the same discretisation."""
+    contact, size, plane = (*problem.split(), "strain")[:3]
+    Nr = int(size)
+    given = dict(Nr=Nr, Nh=Nr // 2, steps=1, relin=14, plane=plane, contact=contact)
+    case = build("dual-bounds", **given)
+    s = reference_solution(case.qp)
+    result, nodes = case.quantities(s), case.recover(s).reshape(-1, 2)
+    points = model(Nr, Nr // 2, Nr, plane).mesh.points
+    at = [np.hypot(*(points - p).T).argmin() for p in ((2, 0.5), (1, 0.75))]
+
+    assert nodes[at].ravel() == pytest.approx(u, abs=6e-6)
+    assert np.divide(result["contact_force"], 1e7) == pytest.approx(force, abs=6e-5)
+    assert result["active"] == active
+
+
+def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
+    """Tip deflection against that of the converged linearisation: halving the load step
+    halves the error; three linearisations of one full load step leave less than ten
+    steps do."""
+
+    def tip(**given):
+        case = build("dual-bounds", Nr=10, Nh=5, **given)
+        return case.quantities(reference_solution(case.qp))["tip"][1]
+
+    exact = tip(steps=1, relin=14)
+    errors = [abs(tip(steps=n) - exact) for n in (5, 10, 20, 40)]
+
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(1, abs=0.15)
+    assert abs(tip(steps=1, relin=3) - exact) < errors[1]
+    assert abs(tip(steps=1, relin=2) - exact) > errors[1]
+
+
+@pytest.mark.parametrize("basis", ["dual", "standard"])
+def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
+    def force(contact, Nr):
+        given = dict(steps=1, relin=10, contact=contact, basis=basis)
+        case = build("dual-bounds", Nr=Nr, Nh=Nr // 2, **given)
+        return case.quantities(reference_solution(case.qp))["contact_force"][0]
+
+    apart = [abs(force("mortar", Nr) / force("nts", Nr) - 1) for Nr in (8, 16, 32)]
+
+    assert apart[2] < apart[0]
+    assert apart[2] < 2e-3
 
 
 @pytest.mark.parametrize(

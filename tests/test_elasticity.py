@@ -6,8 +6,8 @@ from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.mesh import as_vectors, half_ring, rectangle
-from problems.stress import centre_stress, recover, von_mises
+from problems.mesh import as_vectors, half_disc, half_ring, rectangle
+from problems.stress import centre_stress, gauss_stress, recover, von_mises
 
 STEEL = Material(E=200e9, nu=0.3)
 
@@ -123,3 +123,34 @@ def test_one_layer_of_cells_gets_cell_means():
 )
 def test_von_mises_of_elementary_states(stress, plane, expected):
     assert von_mises(np.array(stress), 0.3, plane) == pytest.approx(expected)
+
+
+def test_stress_at_the_gauss_points_of_a_bilinear_field():
+    """u = (xy, 0) on a unit square: ε = (y, 0, x), in the order of the corners."""
+    mesh = rectangle((0, 0), (1, 1), (1, 1))
+    u = np.zeros(8)
+    u[0::2] = mesh.points.prod(axis=1)
+    D = elasticity_matrix(STEEL, "strain")
+    a, b = (1 - 1 / np.sqrt(3)) / 2, (1 + 1 / np.sqrt(3)) / 2
+    strain = np.array([[a, 0, a], [a, 0, b], [b, 0, b], [b, 0, a]])
+
+    assert gauss_stress(mesh, D, u) == pytest.approx((strain @ D)[None], rel=1e-12)
+
+
+def test_a_half_disc_with_triangles_at_its_centre_stretches_exactly():
+    """Constant strain ε: uᵀKu is ε·Dε times the area, and K has three rigid modes."""
+    mesh = half_disc((0, 1), np.linspace(-np.pi, 0, 9), np.array([1, 0.8, 0.3]))
+    D = elasticity_matrix(STEEL, "strain")
+    K = stiffness(mesh, D)
+    strain = np.array([1e-3, -4e-4, 6e-4])
+    x, y = mesh.points.T
+    u = np.column_stack([strain[0] * x + strain[2] * y, strain[1] * y]).ravel()
+    area = 8 * np.sin(np.pi / 8) / 2
+    forces = as_vectors(K @ u)
+    inside = np.setdiff1d(
+        np.arange(len(x)), np.concatenate(list(mesh.boundaries.values()))
+    )
+
+    assert u @ K @ u == pytest.approx(strain @ D @ strain * area)
+    assert forces[inside] == pytest.approx(0, abs=1e-12 * abs(forces).max())
+    assert np.linalg.eigvalsh(K.toarray())[3] > 1e-8 * abs(K).max()

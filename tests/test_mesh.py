@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from problems.mesh import half_ring, join, rectangle
+from problems.mesh import (
+    half_disc,
+    half_ring,
+    join,
+    nodal_lengths,
+    prefixed,
+    rectangle,
+)
 
 
 def signed_areas(mesh):
@@ -28,8 +35,12 @@ def test_the_area_of_a_half_ring_converges_with_second_order():
 
 @pytest.mark.parametrize(
     "mesh",
-    [rectangle((0, 0.5), (2, 0.25), (8, 3)), half_ring((1, 0), (0.3, 0.49), (24, 4))],
-    ids=["rectangle", "half ring"],
+    [
+        rectangle((0, 0.5), (2, 0.25), (8, 3)),
+        half_ring((1, 0), (0.3, 0.49), (24, 4)),
+        half_disc((1, 3), np.linspace(-np.pi, 0, 9), np.array([2, 1.5, 0.5])),
+    ],
+    ids=["rectangle", "half ring", "half disc"],
 )
 def test_every_boundary_has_the_body_on_its_left(mesh):
     """Summed edge normals vanish and ∮ x·n ds is twice the area (Gauss)."""
@@ -67,3 +78,33 @@ def test_joined_bodies_share_no_node():
     assert both.points[both.boundaries["outer"]] == pytest.approx(
         b.points[b.boundaries["outer"]]
     )
+
+
+def test_a_half_disc_is_the_polygon_of_its_arc():
+    angles = np.linspace(0, np.pi, 7)
+    disc = half_disc((1, 3), angles, np.array([2, 1.5, 0.5]))
+    arc, flat = (disc.points[disc.boundaries[name]] for name in ("arc", "flat"))
+
+    assert signed_areas(disc).min() > 0
+    assert signed_areas(disc).sum() == pytest.approx(6 * 2 * np.sin(np.pi / 6))
+    assert arc == pytest.approx(
+        np.column_stack([1 + 2 * np.cos(angles), 3 + 2 * np.sin(angles)])
+    )
+    assert flat == pytest.approx(np.column_stack([[-1, -0.5, 0.5, 1, 1.5, 2.5, 3],
+                                                  np.full(7, 3)]))  # fmt: skip
+
+
+def test_bodies_of_one_shape_keep_their_boundaries_apart_by_prefixes():
+    block = rectangle((0, 0), (1, 1), (2, 3))
+    both, _ = join((prefixed(block, "lower_"), prefixed(block, "upper_")))
+
+    assert (both.boundaries["lower_top"] == block.boundaries["top"]).all()
+    assert (both.boundaries["upper_top"] == block.boundaries["top"] + 12).all()
+
+
+def test_nodal_lengths_integrate_linear_functions_along_a_chain():
+    chain = np.array([[0, 0], [3, 4], [3, 5], [3, 5.5]])
+    along = np.array([0, 5, 6, 6.5])
+
+    assert nodal_lengths(chain) == pytest.approx([2.5, 3, 0.75, 0.25])
+    assert nodal_lengths(chain) @ along == pytest.approx(6.5**2 / 2)

@@ -1,0 +1,32 @@
+"""The contact rows of a set of bodies by the method that the keys of a case name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, vstack
+
+from harness import Vector
+from problems.bodies import Bodies
+from problems.contact import ContactRows, node_to_segment
+from problems.mortar import mortar
+
+#: values of the keys that choose the method; node-to-segment takes no notice of basis
+METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
+
+
+def linearisation(
+    bodies: Bodies, contact: str, basis: Any
+) -> Callable[[Vector], ContactRows]:
+    """Return the map from a displacement (n,) in m to the rows of all pairs."""
+    rows = node_to_segment if contact == "nts" else partial(mortar, basis=basis)
+
+    def linearise(u: Vector) -> ContactRows:
+        parts = [rows(bodies.mesh.points, u, *pair) for pair in bodies.pairs]
+        B = csr_array(vstack([part.B for part in parts]))
+        return ContactRows(B, np.concatenate([part.c for part in parts]))
+
+    return linearise

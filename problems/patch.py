@@ -1,0 +1,110 @@
+"""The contact patch test: a uniform pressure must pass through a non-matching joint.
+
+Two blocks of 1 m × ½ m lie on each other, without friction and without a gap, each on
+rollers at its left side, the lower one on rollers at its bottom; the pressure p acts on
+the top. The exact solution is linear in each block, so bilinear elements contain it:
+
+    σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
+
+A contact discretisation that reproduces it transfers constant pressures exactly (Taylor
+and Papadopoulos 1991). Mortar methods do, node-to-segment contact in one pass does not:
+its error in σ_y is of order one and does not vanish with the mesh size. Contact alone
+holds the upper block up, so that ``dual-bounds`` does not exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from harness import Case, Reference, Solution, Value
+from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.elasticity import Material
+from problems.emit import contact_case
+from problems.linearise import METHODS, linearisation
+from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from problems.ranges import at_least, one_of, positive
+from problems.results import quantities
+from problems.stepping import primal_qp
+from problems.stress import gauss_stress
+
+LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
+PRESSURE = 1e6  #: p, Pa
+E_UPPER, NU = 10e6, 0.3  #: Pa
+
+
+@dataclass(frozen=True)
+class ContactPatch:
+    """Contact patch test: two blocks on each other under uniform pressure."""
+
+    name: str = "contact-patch"
+    defaults: Mapping[str, Value] = field(
+        default_factory=lambda: MappingProxyType({
+            "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
+            "contact": "mortar", "basis": "dual", "plane": "strain",
+        }),
+        hash=False,
+    )  # fmt: skip
+    forms: tuple[str, ...] = ("primal", "dual")
+
+    def check(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless every key is in its range."""
+        at_least(1, self.name, params, ("lower", "upper"))
+        positive(self.name, params, ("ratio",))
+        one_of(self.name, params, {
+            "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),
+        })  # fmt: skip
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Emit the QP in one form."""
+        del reference  # the gap is linear in u, there is nothing to linearise at
+        self.check(params)
+        p: Any = params
+        bodies = model(params)
+        linearise = linearisation(bodies, p["contact"], p["basis"])
+        primal = primal_qp(bodies, linearise(np.zeros(bodies.mesh.dofs)))
+        return contact_case(
+            bodies, primal, form,
+            floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+            quantities=lambda s: quantities(bodies, primal, s)
+            | {"stress_error": stress_error(bodies, s)},
+        )  # fmt: skip
+
+
+def model(params: Mapping[str, Value]) -> Bodies:
+    """Mesh and assemble the blocks, with `lower` and `upper` elements along x."""
+    p: Any = params
+    mesh, body = join((
+        prefixed(_block(0.0, p["lower"]), "lower_"),
+        prefixed(_block(HEIGHT, p["upper"]), "upper_"),
+    ))  # fmt: skip
+    sides = mesh.boundaries
+    load = np.zeros(mesh.dofs)
+    top = sides["upper_top"]
+    load[2 * top + 1] = -PRESSURE * nodal_lengths(mesh.points[top])
+    rollers = (2 * sides["lower_left"], 2 * sides["upper_left"])
+    lower, upper = sides["lower_top"], sides["upper_bottom"]
+    return assemble(
+        mesh, body, names=("lower", "upper"),
+        materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
+        plane=p["plane"], units=(LENGTH, PRESSURE * LENGTH),
+        fixed=np.concatenate([*rollers, 2 * sides["lower_bottom"] + 1]), load=load,
+        pairs=(ContactPair(lower, upper) if p["slave"] == "lower"
+               else ContactPair(upper, lower),),
+    )  # fmt: skip
+
+
+def _block(bottom: float, n: int) -> Mesh:
+    return rectangle((0.0, bottom), (LENGTH, HEIGHT), (n, -(-n // 2)))
+
+
+def stress_error(bodies: Bodies, s: Solution) -> float:
+    """Return the largest |σ_y + p|/p over all Gauss points."""
+    stress = gauss_stress(bodies.mesh, bodies.D, s.x * bodies.length)
+    return float(np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE)

@@ -1,0 +1,42 @@
+"""Every family that needs no file, from the command line."""
+
+import json
+
+import pytest
+
+from harness.cli import main
+from harness.workbench import Workbench
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+CASES = [
+    (name, form)
+    for name, family in PROBLEMS.items()
+    if "path" not in family.defaults
+    for form in family.forms
+]
+
+
+@pytest.mark.parametrize(("name", "form"), CASES)
+def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsys):
+    workbench = Workbench(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=None, plot=None, vtu=None,
+    )  # fmt: skip
+    declined = SOLVERS["smalbe"].declines(
+        PROBLEMS[name].build(form, _defaults(name), reference_solution).qp
+    )
+    solver = "clarabel" if declined else "smalbe"
+    code = main(workbench, ["solve", f"{name}/{form}", "--solver", solver, "--json"])
+    record = json.loads(capsys.readouterr().out)
+
+    assert (code, record["status"]) == (0, "verified")
+    assert record["case"] == f"{name}/{form}"
+    assert record["quantities"]["energy"]
+
+
+def _defaults(name):
+    family = PROBLEMS[name]
+    complete = getattr(family, "complete", lambda given: {**family.defaults, **given})
+    return complete({})

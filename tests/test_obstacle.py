@@ -1,0 +1,146 @@
+"""String and membrane over an obstacle: closed forms, rates, agreement of the forms."""
+
+import numpy as np
+import pytest
+
+from harness import InputError, kkt_residuals
+from problems.obstacle import Obstacle, exact_energy, exact_height, obstacle_problem
+from solvers.clarabel_ import Clarabel
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+FAMILY = Obstacle()
+TOL = 1e-11
+
+
+def solved(solver, form, dim, n):
+    case = FAMILY.build(form, {"dim": dim, "n": n}, reference_solution)
+    if solver is reference_solution:
+        s = reference_solution(case.qp)
+    else:
+        s = solver.prepare(case.qp, TOL)()
+    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
+    return case, s
+
+
+def result(dim, n):
+    case, s = solved(SMALBE(), "primal", dim, n)
+    return case.quantities(s)
+
+
+def rates(errors):
+    return np.log2(np.divide(errors[:-1], errors[1:]))
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
+    """And lies on the obstacle, smoothly, within the unit distance."""
+    rng = np.random.default_rng(20090)
+    x, h = rng.uniform(-1.5, 1.5, (400, dim)), 1e-4
+    steps = h * np.eye(dim)
+    laplacian = sum(
+        exact_height(x + e) - 2 * exact_height(x) + exact_height(x - e) for e in steps
+    ) / h**2  # fmt: skip
+    r = np.linalg.norm(x, axis=1)
+    rim = x[abs(r - 1) < 0.05] / r[abs(r - 1) < 0.05, None]
+
+    assert laplacian[r > 1 + h] == pytest.approx(2, abs=1e-5)
+    assert (exact_height(x[r <= 1]) == 0).all()
+    assert exact_height(rim * (1 + h)) == pytest.approx(h**2, rel=1e-3)
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+def test_the_exact_energy_is_that_of_the_exact_height(dim):
+    """Midpoint rule for ½|∇u|² + 2u; |∇u| = 2(r − 1) or r − 1/r."""
+    n = 2000
+    x = -1.5 + 3 * (np.arange(n) + 0.5) / n
+    points = np.stack([a.ravel() for a in np.meshgrid(*[x] * dim)], axis=1)
+    r = np.maximum(np.linalg.norm(points, axis=1), 1)
+    slope = 2 * (r - 1) if dim == 1 else r - 1 / r
+    density = slope**2 / 2 + 2 * exact_height(points)
+
+    assert density.mean() * 3**dim == pytest.approx(exact_energy(dim), rel=1e-5)
+
+
+def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
+    """Linear elements are, between points where the solution is known."""
+    case, s = solved(SMALBE(), "primal", 1, 12)
+    got = case.quantities(s)
+
+    assert got["max_error"] <= 1e-14
+    assert got["obstacle_force"] == pytest.approx(4, rel=1e-12)
+    assert got["active"] == 9
+    # of the interpolant, u″ = 2 over a length of 1: −½|u − u_h|² + ∫2(u_h − u)
+    h = 0.25
+    assert got["energy"] - 1 / 3 == pytest.approx(-4 * h**2 / 24 + 4 * h**2 / 12)
+
+
+@pytest.mark.parametrize("phase", [10, 20])
+def test_the_string_converges_with_second_order(phase):
+    """It lifts off ⅓ or ⅔ of a cell from a node, and four times finer it does again."""
+    got = [result(1, n) for n in (4 * phase, 16 * phase, 64 * phase)]
+
+    for error in ("max_error", "energy_error"):
+        assert rates([g[error] for g in got]) / 2 == pytest.approx(2, abs=0.1)
+    assert got[-1]["force_error"] == pytest.approx(0, abs=1e-5)
+
+
+def test_the_membrane_converges_with_second_order():
+    meshes = (10, 20, 40, 80)
+    got = [result(2, n) for n in meshes]
+
+    assert rates([g["energy_error"] for g in got]) == pytest.approx(2, abs=0.1)
+    for n, g in zip(meshes, got, strict=True):
+        assert g["max_error"] <= 0.2 * (3 / n) ** 2
+    assert abs(got[-1]["force_error"]) <= 1e-3
+
+
+@pytest.mark.parametrize(("dim", "n"), [(1, 20), (2, 12)])
+def test_every_form_and_solver_gives_the_same_heights_energy_and_forces(dim, n):
+    expected, s = solved(reference_solution, "primal", dim, n)
+    u, quantities = expected.recover(s), expected.quantities(s)
+    runs = [
+        (reference_solution, "dual-bounds"), (SMALBE(), "dual-bounds"),
+        (SMALBE(), "primal"), (Clarabel(), "primal"), (Clarabel(), "dual-bounds"),
+    ]  # fmt: skip
+    for solver, form in runs:
+        case, s = solved(solver, form, dim, n)
+
+        assert case.recover(s) == pytest.approx(u, abs=1e-8)
+        assert case.quantities(s) == pytest.approx(quantities, rel=1e-6, abs=1e-8)
+        assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
+            quantities["energy"], rel=1e-9
+        )
+
+
+def test_the_membrane_keeps_the_symmetry_of_the_square():
+    case, s = solved(SMALBE(), "primal", 2, 14)
+    u = case.recover(s).reshape(15, 15)
+
+    for image in (u.T, u[::-1], u[:, ::-1]):
+        assert image == pytest.approx(u, abs=1e-10)
+
+
+def test_the_boundary_is_held_at_the_exact_height():
+    problem = obstacle_problem(2, 8)
+    at_boundary = abs(problem.x).max(axis=1) == 1.5
+    case, s = solved(SMALBE(), "primal", 2, 8)
+
+    assert at_boundary.sum() == problem.qp.b.size == 32
+    assert case.recover(s)[at_boundary] == pytest.approx(
+        exact_height(problem.x[at_boundary])
+    )
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        ({"dim": 3}, "dim=3 is unknown, expected 1 or 2"),
+        ({"n": 1}, "n=1 must be at least 2"),
+    ],
+)
+def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
+    with pytest.raises(InputError, match="obstacle: ") as e:
+        FAMILY.check({**FAMILY.defaults, **bad})
+
+    assert told in str(e.value)

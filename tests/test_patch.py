@@ -1,0 +1,130 @@
+"""The contact patch test: exact linear states, and who fails to reproduce them."""
+
+import numpy as np
+import pytest
+
+from harness import InputError, kkt_residuals
+from problems.mesh import as_vectors
+from problems.patch import ContactPatch, model
+from solvers.clarabel_ import Clarabel
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+FAMILY = ContactPatch()
+SOLVERS = {"dual": (SMALBE(), 1e-13), "primal": (Clarabel(), 1e-11)}
+BASES = [("mortar", "dual"), ("mortar", "standard")]
+MESHES = [(6, 4), (7, 5), (24, 20)]
+
+
+def solved(form="dual", **given):
+    """The case, its verified solution, its quantities."""
+    solver, tol = SOLVERS[form]
+    case = FAMILY.build(form, {**FAMILY.defaults, **given}, reference_solution)
+    s = solver.prepare(case.qp, tol)()
+    assert kkt_residuals(case.qp, s).worst <= 10 * tol
+    return case, s, case.quantities(s)
+
+
+def error(**given):
+    return solved(**given)[2]["stress_error"]
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e-3])
+@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize(("contact", "basis"), BASES)
+@pytest.mark.parametrize(("lower", "upper"), MESHES)
+def test_mortar_reproduces_a_uniform_pressure(
+    lower, upper, contact, basis, slave, ratio
+):
+    assert error(lower=lower, upper=upper, contact=contact, basis=basis, slave=slave,
+                 ratio=ratio) <= 1e-10  # fmt: skip
+
+
+def test_one_element_on_one_element_is_enough():
+    assert error(lower=1, upper=1) <= 1e-10
+
+
+@pytest.mark.parametrize(("basis", "coupled"), [("dual", 1), ("standard", 3)])
+def test_only_the_dual_basis_uncouples_the_slave_nodes(basis, coupled):
+    case = FAMILY.build(
+        "primal", {**FAMILY.defaults, "basis": basis}, reference_solution
+    )
+    (pair,) = model(FAMILY.defaults).pairs
+    vertical = case.qp.G[:, 2 * pair.slave + 1].toarray()
+
+    assert (abs(vertical) > 1e-12).sum(axis=1).max() == coupled
+
+
+@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize(("lower", "upper"), MESHES)
+def test_node_to_segment_fails_and_refinement_does_not_help(lower, upper, slave):
+    assert error(contact="nts", lower=lower, upper=upper, slave=slave) >= 0.05
+
+
+def test_node_to_segment_passes_on_matching_meshes():
+    assert error(contact="nts", lower=5, upper=5) <= 1e-10
+
+
+@pytest.mark.parametrize(
+    ("mesh", "slave", "percent"),
+    [((6, 4), "upper", 27.8), ((6, 4), "lower", 8.9), ((24, 20), "upper", 9.8)],
+)
+def test_node_to_segment_fails_by_what_another_code_found(mesh, slave, percent):
+    """The numbers are those of a prototype with other supports."""
+    lower, upper = mesh
+    got = 100 * error(contact="nts", slave=slave, lower=lower, upper=upper)
+
+    assert got == pytest.approx(percent, abs=0.1)
+
+
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+def test_the_whole_pressure_passes_even_where_its_distribution_is_wrong(contact):
+    on_lower = solved(contact=contact, slave="upper")[2]
+    on_upper = solved(contact=contact, slave="lower")[2]
+
+    assert on_lower["contact_force"] == pytest.approx([0, -1e6], abs=1e-4)
+    assert on_upper["contact_force"] == pytest.approx([0, 1e6], abs=1e-4)
+
+
+@pytest.mark.parametrize("plane", ["strain", "stress"])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_the_displacement_is_the_exact_linear_one(form, plane):
+    """ε_y = −p/E′, ε_x = ν′p/E′; in plane strain E′ = E/(1 − ν²), ν′ = ν/(1 − ν)."""
+    given = {"ratio": 0.25, "plane": plane}
+    case, s, _ = solved(form, **given)
+    bodies = model({**FAMILY.defaults, **given})
+    E, nu = (10e6 / 0.91, 0.3 / 0.7) if plane == "strain" else (10e6, 0.3)
+    x, y = bodies.mesh.points.T
+    lower = bodies.body_of_node == 0
+    softness = 1e6 / E * np.where(lower, 4, 1)
+    exact = np.column_stack([nu * softness * x, -softness * y])
+    exact[~lower, 1] -= 1e6 / E * (4 - 1) * 0.5
+
+    assert as_vectors(case.recover(s)) == pytest.approx(exact, abs=1e-9)
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_the_energy_is_minus_half_the_work_of_the_pressure(form):
+    case, s, result = solved(form)
+    expected = -0.5 * 1e6 * 1e6 * 0.91 / 10e6
+
+    assert result["energy"] == pytest.approx(expected, rel=1e-9)
+    assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
+        expected, rel=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        ({"lower": 0}, "lower=0 must be at least 1"),
+        ({"ratio": 0.0}, "ratio=0.0 must be positive"),
+        ({"slave": "both"}, "slave='both' is unknown, expected 'lower' or 'upper'"),
+        ({"basis": "cubic"}, "basis='cubic' is unknown, expected 'dual' or 'standard'"),
+    ],
+)
+def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
+    with pytest.raises(InputError, match="contact-patch: ") as e:
+        FAMILY.check({**FAMILY.defaults, **bad})
+
+    assert told in str(e.value)
