@@ -28,6 +28,7 @@ def main() -> None:
         reference=reference_solution,
         report=_report,
         plot=_plot,
+        vtu=_vtu,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
@@ -42,6 +43,12 @@ def _plot(fields: Fields, path: Path) -> None:
     from reports.mechanics import draw_deformed
 
     draw_deformed(fields, path)
+
+
+def _vtu(fields: Fields, path: Path) -> None:
+    from reports.vtu import write_vtu
+
+    write_vtu(fields, path)
 
 
 if __name__ == "__main__":

@@ -76,13 +76,16 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
     )
+    command.add_argument(
+        "--vtu", metavar="FILE.vtu", type=Path, help="the same for ParaView"
+    )
     _add_plugin(command)
     _add_json(command)
     command.set_defaults(run=commands.solve, parser=command)
 
     command = add("export", help="one QP as a file", allow_abbrev=False)
     command.add_argument("case", metavar="CASE")
-    command.add_argument("file", metavar="FILE.npz", type=Path)
+    command.add_argument("file", metavar="FILE.npz|mat", type=Path)
     _add_plugin(command)
     command.set_defaults(run=commands.export, parser=command)
 

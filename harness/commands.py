@@ -15,8 +15,9 @@ from harness.environment import capture, digest
 from harness.errors import InputError, unknown
 from harness.journal import read_journal
 from harness.judge import blank, has_point, judged, plain
+from harness.matfile import save_mat
 from harness.measure import measure
-from harness.names import assemble, canonical, parse
+from harness.names import canonical, completed, parse
 from harness.progress import shown_on
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict
@@ -37,7 +38,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
                 {
                     "name": name,
                     "description": show.first_sentence(family),
-                    "defaults": assemble(family, {}, family.forms[0]).params,
+                    "defaults": completed(family, {}),
                     "forms": family.forms,
                 }
                 for name, family in workbench.families.items()
@@ -105,7 +106,9 @@ def solve(workbench: Workbench, options: Namespace) -> int:
     if not 0 < options.tol < 1:
         raise InputError(f"--tol = {options.tol}; expected a number between 0 and 1")
     if options.plot is not None:
-        _check_writable(options.plot, ".png")
+        _check_writable(options.plot, (".png",))
+    if options.vtu is not None:
+        _check_writable(options.vtu, (".vtu",))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
     family = workbench.families[name.family]
@@ -121,15 +124,27 @@ def solve(workbench: Workbench, options: Namespace) -> int:
         repeat=0,
         environment=digest(capture()),
     )
-    if options.plot is not None and case.fields is None:
-        raise InputError(f"{record.case} has no bodies to draw; leave out --plot")
+    pictures = {
+        option: (draw, path)
+        for option, draw, path in (
+            ("--plot", workbench.plot, options.plot),
+            ("--vtu", workbench.vtu, options.vtu),
+        )
+        if path is not None
+    }
+    if pictures and case.fields is None:
+        raise InputError(
+            f"{record.case} has no bodies to draw; leave out {', '.join(pictures)}"
+        )
 
     measurement = measure(solver, case.qp, options.tol)
     record = judged(record, case, measurement)
     _show(record, options.json)
-    if options.plot is not None and case.fields is not None:
+    if pictures and case.fields is not None:
         if has_point(measurement.solution):
-            workbench.plot(case.fields(measurement.solution), options.plot)
+            fields = case.fields(measurement.solution)
+            for draw, path in pictures.values():
+                draw(fields, path)
         else:
             _say(f"no picture: {record.solver} returned no point")
     return 0 if record.status is Verdict.VERIFIED else 1
@@ -137,7 +152,7 @@ def solve(workbench: Workbench, options: Namespace) -> int:
 
 def export(workbench: Workbench, options: Namespace) -> int:
     """Write the QP of one case for other people's solvers."""
-    _check_writable(options.file, ".npz")
+    _check_writable(options.file, (".npz", ".mat"))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
     family = workbench.families[name.family]
@@ -151,7 +166,10 @@ def export(workbench: Workbench, options: Namespace) -> int:
         "scale": case.scale,
         "constant": case.constant,
     }
-    save_qp(options.file, case.qp, plain(meta))
+    if options.file.suffix == ".mat":
+        save_mat(options.file, case.qp, plain(meta), case.matrices)
+    else:
+        save_qp(options.file, case.qp, plain(meta))
     print(options.file)
     return 0
 
@@ -206,10 +224,12 @@ def _show(record: Record, as_json: bool) -> None:
         _say(f"{record.solver} declines {record.case}: {record.message}")
 
 
-def _check_writable(path: Path, suffix: str) -> None:
+def _check_writable(path: Path, suffixes: tuple[str, ...]) -> None:
     """Refuse a file that could not be written before any work is done for it."""
-    if path.suffix != suffix:
-        raise InputError(f"{path}: unknown format {path.suffix!r}; expected {suffix}")
+    if path.suffix not in suffixes:
+        raise InputError(
+            f"{path}: unknown format {path.suffix!r}; expected {' or '.join(suffixes)}"
+        )
     if not path.parent.is_dir():
         raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
 

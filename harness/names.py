@@ -3,6 +3,10 @@
 A family may derive a default from other keys (a number of layers from another one). It
 then has ``complete(params) -> params``, which takes the keys that were set and returns
 all of them; without it, keys left out take the value in the family's ``defaults``.
+
+A family whose problems lie in files has the key ``path`` and says in ``path_suffix``
+how paths end. Its names are ``FAMILY:PATH/key=value/…/FORM``, where PATH is the first
+part that ends so; or ``FAMILY:PATH`` if the suffix is empty and there is one form.
 """
 
 from __future__ import annotations
@@ -39,14 +43,20 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
         key=value, a value of the wrong type, and whatever ``family.check`` refuses.
 
     """
-    head, *parts = text.split("/")
+    head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
         raise unknown("family", head, families)
     family = families[head]
+    if (suffix := getattr(family, "path_suffix", None)) is None:
+        parts, given = text.split("/")[1:], {}
+    else:
+        path, parts = _split_path(text, head, suffix)
+        given = {"path": path}
+        if not suffix:
+            return assemble(family, given, family.forms[0])
     if not parts or "=" in parts[-1]:
         forms = ", ".join(family.forms)
         raise InputError(f"{text}: no form at the end; expected one of {forms}")
-    given: dict[str, str] = {}
     for part in parts[:-1]:
         key, equals, value = part.partition("=")
         if not equals:
@@ -72,8 +82,9 @@ def assemble(family: Family, given: Mapping[str, object], form: str) -> CaseName
     for key, value in given.items():
         if key not in family.defaults:
             raise unknown("key", key, family.defaults, where=family.name)
-        typed[key] = _typed(f"{family.name}: {key}", value, type(family.defaults[key]))
-    params = _completed(family, typed)
+        where, kind = f"{family.name}: {key}", type(family.defaults[key])
+        typed[key] = _typed(where, value, kind, free=key == _path_key(family))
+    params = completed(family, typed)
     if (check := getattr(family, "check", None)) is not None:
         check(params)
     return CaseName(family=family.name, params=params, form=form)
@@ -81,13 +92,18 @@ def assemble(family: Family, given: Mapping[str, object], form: str) -> CaseName
 
 def canonical(name: CaseName, family: Family) -> str:
     """Write `name` with only those keys that its other keys do not imply."""
-    needed = dict(name.params)
-    for key in family.defaults:
+    needed, head = dict(name.params), name.family
+    if (path := needed.pop(_path_key(family), None)) is not None:
+        head = f"{head}:{path}"
+        if not getattr(family, "path_suffix", ""):
+            return head
+    for key in list(needed):
         fewer = {k: v for k, v in needed.items() if k != key}
-        if _completed(family, fewer) == name.params:
+        given = fewer if path is None else {"path": path, **fewer}
+        if completed(family, given) == name.params:
             needed = fewer
     middle = [f"{key}={value}" for key, value in needed.items()]
-    return "/".join([name.family, *middle, name.form])
+    return "/".join([head, *middle, name.form])
 
 
 def match(pattern: str, names: Iterable[str]) -> list[str]:
@@ -95,17 +111,40 @@ def match(pattern: str, names: Iterable[str]) -> list[str]:
     return [name for name in names if fnmatchcase(name, pattern)]
 
 
-def _completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
+def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
     """Fill in the keys that are not given, in the family's order."""
     complete = getattr(family, "complete", lambda given: {**family.defaults, **given})
     params = complete(given)
     return {key: params[key] for key in family.defaults}
 
 
-def _typed(where: str, value: object, kind: type) -> Value:
-    """Convert a text, or check a typed value, to the type of the key's default."""
-    if kind is str and isinstance(value, str) and value and not set("/=") & set(value):
-        return value
+def _path_key(family: Family) -> str:
+    """Name the key that holds a path; empty where the family takes none."""
+    return "" if getattr(family, "path_suffix", None) is None else "path"
+
+
+def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
+    """Split what follows ``FAMILY:`` into the path and the other parts."""
+    path = text[len(head) + 1 :]
+    if text[len(head) : len(head) + 1] != ":" or not path:
+        raise InputError(f"{text}: no file; expected {head}:PATH{suffix}")
+    if not suffix:
+        return path, []
+    parts = path.split("/")
+    ends = [i for i, part in enumerate(parts, 1) if part.endswith(suffix)]
+    if not ends:
+        raise InputError(f"{text}: no file; expected {head}:PATH{suffix}/…/FORM")
+    return "/".join(parts[: ends[0]]), parts[ends[0] :]
+
+
+def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
+    """Convert a text, or check a typed value, to the type of the key's default.
+
+    free : whether a text may hold the signs that separate the parts of a name
+    """
+    if kind is str and isinstance(value, str) and value:  # noqa: SIM102
+        if free or not set("/=") & set(value):
+            return value
     if kind is int:
         if isinstance(value, str) and _INTEGER.fullmatch(value):
             return int(value)

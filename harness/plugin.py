@@ -56,6 +56,7 @@ class Case:
     fields: Callable[[Solution], Fields] | None = None  #: for pictures, where there are
     scale: float = 1.0
     constant: float = 0.0
+    matrices: Mapping[str, Any] = field(default_factory=dict)  #: to export with the QP
 
 
 class Family(Protocol):
@@ -80,5 +81,6 @@ class Family(Protocol):
 
         A family may also have ``check(params) -> None``, which is called before a run
         starts, and ``complete(given) -> params`` where a default depends on another
-        key. All raise `InputError` for values outside the family's range.
+        key. All raise `InputError` for values outside the family's range. One with
+        ``path_suffix`` takes a file; see `harness.names`.
         """

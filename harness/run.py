@@ -102,7 +102,7 @@ def run(
     Raises
     ------
     InputError
-        When `out` holds another suite or environment or is in use, and for whatever a
+        When `out` holds another suite, case or environment or is in use, and for what a
         family refuses to build. Any other failure costs the measurements it concerns.
 
     """
@@ -111,6 +111,7 @@ def run(
         scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
         journal = stack.enter_context(Journal(out, digest))
         past = read_journal(out)
+        _check_same(out, past, suite, families)
         entrants = [
             _Entrant(
                 spec=spec,
@@ -138,6 +139,21 @@ def run(
         progress.start(cells)
         for name in suite.cases:
             _run_case(bench, name)
+
+
+def _check_same(
+    out: Path, past: list[Record], suite: Suite, families: Mapping[str, Family]
+) -> None:
+    """Refuse to go on where a name now means another case: its file has changed."""
+    now = {canonical(c, families[c.family]): c.params for c in suite.cases}
+    for record in past:
+        params = now.get(record.case, record.params)
+        for key in params.keys() & record.params.keys():
+            if record.params[key] != params[key]:
+                raise InputError(
+                    f"{out} holds {record.case} with {key} = {record.params[key]}, "
+                    f"now {params[key]}; choose another --out or use --fresh"
+                )
 
 
 def _run_case(bench: _Bench, name: CaseName) -> None:

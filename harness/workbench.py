@@ -23,6 +23,7 @@ class Workbench:
     reference: Reference
     report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
     plot: Callable[[Fields, Path], None]
+    vtu: Callable[[Fields, Path], None]
     suites: Path = SUITES
 
     def extended(self, plugin: Plugin) -> Workbench:

@@ -49,8 +49,7 @@ def contact_case(
         case _:
             inverse = clamped()
             new = dual_bounds(primal, inverse)
-            free = np.setdiff1d(np.arange(primal.q.size), bodies.B_D.indices)
-            matrices = _paper(new.qp, csr_array(primal.G)[:, free], primal.h, inverse)
+            matrices = _paper(new.qp, csr_array(primal.G), primal.h, inverse)
     energy = bodies.force * bodies.length
     return Case(
         qp=new.qp,
@@ -66,5 +65,5 @@ def contact_case(
 def _paper(
     dual: QP, B: csr_array, c: Vector, inverse: GeneralisedInverse
 ) -> dict[str, Any]:
-    """Name the matrices of the dual as the paper does, (2)-(5); u_D = 0."""
+    """Name the matrices of the dual as the paper does, (2)-(5)."""
     return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": inverse.kernel}

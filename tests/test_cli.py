@@ -111,6 +111,7 @@ def workbench(tmp_path):
         reference=lambda qp: Exact().prepare(qp, 0.0)(),
         report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
         plot=lambda fields, path: path.write_bytes(b"picture"),
+        vtu=lambda fields, path: path.write_bytes(b"grid"),
         suites=suites,
     )
 
@@ -324,7 +325,10 @@ WRONG = {
         ("solve", "well/dual", "--solver", "exact", "--plot", "a.png"),
         "well/dual has no bodies to draw; leave out --plot",
     ),
-    "export format": (("export", "well/dual", "a.mat"), "'.mat'; expected .npz"),
+    "export format": (
+        ("export", "well/dual", "a.parquet"),
+        "'.parquet'; expected .npz or .mat",
+    ),
     "report format": (
         ("report", "folder", "--format", "md,htm"),
         "--format: unknown format 'htm'; did you mean 'html'? known: csv, html",

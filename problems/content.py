@@ -1,0 +1,35 @@
+"""What a case rests on when it comes from files: their content, by digest."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from pathlib import Path
+
+from harness import InputError, Value
+
+
+def digest(*paths: Path) -> str:
+    """Digest the bytes of files, 12 hexadecimal digits of SHA-256.
+
+    Raises
+    ------
+    InputError
+        When one cannot be read.
+
+    """
+    content = sha256()
+    for path in paths:
+        try:
+            content.update(path.read_bytes())
+        except OSError as e:
+            raise InputError(f"{path}: {e.strerror}") from None
+    return content.hexdigest()[:12]
+
+
+def check_digest(path: Value, asked: Value, found: str) -> None:
+    """Raise InputError unless the content is what the case was named for."""
+    if asked != found:
+        raise InputError(
+            f"{path}: its content has the digest {found}, not {asked}; "
+            "the file changed, or another one was meant"
+        )

@@ -1,0 +1,254 @@
+"""A contact problem described by a TOML file next to a mesh from gmsh.
+
+::
+
+    mesh = "press.msh"         # beside this file; physical names as used below; m
+    plane = "strain"           # or "stress"
+    contact = "nts"            # or "mortar"
+    basis = "dual"             # of mortar; or "standard"
+    steps = 10                 # load steps
+    relin = 1                  # linearisations of the contact per step
+    units = { length = 2.0, force = 1e8 }   # m, N/m: scales of the QP, see below
+
+    [[bodies]]                 # one for each physical surface
+    name = "beam"
+    E = 200e9                  # Pa
+    nu = 0.3
+
+    [[supports]]
+    boundary = "left"          # a physical curve; or point = a physical point
+    fix = ["x", "y"]           # the components of the displacement that are zero
+
+    [[loads]]
+    boundary = "top"
+    traction = [0.0, -1e6]     # Pa, that is N per m of boundary and m of thickness;
+                               # or force = [0, -1e6]: N per m of thickness in all,
+                               # spread evenly over the boundary. A point takes a force
+    [[contacts]]
+    slave = "arc"              # its nodes must not enter the master
+    master = "bottom"
+
+Plane, contact, basis, steps and relin may be left out for the values above. So may
+units, for the larger side of the box around the mesh and the sum of |load| over nodes.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import InputError, Value, checked
+from harness.checked import located
+from harness.errors import unknown
+from problems.bodies import Bodies, ContactPair, assemble
+from problems.elasticity import Material
+from problems.linearise import METHODS
+from problems.mesh import Mesh, Nodes
+from problems.msh import NamedMesh, read_msh
+
+#: what a case name may set, too, with the value where the file says nothing
+SETTINGS: Mapping[str, Value] = {
+    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
+}  # fmt: skip
+CHOICES = {**METHODS, "plane": ("strain", "stress")}
+_KEYS = ("mesh", *SETTINGS, "units", "bodies", "supports", "loads", "contacts")
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """Read the TOML file and check its keys, settings and the path of its mesh.
+
+    Raises
+    ------
+    InputError
+        With the file and the key.
+
+    """
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror}; expected a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: no TOML: {e}") from None
+    with located(str(path)):
+        checked.only_keys(table, _KEYS)
+        for key in ("mesh", "bodies", "supports", "loads", "contacts"):
+            if key not in table:
+                raise InputError(f"{key} is missing")
+        checked.text("mesh", table["mesh"])
+        for key in ("steps", "relin"):
+            checked.at_least_one(key, table.get(key, SETTINGS[key]))
+        for key, known in CHOICES.items():
+            if table.get(key, SETTINGS[key]) not in known:
+                raise unknown(f"value of {key}", str(table[key]), known)
+    return table
+
+
+def described_bodies(path: Path, plane: Any) -> Bodies:
+    """Assemble what the TOML file describes.
+
+    Raises
+    ------
+    InputError
+        With the file and the entry, the name or value that is wrong, what is right.
+
+    """
+    table = read_description(path)
+    named = read_msh(path.parent / table["mesh"])
+    with located(str(path)):
+        materials = _materials(table["bodies"], named)
+        fixed = _each(table, "supports", lambda entry: _support(entry, named))
+        loads = _each(table, "loads", lambda entry: _load(entry, named))
+        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
+        load: NDArray[np.float64] = np.sum(loads, axis=0)
+        units = _units(table.get("units", {}), named, load)
+    body = np.repeat(
+        np.arange(len(named.surfaces)), [len(c) for c in named.surfaces.values()]
+    )
+    return assemble(
+        Mesh(named.points, named.cells, {}), body, names=tuple(named.surfaces),
+        materials=tuple(materials[name] for name in named.surfaces), plane=plane,
+        units=units, fixed=np.unique(np.concatenate(fixed)), load=load.ravel(),
+        pairs=tuple(pairs),
+    )  # fmt: skip
+
+
+def _each(
+    table: Mapping[str, Any], key: str, read: Callable[[dict[str, Any]], Any]
+) -> list[Any]:
+    """Read every entry of a list of tables; what is wrong is said with its number."""
+    found = []
+    for i, entry in enumerate(checked.filled_list(key, table[key])):
+        with located(f"{key}[{i}]"):
+            found.append(read(checked.table("entry", entry)))
+    return found
+
+
+def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
+    found: dict[str, Material] = {}
+
+    def read(entry: dict[str, Any]) -> None:
+        _keys(entry, ("name", "E", "nu"))
+        name = _one_of(named.surfaces, "physical surface", entry, "name")
+        if name in found:
+            raise InputError(f"body {name!r} is described twice; expected once")
+        E, nu = checked.positive("E", entry["E"]), entry["nu"]
+        if not checked.is_number(nu) or not -1 < nu < 0.5:
+            raise InputError(f"nu = {nu!r}; expected a number between -1 and 0.5")
+        found[name] = Material(E=E, nu=float(nu))
+
+    _each({"bodies": entries}, "bodies", read)
+    if missing := [name for name in named.surfaces if name not in found]:
+        raise InputError(f"bodies: physical surface {missing[0]!r} has no entry")
+    return found
+
+
+def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
+    """Return the displacement components that a support fixes."""
+    nodes, _ = _place(entry, named, ("fix",))
+    fix = checked.filled_list("fix", entry["fix"])
+    for component in fix:
+        if component not in ("x", "y"):
+            raise unknown("component", str(component), ("x", "y"))
+    return np.concatenate([2 * nodes + "xy".index(c) for c in fix])
+
+
+def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
+    """Return the nodal forces (N, 2) of a load, N/m."""
+    kinds = [kind for kind in ("force", "traction") if kind in entry]
+    if len(kinds) != 1:
+        raise InputError("expected either force or traction, [x, y]")
+    vector = checked.filled_list(kinds[0], entry[kinds[0]])
+    if len(vector) != 2 or not all(map(checked.is_number, vector)):
+        raise InputError(f"{kinds[0]} = {vector}; expected two numbers, [x, y]")
+    if not np.isfinite(vector).all():
+        raise InputError(f"{kinds[0]} = {vector}; expected finite numbers")
+    nodes, edges = _place(entry, named, tuple(kinds))
+    weights = np.zeros(len(named.points))
+    if edges.size:  # ∫N over the boundary, m
+        lengths = np.linalg.norm(np.diff(named.points[edges], axis=1)[:, 0], axis=1)
+        np.add.at(weights, edges, lengths[:, None] / 2)
+    elif kinds == ["traction"]:
+        raise InputError("a point takes a force, no traction")
+    else:
+        weights[nodes] = 1.0
+    if kinds == ["force"]:
+        weights /= weights.sum()
+    return np.outer(weights, vector)
+
+
+def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
+    _keys(entry, ("slave", "master"))
+    sides = {}
+    for side in ("slave", "master"):
+        name = _one_of(named.curves, "physical curve", entry, side)
+        sides[side] = _chain(f"{side} {name!r}", named.curves[name])
+    if np.intersect1d(sides["slave"], sides["master"]).size:
+        raise InputError("slave and master share nodes; expected sides that are apart")
+    return ContactPair(**sides)
+
+
+def _chain(where: str, edges: Nodes) -> Nodes:
+    """Order the edges (k, 2) to one open chain of nodes (k + 1,)."""
+    following = dict(edges.tolist())
+    starts = np.setdiff1d(edges[:, 0], edges[:, 1])
+    chain = starts[:1].tolist()
+    while chain and chain[-1] in following:
+        chain.append(following.pop(chain[-1]))
+    if len(chain) != len(edges) + 1:
+        got = "is in pieces or branches" if starts.size else "closes on itself"
+        raise InputError(f"{where} {got}; expected one open chain of edges")
+    return np.array(chain, dtype=np.int64)
+
+
+def _units(
+    entry: object, named: NamedMesh, load: NDArray[np.float64]
+) -> tuple[float, float]:
+    units = checked.table("units", entry)
+    with located("units"):
+        checked.only_keys(units, ("length", "force"))
+        total = float(np.linalg.norm(load, axis=1).sum())
+        if total == 0:
+            raise InputError("the loads sum up to nothing; expected a load")
+        extent = float(np.ptp(named.points, axis=0).max())
+        return (
+            checked.positive("length", units.get("length", extent)),
+            checked.positive("force", units.get("force", total)),
+        )
+
+
+def _place(
+    entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
+) -> tuple[Nodes, Nodes]:
+    """Find the nodes, and the edges if there are any, that an entry is about."""
+    where = [key for key in ("boundary", "point") if key in entry]
+    if len(where) != 1:
+        raise InputError("expected either boundary or point, a physical name")
+    _keys(entry, (*where, *others))
+    if where == ["point"]:
+        name = _one_of(named.spots, "physical point", entry, "point")
+        return named.spots[name], np.zeros((0, 2), dtype=np.int64)
+    name = _one_of(named.curves, "physical curve", entry, "boundary")
+    edges = named.curves[name]
+    return np.unique(edges), edges
+
+
+def _one_of(
+    known: Mapping[str, Any], what: str, entry: Mapping[str, Any], key: str
+) -> str:
+    name = checked.text(key, entry[key])
+    if name not in known:
+        raise unknown(what, name, known, where=key)
+    return name
+
+
+def _keys(entry: Mapping[str, Any], keys: tuple[str, ...]) -> None:
+    """Expect exactly these keys."""
+    checked.only_keys(entry, keys)
+    for key in keys:
+        if key not in entry:
+            raise InputError(f"{key} is missing")

@@ -1,0 +1,148 @@
+"""QPs from files, ``file:PATH``: our exports, Maros-Mészáros .mat files, QPS texts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.sparse import eye_array
+
+from harness import QP, Case, InputError, Reference, Solution, Value
+from harness.checked import located
+from harness.errors import unknown
+from harness.matfile import matrix, read_mat, to_qp, vector
+from harness.qpfile import load_qp
+from problems.content import check_digest, digest
+from problems.qps import parse_qps
+from problems.twosided import TwoSided, one_sided
+
+#: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
+Loaded = tuple[QP, float, float]
+
+
+@dataclass(frozen=True)
+class FromFile:
+    """Any QP from a file: npz, mat (ours or Maros-Mészáros) or QPS text.
+
+    The digest of the file's content is a parameter of the case, so that records say
+    what was measured and a changed file is not taken for it.
+    """
+
+    name: str = "file"
+    path_suffix: str = ""  #: all after ``file:`` is the path
+    defaults: Mapping[str, Value] = field(
+        default_factory=lambda: MappingProxyType({"path": "", "sha256": ""}), hash=False
+    )
+    forms: tuple[str, ...] = ("qp",)
+
+    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Fill in the digest of the file's content."""
+        params = {**self.defaults, **given}
+        if params["path"] and "sha256" not in given:
+            params["sha256"] = digest(Path(str(params["path"])))
+        return params
+
+    def check(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless there is such a file of a known format."""
+        path = Path(str(params["path"]))
+        if not params["path"]:
+            raise InputError("file: path is missing; expected file:PATH")
+        if path.suffix.lower() not in _LOADERS:
+            raise unknown("format", path.suffix, _LOADERS, where=str(path))
+        check_digest(params["path"], params["sha256"], digest(path))
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Read the QP; its objective in the units of the file is the quantity value."""
+        self.check(params)
+        path = Path(str(params["path"]))
+        qp, scale, constant = _LOADERS[path.suffix.lower()](path)
+
+        def quantities(s: Solution) -> dict[str, float]:
+            return {"value": scale * qp.objective(s.x) + constant}
+
+        return Case(
+            qp=qp, recover=lambda s: s.x, quantities=quantities,
+            scale=scale, constant=constant,
+        )  # fmt: skip
+
+
+def _npz(path: Path) -> Loaded:
+    qp, meta = load_qp(path)
+    return _with_units(qp, meta)
+
+
+def _mat(path: Path) -> Loaded:
+    """Read our own .mat file, known by its bounds, or one of Maros-Mészáros."""
+    arrays = read_mat(path)
+    with located(str(path)):
+        if {"G", "h"} & arrays.keys():
+            return _with_units(*to_qp(arrays))
+        given = maros_meszaros(arrays)
+        return one_sided(given), 1.0, given.r
+
+
+def _qps(path: Path) -> Loaded:
+    try:
+        text = path.read_text("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not UTF-8; expected a QPS text") from None
+    with located(str(path)):
+        given, sign = parse_qps(text)
+        return one_sided(given), sign, sign * given.r
+
+
+_LOADERS: dict[str, Callable[[Path], Loaded]] = {
+    ".npz": _npz, ".mat": _mat, ".qps": _qps, ".mps": _qps, ".sif": _qps
+}  # fmt: skip
+
+
+def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSided:
+    """Take  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  out of the variables of a .mat file.
+
+    P and q may be called Q and c, r be missing. As distributed, the last n rows of A
+    are the identity: the bounds of the variables, and they become bounds here.
+
+    Raises
+    ------
+    InputError
+        When a variable is missing or its shape does not fit the others.
+
+    """
+    read = partial(_called, arrays)
+    P, q = read(matrix, "P", "Q"), read(vector, "q", "c")
+    A, l, u = read(matrix, "A"), read(vector, "l"), read(vector, "u")
+    r = float(vector(arrays, "r").sum()) if "r" in arrays else 0.0
+    n, m = q.size, l.size
+    for name, got, right in (("P", P.shape, (n, n)), ("A", A.shape, (m, n)),
+                             ("u", u.shape, (m,))):  # fmt: skip
+        if got != right:
+            raise InputError(f"{name} has shape {got}, expected {right}")
+    for name, size in (("n", n), ("m", m)):
+        if name in arrays and vector(arrays, name).tolist() != [size]:
+            raise InputError(f"{name} is not {size}, as the other variables have it")
+    bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
+    rows = m - n if bounded else m
+    return TwoSided(
+        P=P, q=q, r=r, A=A[:rows], l=l[:rows], u=u[:rows],
+        lb=l[rows:] if bounded else np.full(n, -np.inf),
+        ub=u[rows:] if bounded else np.full(n, np.inf),
+    )  # fmt: skip
+
+
+def _called(arrays: Mapping[str, Any], read: Callable[..., Any], *names: str) -> Any:
+    """Read the variable under the first of its names that is there."""
+    return read(arrays, next((name for name in names if name in arrays), names[0]))
+
+
+def _with_units(qp: QP, meta: Mapping[str, Any]) -> Loaded:
+    scale, constant = meta.get("scale", 1.0), meta.get("constant", 0.0)
+    if not all(isinstance(v, int | float) for v in (scale, constant)):
+        raise InputError("meta: scale and constant are no numbers")
+    return qp, float(scale), float(constant)

@@ -1,0 +1,189 @@
+"""Gmsh's .msh files with physical names, read as plane bodies of quadrilaterals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from harness import InputError
+from problems.mesh import Nodes
+
+FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
+CONNECTED = {"vertex": 0, "line": 1, "quad": 2}  #: cells that we read → dimension
+RECOMBINE = "expected first-order quadrilaterals: Mesh.RecombineAll = 1 in gmsh"
+
+
+class NamedMesh(NamedTuple):
+    """A mesh of quadrilaterals, and its named parts; lengths as in the file."""
+
+    points: NDArray[np.float64]  #: (N, 2)
+    cells: Nodes  #: (E, 4) counter-clockwise
+    surfaces: Mapping[str, Nodes]  #: numbers of the cells of each body
+    curves: Mapping[str, Nodes]  #: (k, 2) edges, the body on their left
+    spots: Mapping[str, Nodes]  #: nodes with the name of a physical point
+
+
+def read_msh(path: Path) -> NamedMesh:
+    """Read the physical surfaces, curves and points of a .msh file, format 2.2 or 4.1.
+
+    Bodies are numbered one after another, which generalised inverses rely on; within a
+    body, nodes and cells keep their order. Nodes that are in no quadrilateral (such as
+    centres of arcs) are left out.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is not plane, has other cells than first-order
+        quadrilaterals, cells without a name or bodies that share nodes or fall apart.
+
+    """
+    mesh = _read(path)
+    points = np.asarray(mesh.points, dtype=float)
+    extent = np.ptp(points, axis=0).max(initial=0.0)
+    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
+        raise InputError(f"{path}: not plane; expected all nodes at the same z")
+    for block in mesh.cells:
+        if block.type not in CONNECTED:
+            raise InputError(f"{path}: cells of type {block.type}; {RECOMBINE}")
+    quads = _named(path, mesh, "quad")
+    if not quads:
+        raise InputError(f"{path}: no named surface with cells; {RECOMBINE}")
+    used = _distinct([np.unique(part) for part in quads.values()])
+    renumbered = np.full(len(points), -1)
+    renumbered[used] = np.arange(used.size)
+    points = points[used, :2]
+    cells = renumbered[np.concatenate(list(quads.values()))]
+    cells = _counter_clockwise(path, points, cells)
+    ends = np.cumsum([0] + [len(part) for part in quads.values()])
+    surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(quads)}
+    _check_apart(path, len(points), cells, surfaces)
+    directed = _boundary(cells)
+    return NamedMesh(
+        points, cells, surfaces,
+        curves={
+            name: _directed(path, name, renumbered[edges], directed)
+            for name, edges in _named(path, mesh, "line").items()
+        },
+        spots={
+            name: renumbered[nodes].ravel()
+            for name, nodes in _named(path, mesh, "vertex").items()
+            if (renumbered[nodes] >= 0).all()
+        },
+    )  # fmt: skip
+
+
+def _read(path: Path) -> Any:
+    import meshio  # late: workers and other families do without it
+
+    try:
+        return meshio.gmsh.read(path)  # meshio.read would print and exit
+    except OSError as e:
+        raise InputError(f"{path}: {e.strerror or e}; expected a .msh file") from None
+    except Exception:  # meshio raises whatever a damaged file makes numpy raise
+        raise InputError(f"{path}: not a .msh file of format 2.2 or 4.1") from None
+
+
+def _named(path: Path, mesh: Any, kind: str) -> dict[str, Nodes]:
+    """Collect the cells of one type under their physical names, in order of file."""
+    names = {
+        int(tag): name
+        for name, (tag, dimension) in mesh.field_data.items()
+        if dimension == CONNECTED[kind]
+    }
+    found: dict[str, list[Nodes]] = {}
+    tags = mesh.cell_data.get("gmsh:physical", [np.zeros(len(b)) for b in mesh.cells])
+    for block, tag in zip(mesh.cells, tags, strict=True):
+        if block.type != kind:
+            continue
+        for number in np.unique(tag):
+            if int(number) in names:
+                part = np.asarray(block.data, dtype=np.int64)[tag == number]
+                found.setdefault(names[int(number)], []).append(part)
+            elif kind == "quad":
+                raise InputError(
+                    f"{path}: {(tag == number).sum()} quadrilaterals without a name; "
+                    "expected each in a named physical surface"
+                )
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _distinct(parts: list[Nodes]) -> Nodes:
+    """Join the nodes of the parts, each node where it comes first."""
+    nodes = np.concatenate(parts)
+    return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
+
+
+def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
+    """Turn clockwise cells over; refuse those that are not convex."""
+    x = points[cells]
+    diagonals = x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]
+    clockwise = _cross(*diagonals) < 0
+    cells = np.where(clockwise[:, None], cells[:, [0, 3, 2, 1]], cells)
+    edges = np.roll(points[cells], -1, axis=1) - points[cells]
+    corners = _cross(np.roll(edges, 1, axis=1), edges)
+    if (bad := (corners <= 0).any(axis=1)).any():
+        x, y = points[cells[bad.argmax()]].mean(axis=0)
+        raise InputError(
+            f"{path}: the cell around ({x:.6g}, {y:.6g}) is not convex; "
+            "expected corners below 180°"
+        )
+    return cells
+
+
+def _check_apart(
+    path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes]
+) -> None:
+    """Refuse bodies that share nodes, and bodies of several parts."""
+    owner = np.full(nodes, -1)
+    names = list(surfaces)
+    for i, name in enumerate(names):
+        of_body = np.unique(cells[surfaces[name]])
+        if (taken := owner[of_body] >= 0).any():
+            other = names[owner[of_body[taken.argmax()]]]
+            raise InputError(
+                f"{path}: bodies {other!r} and {name!r} share nodes; expected nodes of "
+                "its own for each body"
+            )
+        owner[of_body] = i
+    start, end = cells.ravel(), np.roll(cells, -1, axis=1).ravel()
+    graph = coo_array((np.ones(start.size), (start, end)), shape=(nodes, nodes))
+    _, part = connected_components(graph, directed=False)
+    for i, name in enumerate(names):
+        if (count := np.unique(part[owner == i]).size) > 1:
+            raise InputError(
+                f"{path}: body {name!r} falls into {count} parts; expected a physical "
+                "surface for each"
+            )
+
+
+def _boundary(cells: Nodes) -> dict[tuple[int, int], tuple[int, int]]:
+    """Map each edge of exactly one cell, sorted, to its direction in that cell."""
+    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    _, first, times = np.unique(
+        np.sort(edges), axis=0, return_index=True, return_counts=True
+    )
+    once = edges[first[times == 1]].tolist()
+    return {(min(a, b), max(a, b)): (a, b) for a, b in once}
+
+
+def _directed(
+    path: Path, name: str, edges: Nodes, boundary: Mapping[Any, tuple[int, int]]
+) -> Nodes:
+    """Give the edges of a curve the direction that has the body on the left."""
+    sorted_ = [(min(a, b), max(a, b)) for a, b in edges.tolist()]
+    if not all(edge in boundary for edge in sorted_):
+        raise InputError(
+            f"{path}: curve {name!r} has an edge that bounds no body, or lies within "
+            "one; expected edges of quadrilaterals on the boundary"
+        )
+    return np.array([boundary[edge] for edge in sorted_], dtype=np.int64)
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -1,0 +1,265 @@
+"""QPS: the MPS format of linear programs with a section for the quadratic term.
+
+Fields are separated by white space (so names hold none), which also reads files in
+fixed columns. Sections as in Maros and Mészáros (1999), "A repository of convex
+quadratic programming problems", Optim. Methods Softw. 11/12:
+
+* N rows after the first are ignored; the objective's RHS is minus its constant.
+* RANGES R turns  ≤ b  into [b − |R|, b],  ≥ b  into [b, b + |R|],  = b  into
+  [b, b + R] or, for R < 0, [b + R, b].
+* BOUNDS default to [0, ∞); a negative UP on its own frees the lower side, as the
+  commercial readers have it.
+* QUADOBJ and QSECTION hold one triangle of P, QMATRIX both; the objective is
+  ½xᵀPx + qᵀx, so diagonal entries are as in P, not halved.
+
+Undefined names and numbers that are none are refused, with their line: HiGHS' reader
+(1.15) ignores the one and takes the other for 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import coo_array
+
+from harness import InputError
+from harness.errors import unknown
+from problems.twosided import TwoSided
+
+
+@dataclass(eq=False)
+class _Model:
+    """What has been read so far; rows and columns by name."""
+
+    rows: dict[str, str] = field(default_factory=dict)  #: name → N, L, G or E
+    columns: dict[str, int] = field(default_factory=dict)
+    entries: dict[tuple[str, str], float] = field(default_factory=dict)  #: row, column
+    rhs: dict[str, float] = field(default_factory=dict)
+    ranges: dict[str, float] = field(default_factory=dict)
+    lower: dict[str, float] = field(default_factory=dict)
+    upper: dict[str, float] = field(default_factory=dict)
+    triangle: dict[tuple[str, str], float] = field(default_factory=dict)
+    whole: dict[tuple[str, str], float] = field(default_factory=dict)
+    sign: float = 1.0  #: −1 where the objective is maximised
+
+    @property
+    def objective(self) -> str:
+        """The first N row."""
+        return next((name for name, kind in self.rows.items() if kind == "N"), "")
+
+
+def parse_qps(text: str) -> tuple[TwoSided, float]:
+    """Read a QPS text; also return the sign, −1 where it maximises.
+
+    A maximised objective comes back negated, constant included.
+
+    Raises
+    ------
+    InputError
+        With the number of the line where there is one.
+
+    """
+    model, section, ended = _Model(), "", False
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or line.startswith("*"):
+            continue
+        try:
+            if line[0].isspace():
+                _data(model, section, words)
+                continue
+            section = words[0].upper()
+            _header(model, section, words)
+        except InputError as e:
+            raise InputError(f"line {number}: {e}") from None
+        if ended := section == "ENDATA":
+            break
+    if not ended:
+        raise InputError("no ENDATA; the file is cut off, or no QPS")
+    if not model.objective:
+        raise InputError("no row of type N; expected the objective among ROWS")
+    return _two_sided(model), model.sign
+
+
+def _header(model: _Model, section: str, words: list[str]) -> None:
+    known = (*_SECTIONS, "NAME", "ENDATA")
+    if section not in known:
+        raise unknown("section", words[0], known)
+    if section == "QSECTION" and words[1:] not in ([], [model.objective]):
+        raise InputError(
+            f"QSECTION {words[1]} is of a constraint; expected {model.objective!r}"
+        )
+    if section == "OBJSENSE" and words[1:]:
+        _sense(model, words[1:])
+
+
+def _data(model: _Model, section: str, words: list[str]) -> None:
+    if section not in _SECTIONS:
+        raise InputError(f"{words[0]!r} is outside of every section; expected ROWS")
+    _SECTIONS[section](model, words)
+
+
+def _sense(model: _Model, words: list[str]) -> None:
+    senses = {"MIN": 1.0, "MINIMIZE": 1.0, "MAX": -1.0, "MAXIMIZE": -1.0}
+    if words[0].upper() not in senses:
+        raise unknown("objective sense", words[0], senses)
+    model.sign = senses[words[0].upper()]
+
+
+def _row(model: _Model, words: list[str]) -> None:
+    _expect(len(words) == 2, "a type and a name")
+    kind, name = words[0].upper(), words[1]
+    if kind not in ("N", "L", "G", "E"):
+        raise unknown("row type", words[0], ("N", "L", "G", "E"))
+    _new(name not in model.rows, f"row {name!r}")
+    model.rows[name] = kind
+
+
+def _column(model: _Model, words: list[str]) -> None:
+    if len(words) > 1 and words[1].strip("'") == "MARKER":
+        raise InputError("integer variables; expected continuous ones")
+    _expect(len(words) in (3, 5), "a column and one or two pairs of row and number")
+    name = words[0]
+    model.columns.setdefault(name, len(model.columns))
+    for row, value in _pairs(model, words[1:]):
+        _new((row, name) not in model.entries, f"row {row!r} of column {name!r}")
+        model.entries[row, name] = value
+
+
+def _sides(target: str) -> Callable[[_Model, list[str]], None]:
+    """Read RHS or RANGES, whose name of the set may be left out."""
+
+    def read(model: _Model, words: list[str]) -> None:
+        _expect(2 <= len(words) <= 5, "one or two pairs of row and number")
+        values: dict[str, float] = getattr(model, target)
+        for row, value in _pairs(model, words[len(words) % 2 :]):
+            _new(row not in values, f"row {row!r}")
+            values[row] = value
+
+    return read
+
+
+def _bound(model: _Model, words: list[str]) -> None:
+    kind, *rest = words
+    kind = kind.upper()
+    if kind in ("BV", "LI", "UI", "SC", "SI"):
+        raise InputError(f"bound {kind} makes the variable discrete; expected none")
+    if kind not in ("LO", "UP", "FX", "FR", "MI", "PL"):
+        raise unknown("bound type", words[0], ("LO", "UP", "FX", "FR", "MI", "PL"))
+    if kind in ("FR", "MI", "PL"):
+        _expect(1 <= len(rest) <= 3, "a column")
+        # [set] column [number that means nothing]
+        name, value = rest[min(len(rest) - 1, 1)], math.inf
+        if len(rest) == 2 and rest[1] not in model.columns:
+            name = rest[0]
+    else:
+        _expect(len(rest) in (2, 3), "a column and a number")
+        name, value = rest[-2], _number(rest[-1])
+    _known_column(model, name)
+    if kind in ("LO", "FX"):
+        model.lower[name] = value
+    if kind in ("UP", "FX", "PL", "FR"):
+        model.upper[name] = value
+    if kind in ("MI", "FR"):
+        model.lower[name] = -math.inf
+
+
+def _quadratic(target: str) -> Callable[[_Model, list[str]], None]:
+    def read(model: _Model, words: list[str]) -> None:
+        _expect(len(words) in (3, 5), "a column and one or two of column and number")
+        values: dict[tuple[str, str], float] = getattr(model, target)
+        i = words[0]
+        for j, number in zip(words[1::2], words[2::2], strict=True):
+            _known_column(model, i)
+            _known_column(model, j)
+            twice = (i, j) in values or (target == "triangle" and (j, i) in values)
+            _new(not twice, f"entry {i!r}, {j!r}")
+            values[i, j] = _number(number)
+
+    return read
+
+
+_SECTIONS: dict[str, Callable[[_Model, list[str]], None]] = {
+    "OBJSENSE": _sense, "ROWS": _row, "COLUMNS": _column,
+    "RHS": _sides("rhs"), "RANGES": _sides("ranges"), "BOUNDS": _bound,
+    "QUADOBJ": _quadratic("triangle"), "QSECTION": _quadratic("triangle"),
+    "QMATRIX": _quadratic("whole"),
+}  # fmt: skip
+
+
+def _two_sided(model: _Model) -> TwoSided:
+    names, n = list(model.columns), len(model.columns)
+    rows = {
+        row: i for i, row in enumerate(k for k, v in model.rows.items() if v != "N")
+    }
+    sides = np.array([_limits(model, row) for row in rows]).reshape(-1, 2)
+    A = [(rows[r], model.columns[c], v) for (r, c), v in model.entries.items()
+         if r in rows]  # fmt: skip
+    P = [(model.columns[i], model.columns[j], v)
+         for (i, j), v in (model.whole | model.triangle).items()]  # fmt: skip
+    P += [(model.columns[j], model.columns[i], v)
+          for (i, j), v in model.triangle.items() if i != j]  # fmt: skip
+    objective = model.objective
+    q = np.array([model.entries.get((objective, name), 0.0) for name in names])
+    free = [model.upper.get(name, math.inf) < 0 for name in names]
+    lower = [model.lower.get(name, -math.inf if f else 0.0)
+             for name, f in zip(names, free, strict=True)]  # fmt: skip
+    return TwoSided(
+        P=model.sign * _sparse(P, (n, n)), q=model.sign * q,
+        r=-model.sign * model.rhs.get(objective, 0.0),
+        A=_sparse(A, (len(rows), n)), l=sides[:, 0], u=sides[:, 1],
+        lb=np.array(lower), ub=np.array([model.upper.get(k, math.inf) for k in names]),
+    )  # fmt: skip
+
+
+def _limits(model: _Model, row: str) -> tuple[float, float]:
+    """Find l and u of a row from its type, right-hand side and range."""
+    b, R = model.rhs.get(row, 0.0), model.ranges.get(row)
+    match model.rows[row]:
+        case "E":
+            return b + min(R or 0.0, 0.0), b + max(R or 0.0, 0.0)
+        case "L":
+            return -math.inf if R is None else b - abs(R), b
+        case _:
+            return b, math.inf if R is None else b + abs(R)
+
+
+def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> coo_array:
+    i, j, values = zip(*entries, strict=True) if entries else ((), (), ())
+    at = (np.array(i, dtype=np.int64), np.array(j, dtype=np.int64))
+    return coo_array((np.array(values, dtype=float), at), shape=shape)
+
+
+def _pairs(model: _Model, words: list[str]) -> list[tuple[str, float]]:
+    for row in words[::2]:
+        if row not in model.rows:
+            raise InputError(f"row {row!r} is not among ROWS")
+    return [(r, _number(v)) for r, v in zip(words[::2], words[1::2], strict=True)]
+
+
+def _known_column(model: _Model, name: str) -> None:
+    if name not in model.columns:
+        raise InputError(f"column {name!r} is not among COLUMNS")
+
+
+def _number(text: str) -> float:
+    try:
+        value = float(text.upper().replace("D", "E"))
+    except ValueError:
+        raise InputError(f"{text!r} is no number") from None
+    if math.isnan(value):
+        raise InputError(f"{text!r} is no number")
+    return value
+
+
+def _expect(right: bool, what: str) -> None:
+    if not right:
+        raise InputError(f"wrong number of fields; expected {what}")
+
+
+def _new(new: bool, what: str) -> None:
+    if not new:
+        raise InputError(f"{what} is given twice; expected once")

@@ -1,0 +1,482 @@
+"""QPs from files: what is read is the QP that was written down."""
+
+import json
+import re
+
+import highspy
+import numpy as np
+import pytest
+from scipy.io import loadmat, savemat
+from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, vstack
+
+from harness import InputError, kkt_residuals
+from harness.cli import main
+from harness.names import assemble, canonical, parse
+from harness.qpfile import load_qp, save_qp
+from harness.registry import SolverSpec, resolve
+from harness.workbench import Workbench
+from problems import PROBLEMS
+from problems.qps import parse_qps
+from problems.twosided import one_sided
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+#: the example of Maros and Mészáros's report, with every kind of row, range and bound
+QPS = """\
+* a comment
+NAME          EXAMPLE
+ROWS
+ N  obj
+ G  r1
+ L  r2
+ E  r3
+ N  ignored
+ E  r4
+COLUMNS
+    c1        r1                 2.0   r2                -1.0
+    c1        obj                1.5   ignored            7.0
+    c2        r1                 1.0   r2                 2.0
+    c2        obj               -2.0   r3                 1.0
+    c3        r3                 1.0   r4                 1D-14
+    c4        r4                 3.0
+    c5        r4                 1.0
+RHS
+    rhs       obj               -4.0   r1                 2.0
+    rhs       r2                 6.0   r3                 1.0
+RANGES
+    rng       r1                 4.0   r3                -2.0
+    rng       r2                 2.5
+BOUNDS
+ UP bnd       c1                20.0
+ FR bnd       c3
+ MI bnd       c4
+ FX bnd       c5                 2.0
+QUADOBJ
+    c1        c1                 8.0
+    c1        c2                 2.0
+    c2        c2                10.0
+ENDATA
+"""
+
+
+def build(text):
+    name = parse(text, PROBLEMS)
+    return PROBLEMS[name.family].build(name.form, name.params, reference_solution)
+
+
+def solved(qp):
+    clarabel = resolve(SolverSpec(name="clarabel", label="clarabel"), SOLVERS)
+    s = clarabel.prepare(qp, 1e-10)()
+    assert kkt_residuals(qp, s).worst < 1e-8
+    return s
+
+
+@pytest.fixture
+def written(tmp_path, monkeypatch):
+    """Write a file and name it; the working directory is its folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(content, name):
+        if isinstance(content, dict):
+            savemat(tmp_path / name, content)
+        else:
+            (tmp_path / name).write_text(content)
+        return f"file:{name}"
+
+    return write
+
+
+def assert_same(one, two):
+    for name in ("q", "b", "h", "lb", "ub"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    for name in ("P", "A", "G"):
+        left, right = (getattr(qp, name) for qp in (one, two))
+        assert isinstance(left, np.ndarray) == isinstance(right, np.ndarray)
+        np.testing.assert_array_equal(
+            csc_array(left).toarray(), csc_array(right).toarray()
+        )
+
+
+# QPS
+
+
+def test_a_qps_text_holds_the_qp_that_its_sections_say():
+    given, sign = parse_qps(QPS)
+
+    assert sign == 1
+    assert given.r == 4  # the right-hand side of the objective is minus its constant
+    np.testing.assert_array_equal(given.q, [1.5, -2, 0, 0, 0])
+    expected = np.zeros((5, 5))
+    expected[:2, :2] = [[8, 2], [2, 10]]
+    np.testing.assert_array_equal(given.P.toarray(), expected)
+    rows = [[2, 1, 0, 0, 0], [-1, 2, 0, 0, 0], [0, 1, 1, 0, 0], [0, 0, 1e-14, 3, 1]]
+    np.testing.assert_array_equal(given.A.toarray(), rows)
+    np.testing.assert_array_equal(given.l, [2, 3.5, -1, 0])
+    np.testing.assert_array_equal(given.u, [6, 6, 1, 0])
+    np.testing.assert_array_equal(given.lb, [0, 0, -np.inf, -np.inf, 2])
+    np.testing.assert_array_equal(given.ub, [20, np.inf, np.inf, np.inf, 2])
+
+
+def highs_reads(path):
+    highs = highspy.Highs()
+    highs.setOptionValue("output_flag", False)
+    highs.setOptionValue("small_matrix_value", 1e-12)
+    highs.readModel(str(path))
+    lp, hessian = highs.getModel().lp_, highs.getModel().hessian_
+    n, m = lp.num_col_, lp.num_row_
+    parts = lp.a_matrix_
+    A = csc_array((parts.value_, parts.index_, parts.start_), shape=(m, n))
+    triangle = csc_array((hessian.value_, hessian.index_, hessian.start_), shape=(n, n))
+    P = (triangle + triangle.T).toarray() - np.diag(triangle.diagonal())
+    vectors = (lp.col_cost_, lp.row_lower_, lp.row_upper_, lp.col_lower_, lp.col_upper_)
+    return P, A.toarray(), *map(np.array, vectors), lp.offset_
+
+
+@pytest.mark.parametrize("section", ["QUADOBJ", "QSECTION obj", "QMATRIX"])
+def test_highs_reads_the_same_qp(tmp_path, section):
+    text = QPS.replace("1D-14", "0.25").replace("QUADOBJ", section)
+    if section == "QMATRIX":
+        text = text.replace("c2        c2 ", "c2 c1 2.0\n    c2  c2 ")
+    path = tmp_path / "a.mps"
+    path.write_text(text)
+
+    given, _ = parse_qps(text)
+    ours = (given.P.toarray(), given.A.toarray(), given.q, given.l, given.u,
+            given.lb, given.ub, given.r)  # fmt: skip
+    for mine, theirs in zip(ours, highs_reads(path), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_the_name_of_a_set_may_be_left_out():
+    bare = re.sub(r"^    (rhs|rng)", "    ", QPS, flags=re.MULTILINE)
+    bare = re.sub(r"^ (UP|FR|MI|FX) bnd", r" \1", bare, flags=re.MULTILINE)
+    one, two = parse_qps(QPS)[0], parse_qps(bare)[0]
+
+    assert bare != QPS
+    assert_same(one_sided(one), one_sided(two))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "limits"),
+    [
+        ("r1                 4.0", "r1 -4.0", [(2, 6), (3.5, 6), (-1, 1)]),
+        ("r2                 2.5", "r2 -2.5", [(2, 6), (3.5, 6), (-1, 1)]),
+        ("r3                -2.0", "r3 2.0", [(2, 6), (3.5, 6), (1, 3)]),
+    ],
+)
+def test_the_sign_of_a_range_matters_for_equalities_only(old, new, limits):
+    assert old in QPS
+    given, _ = parse_qps(QPS.replace(old, new))
+
+    assert list(zip(given.l, given.u, strict=True))[:3] == limits
+
+
+def test_a_negative_upper_bound_alone_frees_the_lower_side():
+    negative = QPS.replace(" UP bnd       c1                20.0", " UP bnd c1 -3")
+
+    assert parse_qps(negative)[0].lb[0] == -np.inf
+    both = negative.replace(" UP bnd c1", " LO bnd c1 -5\n UP bnd c1")
+    assert parse_qps(both)[0].lb[0] == -5
+
+
+def test_a_maximised_objective_is_minus_a_minimised_one(written):
+    concave = QPS.replace("8.0", "-8.0").replace("10.0", "-10.0")
+    case = build(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
+    s = solved(case.qp)
+
+    # of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 where both r1 and r2 are at their lower
+    # sides: c₁ = 0.1, c₂ = 1.8
+    np.testing.assert_allclose(s.x[:2], [0.1, 1.8], atol=1e-8)
+    assert case.quantities(s)["value"] == pytest.approx(-15.33)
+    energy = case.scale * case.qp.objective(s.x) + case.constant
+    assert energy == pytest.approx(-15.33)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("r4                 3.0", "r9 3.0", "line 16: row 'r9' is not among ROWS"),
+        ("    c1        c2  ", "    c1 c9 ", "line 31: column 'c9' is not among COL"),
+        ("20.0", "2O.0", "line 25: '2O.0' is no number"),
+        (" UP bnd", " UQ bnd", "line 25: unknown bound type 'UQ'; did you mean 'UP'?"),
+        (" UP bnd", " BV bnd", "line 25: bound BV makes the variable discrete"),
+        ("RANGES", "RANGE", "line 21: unknown section 'RANGE'; did you mean 'RANGES'?"),
+        (" G  r1", " H  r1", "line 5: unknown row type 'H'"),
+        (" G  r1", " G  r2", "line 6: row 'r2' is given twice"),
+        ("COLUMNS\n", "COLUMNS\n M 'MARKER' 'INTORG'\n", "line 11: integer variables"),
+        ("c2        c2 ", "c2 c1 ", "line 32: entry 'c2', 'c1' is given twice"),
+        ("QUADOBJ", "QSECTION r1", "line 29: QSECTION r1 is of a constraint"),
+        ("ENDATA\n", "", "no ENDATA; the file is cut off"),
+        (" N  obj\n", " G  obj\n", None),
+        ("MI bnd       c4", "LO bnd c4 1e20", "the limits of variable 3 (from 0)"),
+        ("FX bnd       c5  ", "UP bnd c5 1\n LO bnd c5 ", "the limits of variable 4"),
+    ],
+)  # fmt: skip
+def test_a_bad_qps_text_is_refused_with_its_line(written, old, new, message):
+    assert old in QPS
+    text = QPS.replace(old, new, 1)
+    if message is None:
+        text, message = text.replace(" N  ignored\n", " G  ignored\n"), "no row of type"
+    with pytest.raises(InputError) as e:
+        build(written(text, "a.qps"))
+
+    assert str(e.value).startswith(f"a.qps: {message}")
+    assert "\n" not in str(e.value)
+
+
+# Maros-Mészáros in .mat
+
+RNG = np.random.default_rng(20240613)
+HALF = RNG.standard_normal((4, 4))
+MAT = {
+    "P": csc_matrix(HALF @ HALF.T),
+    "q": RNG.standard_normal((4, 1)),
+    "r": 2.5,
+    "A": csc_matrix(RNG.standard_normal((5, 4))),
+    "l": np.array([[1.0, -1e20, -2, -1e20, -1]]),
+    "u": np.array([[1.0, 3, 1e20, 1e20, 4]]),
+    "n": 4,
+    "m": 5,
+}
+
+
+def test_two_sided_rows_become_equalities_and_inequalities(written):
+    case = build(written(MAT, "a.mat"))
+    qp, A = case.qp, MAT["A"].toarray()
+
+    np.testing.assert_array_equal(csc_array(qp.P).toarray(), MAT["P"].toarray())
+    np.testing.assert_array_equal(qp.q, MAT["q"].ravel())
+    np.testing.assert_array_equal(qp.A.toarray(), A[:1])
+    np.testing.assert_array_equal(qp.b, [1])
+    np.testing.assert_array_equal(qp.G.toarray(), [A[1], A[4], -A[2], -A[4]])
+    np.testing.assert_array_equal(qp.h, [3, 4, 2, 1])
+    assert not np.isfinite(qp.lb).any()
+    assert not np.isfinite(qp.ub).any()
+    s = solved(qp)
+    assert case.quantities(s)["value"] == qp.objective(s.x) + 2.5
+
+
+def test_identity_rows_at_the_end_are_the_bounds(written):
+    bounds = np.array([[0.0, -1e20, -1, 2]]), np.array([[1.0, 1e20, 1e20, 2]])
+    more = MAT | {
+        "A": csc_matrix(vstack([MAT["A"], eye_array(4)])),
+        "l": np.hstack([MAT["l"], bounds[0]]),
+        "u": np.hstack([MAT["u"], bounds[1]]),
+        "m": 9,
+    }
+    qp = build(written(more, "a.mat")).qp
+
+    assert (qp.b.size, qp.h.size) == (1, 4)
+    np.testing.assert_array_equal(qp.lb, [0, -np.inf, -1, 2])
+    np.testing.assert_array_equal(qp.ub, [1, np.inf, np.inf, 2])
+
+
+def test_the_older_names_of_p_and_q_are_known(written):
+    older = {"Q": MAT["P"], "c": MAT["q"]} | {
+        k: v for k, v in MAT.items() if k not in ("P", "q", "r", "n", "m")
+    }
+
+    assert_same(build(written(older, "b.mat")).qp, build(written(MAT, "a.mat")).qp)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"P": csc_matrix(HALF)}, "P is not symmetric: P["),
+        ({"P": csc_matrix(np.eye(3))}, "P has shape (3, 3), expected (4, 4)"),
+        ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
+        ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
+        ({"q": np.full(4, np.nan)}, "q holds NaN"),
+        ({"q": "text"}, "q is no matrix of numbers"),
+        ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
+        ({"m": 7}, "m is not 5"),
+        ({"u": np.ones(4)}, "u has shape (4,), expected (5,)"),
+        ({"A": None}, "A is missing"),
+        ({"G": np.eye(4)}, "h is missing"),
+    ],
+)
+def test_a_bad_mat_file_is_named_with_what_is_wrong(written, changes, message):
+    content = {k: v for k, v in (MAT | changes).items() if v is not None}
+    with pytest.raises(InputError) as e:
+        build(written(content, "a.mat"))
+
+    assert str(e.value).startswith(f"a.mat: {message}")
+    assert "\n" not in str(e.value)
+
+
+def test_other_files_are_refused(written, tmp_path):
+    name = written("no mat file", "a.mat")
+    with pytest.raises(InputError, match=r"a\.mat: not a \.mat file"):
+        build(name)
+    with pytest.raises(InputError, match=r"b\.mat: No such file"):
+        build("file:b.mat")
+    written("", "a.parquet")
+    with pytest.raises(InputError, match=r"a\.parquet: unknown format '\.parquet'; "):
+        build("file:a.parquet")
+    (tmp_path / "a.qps").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match=r"a\.qps: not UTF-8"):
+        build("file:a.qps")
+
+
+# names
+
+
+def test_all_after_the_colon_is_the_path_and_the_canonical_name(written):
+    text = written(QPS, "a b=c:1.qps")
+    family = PROBLEMS["file"]
+    name = parse(text, PROBLEMS)
+
+    assert name.params["path"] == "a b=c:1.qps"
+    assert canonical(name, family) == text
+    assert assemble(family, {"path": "a b=c:1.qps"}, "qp") == name
+
+
+def test_the_content_is_part_of_the_case(written):
+    text = written(QPS, "a.qps")
+    before = parse(text, PROBLEMS)
+    written(QPS.replace("20.0", "30.0"), "a.qps")
+    after = parse(text, PROBLEMS)
+
+    assert before.params["sha256"] != after.params["sha256"]
+    family = PROBLEMS["file"]
+    with pytest.raises(InputError, match=r"a\.qps: its content has the digest"):
+        family.build("qp", before.params, reference_solution)
+
+
+@pytest.mark.parametrize("text", ["file", "file:", "file/a.npz"])
+def test_a_name_without_a_path_says_how_to_write_one(text):
+    with pytest.raises(InputError, match="no file; expected file:PATH"):
+        parse(text, PROBLEMS)
+
+
+# export and back
+
+
+@pytest.fixture
+def command(capsys):
+    """Run the command line; return exit code, stdout and stderr."""
+    bench = Workbench(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=lambda out, formats: [], plot=lambda fields, path: None,
+        vtu=lambda fields, path: None,
+    )  # fmt: skip
+
+    def run(*arguments):
+        return main(bench, arguments), *capsys.readouterr()
+
+    return run
+
+
+SMALL = "beam-ring/Nr=2/Nh=1/steps=2"
+
+
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+@pytest.mark.parametrize("suffix", ["npz", "mat"])
+def test_an_exported_qp_comes_back_exactly(written, command, form, suffix):
+    assert command("export", f"{SMALL}/{form}", f"a.{suffix}")[0] == 0
+    original, back = build(f"{SMALL}/{form}"), build(f"file:a.{suffix}")
+
+    assert_same(back.qp, original.qp)
+    assert (back.scale, back.constant) == (original.scale, original.constant)
+    s = solved(original.qp)
+    energy = original.quantities(s)["energy"]
+    assert back.quantities(s)["value"] == pytest.approx(energy, rel=1e-6)
+
+
+def test_a_mat_file_holds_sparse_matrices_under_the_names_of_the_npz(written, command):
+    command("export", f"{SMALL}/primal", "a.mat")
+    stored = loadmat("a.mat")
+
+    assert all(hasattr(stored[name], "tocsc") for name in "PGA")
+    assert json.loads(stored["meta"].item())["form"] == "primal"
+    assert {"q", "h", "b", "lb", "ub"} < stored.keys()
+    assert "F" not in stored
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_the_dual_s_matrices_obey_the_paper(written, command, form):
+    command("export", f"{SMALL}/primal", "p.mat")
+    command("export", f"{SMALL}/{form}", "a.mat")
+    p, a = loadmat("p.mat"), loadmat("a.mat")
+    K, f = p["P"].toarray(), -p["q"].ravel()
+    B, R, F, d, c = (csc_array(a[k]).toarray() for k in "BRFdc")
+    if form == "dual":
+        inverse = np.linalg.pinv(K, rcond=1e-12)
+    else:  # supports are not in B but in K⁺, which is zero there
+        free = np.setdiff1d(np.arange(f.size), csr_array(p["A"]).indices)
+        inverse = np.zeros_like(K)
+        inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
+
+    np.testing.assert_array_equal(F, a["P"].toarray())
+    np.testing.assert_array_equal(d, -a["q"])
+    # any generalised inverse serves on the λ that satisfy RᵀBᵀλ = Rᵀf
+    T = np.linalg.svd(R.T @ B.T)[2][R.shape[1] :] if R.size else np.eye(len(c))
+    scale = abs(T @ F @ T.T).max()
+    np.testing.assert_allclose(
+        T @ F @ T.T, T @ (B @ inverse @ B.T) @ T.T, rtol=0, atol=1e-9 * scale
+    )
+    feasible = (
+        np.linalg.lstsq(R.T @ B.T, R.T @ f, rcond=None)[0] if R.size else 0 * c.T[0]
+    )
+    left = d.ravel() - F @ feasible
+    right = B @ inverse @ f - c.ravel() - B @ inverse @ B.T @ feasible
+    np.testing.assert_allclose(T @ left, T @ right, rtol=0, atol=1e-8 * abs(left).max())
+    if form == "dual":
+        np.testing.assert_allclose(R.T @ B.T, a["A"].toarray(), atol=1e-12)
+        assert R.shape[1] == 6
+    else:
+        assert R.shape == (f.size, 0)
+
+
+def test_unknown_formats_of_an_export_are_refused_with_those_there_are(
+    written, command
+):
+    code, _, err = command("export", f"{SMALL}/primal", "a.parquet")
+
+    assert code == 2
+    assert (
+        err
+        == "mortarbench: a.parquet: unknown format '.parquet'; expected .npz or .mat\n"
+    )
+
+
+def test_a_file_of_an_operator_comes_back_as_an_array(written, planted, tmp_path):
+    qp, _ = planted("everything", dense=True)
+    save_qp(tmp_path / "a.npz", qp, {"scale": -2.0, "constant": 3.0})
+    case = build("file:a.npz")
+
+    assert_same(case.qp, load_qp(tmp_path / "a.npz")[0])
+    assert (case.scale, case.constant) == (-2.0, 3.0)
+    assert isinstance(case.qp.P, np.ndarray)
+
+
+def test_a_file_can_be_solved_by_name(written, command):
+    code, out, _ = command(
+        "solve", written(QPS, "a.qps"), "--solver", "clarabel", "--json"
+    )
+    record = json.loads(out)
+
+    assert code == 0
+    assert record["case"] == "file:a.qps"
+    assert len(record["params"]["sha256"]) == 12
+    assert record["quantities"]["value"] == pytest.approx(record["objective"] + 4)
+
+
+def test_a_run_does_not_go_on_with_a_file_that_has_changed(written, command, tmp_path):
+    written(QPS, "a.qps")
+    suite = tmp_path / "s.toml"
+    suite.write_text(
+        'name = "s"\nrepeats = 1\nsolvers = ["clarabel"]\n[[problems]]\n'
+        'family = "file"\nparams = { path = ["a.qps"] }\n'
+    )
+    assert command("run", str(suite), "--out", "out")[0] == 0
+    assert command("run", str(suite), "--out", "out")[0] == 0
+    written(QPS.replace("20.0", "30.0"), "a.qps")
+    code, _, err = command("run", str(suite), "--out", "out")
+
+    assert code == 2
+    assert re.fullmatch(
+        r"mortarbench: out holds file:a\.qps with sha256 = \w{12}, now \w{12}; "
+        r"choose another --out or use --fresh\n",
+        err.splitlines(keepends=True)[-1],
+    )

@@ -1,0 +1,141 @@
+"""VTU files, read back by meshio and by an XML parser."""
+
+from xml.etree import ElementTree
+
+import meshio
+import numpy as np
+import pytest
+
+from harness import Fields, InputError
+from harness.cli import main
+from harness.qpfile import save_qp
+from harness.workbench import Workbench
+from problems import PROBLEMS
+from reports.vtu import write_series, write_vtu
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+FIELDS = Fields(
+    points=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0, 2], [1, 2], [1, 3], [0, 3]]),
+    cells=np.array([[0, 1, 2, 3], [4, 5, 6, 7]]),
+    bodies=np.array([0, 1]),
+    displacement=np.arange(16).reshape(8, 2) / 7,
+    nodal={"von_mises": np.linspace(1e6, 2e6, 8)},
+    contact_nodes=np.array([3, 2]),
+    contact_forces=np.array([[0.0, -3e5], [0.0, -0.1]]),
+)
+
+
+@pytest.fixture
+def grid(tmp_path):
+    write_vtu(FIELDS, tmp_path / "a.vtu")
+    return meshio.read(tmp_path / "a.vtu")
+
+
+def test_points_and_vectors_have_three_components(grid):
+    np.testing.assert_array_equal(grid.points[:, :2], FIELDS.points)
+    u = grid.point_data["displacement"]
+    np.testing.assert_array_equal(u[:, :2], FIELDS.displacement)
+    for vectors in (grid.points, u, grid.point_data["contact_force"]):
+        assert vectors.shape == (8, 3)
+        assert not vectors[:, 2].any()
+
+
+def test_cells_know_their_body(grid):
+    (block,) = grid.cells
+
+    assert block.type == "quad"
+    np.testing.assert_array_equal(block.data, FIELDS.cells)
+    np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
+
+
+def test_contact_is_a_force_and_a_flag_without_gaps_elsewhere(grid):
+    force, flag = grid.point_data["contact_force"], grid.point_data["in_contact"]
+
+    np.testing.assert_array_equal(force[:, 1], [0, 0, -0.1, -3e5, 0, 0, 0, 0])
+    assert flag.dtype.kind == "i"  # the second force is rounding next to the first
+    np.testing.assert_array_equal(flag, [0, 0, 0, 1, 0, 0, 0, 0])
+    np.testing.assert_array_equal(
+        grid.point_data["von_mises"], FIELDS.nodal["von_mises"]
+    )
+
+
+def test_bodies_without_contact_are_written_too(tmp_path):
+    bare = Fields(points=FIELDS.points, cells=FIELDS.cells, bodies=FIELDS.bodies,
+                  displacement=FIELDS.displacement)  # fmt: skip
+    write_vtu(bare, tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+
+    assert not data["contact_force"].any()
+    assert not data["in_contact"].any()
+
+
+def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path):
+    params = dict(Nr=2, Nh=1, steps=1)
+    family = PROBLEMS["beam-ring"]
+    case = family.build("dual-bounds", family.complete(params), reference_solution)
+    s = SOLVERS["clarabel"].prepare(case.qp, 1e-8)()
+    write_vtu(case.fields(s), tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+
+    assert all(np.isfinite(values).all() for values in data.values())
+    assert data["in_contact"].sum() == case.quantities(s)["active"]
+    # on the ring, so opposite to what the beam gets
+    on_beam = case.quantities(s)["contact_force"]
+    np.testing.assert_allclose(
+        data["contact_force"].sum(axis=0)[:2], np.negative(on_beam)
+    )
+    np.testing.assert_allclose(data["displacement"][:, :2].ravel(), case.recover(s))
+
+
+@pytest.fixture
+def solve(tmp_path, capsys):
+    """Solve a case with --vtu; return exit code, stderr and the file."""
+    bench = Workbench(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
+    )  # fmt: skip
+
+    def solve(case, name="a.vtu"):
+        path = tmp_path / name
+        code = main(bench, ["solve", case, "--solver", "clarabel", "--vtu", str(path)])
+        return code, capsys.readouterr().err, path
+
+    return solve
+
+
+def test_solve_writes_the_deformed_state(solve):
+    code, _, path = solve("beam-ring/Nr=1/Nh=1/steps=1/dual-bounds")
+
+    assert code == 0
+    assert "von_mises" in meshio.read(path).point_data
+
+
+def test_solve_refuses_what_it_cannot_write(solve, planted, tmp_path):
+    save_qp(tmp_path / "a.npz", planted("box")[0], {})
+    code, err, path = solve(f"file:{tmp_path / 'a.npz'}")
+
+    assert (code, path.exists()) == (2, False)
+    assert err.endswith("has no bodies to draw; leave out --vtu\n")
+    code, err, _ = solve("beam-ring/dual", "a.vtk")
+    assert code == 2
+    assert err.endswith("a.vtk: unknown format '.vtk'; expected .vtu\n")
+
+
+def test_a_series_names_its_files_and_times_next_to_it(tmp_path):
+    path = tmp_path / "a & b.pvd"
+    written = write_series([(0.5, FIELDS), (1.0, FIELDS)], path)
+    sets = ElementTree.parse(path).getroot().findall("Collection/DataSet")
+
+    assert written[0] == path
+    assert [float(s.get("timestep")) for s in sets] == [0.5, 1.0]
+    assert [tmp_path / s.get("file") for s in sets] == written[1:]
+    for file in written[1:]:
+        assert len(meshio.read(file).points) == 8
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"a\.vtu: cannot be written"):
+        write_vtu(FIELDS, tmp_path / "no" / "a.vtu")
+    with pytest.raises(InputError, match=r"a\.pvd: cannot be written"):
+        write_series([], tmp_path / "no" / "a.pvd")
