@@ -40,6 +40,12 @@ class Bodies:
 
     K, f and what is derived from them are non-dimensional: lengths by `length`, forces
     per thickness by `force`, hence K' = K·l/F₀ and u' = u/l.
+
+    Raises
+    ------
+    ValueError
+        When the nodes are not numbered body by body.
+
     """
 
     mesh: Mesh  #: of all bodies, m
@@ -53,6 +59,10 @@ class Bodies:
     f: Vector  #: (n,) full load
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component
     pairs: tuple[ContactPair, ...]  #: sides that may touch
+
+    def __post_init__(self) -> None:
+        if (np.diff(self.body_of_node) < 0).any():
+            raise ValueError("nodes must be numbered one body after another")
 
     @property
     def body_of_node(self) -> NDArray[np.int64]:

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from problems.beam_ring import model
 from problems.mesh import (
     half_disc,
     half_ring,
@@ -108,3 +111,13 @@ def test_nodal_lengths_integrate_linear_functions_along_a_chain():
 
     assert nodal_lengths(chain) == pytest.approx([2.5, 3, 0.75, 0.25])
     assert nodal_lengths(chain) @ along == pytest.approx(6.5**2 / 2)
+
+
+def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
+    """The rigid modes of each body are written to a block of rows of R."""
+    bodies = model(1, 1, 2, "strain")
+    shuffle = np.random.default_rng(271828).permutation(len(bodies.mesh.points))
+    mesh = replace(bodies.mesh, cells=shuffle[bodies.mesh.cells])
+
+    with pytest.raises(ValueError, match="one body after another"):
+        replace(bodies, mesh=mesh)
