@@ -5,7 +5,7 @@ All functions raise `InputError`; `where` names the value as the user knows it.
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -38,7 +38,7 @@ def at_least_one(where: str, value: object) -> int:
 
 def positive(where: str, value: Any) -> float:
     """Take a positive finite number."""
-    if not is_number(value) or not 0 < value < math.inf:
+    if not is_number(value) or not 0 < value <= sys.float_info.max:
         raise InputError(f"{where} = {value!r}; expected a positive number")
     return float(value)
 

@@ -7,6 +7,8 @@ stderr; 3 a fault of ours, with a traceback; 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -26,27 +28,62 @@ class _Parser(argparse.ArgumentParser):
         usage = " ".join(self.format_usage().split())
         raise InputError(f"{message}; {usage}")
 
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """End after a help text, while a reader that has gone is no surprise."""
+        print(end="", flush=True)
+        super().exit(status, message)
+
 
 def main(workbench: Workbench, argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
+    _show_what_can_be_shown()
     try:
-        workbench = workbench.extended(entry_point_plugins())
-        if argv[:1] == ["worker"]:  # how runs start their workers; not for users
-            return commands.worker(workbench, argv[1:])
-        options, left = _parser().parse_known_args(argv)
-        if left:
-            options.parser.error(f"unknown argument {left[0]!r}")
-        code: int = options.run(workbench, options)
+        return _run(workbench, argv)
     except InputError as e:
-        print(f"mortarbench: {' '.join(str(e).splitlines())}", file=sys.stderr)
-        return 2
+        return _complain(" ".join(str(e).splitlines()))
     except KeyboardInterrupt:
-        print("mortarbench: interrupted; the same command continues", file=sys.stderr)
+        goes_on = "; the same command continues" if argv[:1] == ["run"] else ""
+        _complain(f"interrupted{goes_on}")
         return 130
-    except Exception:
+    except BrokenPipeError:  # as of `mortarbench list solvers | head -1`
+        _print_no_more()
+        return 0
+    except Exception as e:
+        if isinstance(e, OSError) and e.filename is not None:
+            return _complain(f"{os.fsdecode(e.filename)}: {e.strerror}")
         traceback.print_exc()
         return 3
+
+
+def _run(workbench: Workbench, argv: Sequence[str]) -> int:
+    workbench = workbench.extended(entry_point_plugins())
+    if argv[:1] == ["worker"]:  # how runs start their workers; not for users
+        return commands.worker(workbench, argv[1:])
+    options, left = _parser().parse_known_args(argv)
+    if left:
+        options.parser.error(f"unknown argument {left[0]!r}")
+    code: int = options.run(workbench, options)
+    print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
+
+
+def _complain(message: str) -> int:
+    """Say in one line what is wrong, and return the exit code of wrong input."""
+    print(f"mortarbench: {message}", file=sys.stderr)
+    return 2
+
+
+def _show_what_can_be_shown() -> None:
+    """Have a terminal of few characters show a question mark instead of a λ."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _print_no_more() -> None:
+    """Make the last flush of the streams, when Python ends, succeed."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -104,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
 def _add_run_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("suite", metavar="SUITE.toml", help="or the name of a suite")
     command.add_argument(
-        "--out", metavar="DIR", type=Path, help="default: out/NAME-OF-SUITE"
+        "--out", metavar="DIR", type=_folder, help="default: out/NAME-OF-SUITE"
     )
     command.add_argument(
         "--solver", metavar="NAME", action="append", default=[], help="only this one"
@@ -119,6 +156,12 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--fresh", action="store_true", help="forget what the folder holds"
     )
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise InputError("--out is empty; expected a folder")
+    return Path(text)
 
 
 def _add_plugin(command: argparse.ArgumentParser) -> None:

@@ -5,23 +5,26 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
 from pathlib import Path
 from typing import Any
 
 from harness import show
-from harness.doctor import advice, noise_floor, render
+from harness.build import build, unbuilt
+from harness.doctor import QUIET_LOAD, advice, noise_floor, render
 from harness.environment import capture, digest
-from harness.errors import InputError, unknown
+from harness.errors import InputError, some, unknown
 from harness.journal import read_journal
-from harness.judge import blank, has_point, judged, plain
+from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
-from harness.measure import measure
-from harness.names import canonical, completed, parse
+from harness.names import CaseName, canonical, completed, parse
+from harness.plugin import Case
 from harness.progress import shown_on
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec, options_of, resolve
+from harness.remote import measured_once
 from harness.run import run as run_suite
 from harness.suite import load_suite, with_overrides
 from harness.workbench import FORMATS, Workbench
@@ -66,7 +69,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
 
 
 def run(workbench: Workbench, options: Namespace) -> int:
-    """Measure what the result folder lacks of a suite, and report."""
+    """Measure what the result folder lacks of a suite, and report; 1 if not all."""
     workbench = workbench.with_files(options.plugin)
     path = workbench.suite_path(options.suite)
     suite = with_overrides(
@@ -80,29 +83,35 @@ def run(workbench: Workbench, options: Namespace) -> int:
         memory_limit=options.memory_limit,
     )
     out = options.out or Path("out") / suite.name
-    environment = capture()
+    environment = capture(options.plugin)
+    if (load := environment["now"]["load"]) > QUIET_LOAD:
+        _say(f"other programs keep {load:.1f} cores busy; times will be less certain")
     with shown_on(sys.stderr) as progress:
-        run_suite(
+        unbuilt_cases = run_suite(
             suite,
             families=workbench.families,
             reference=workbench.reference,
             out=out,
-            command=lambda spec: worker_command(spec, options.plugin),
+            command=lambda spec: workbench.worker_command(spec, options.plugin),
             resolve=lambda spec: resolve(spec, workbench.solvers),
             environment=environment,
             digest=digest(environment),
             progress=progress,
             fresh=options.fresh,
         )
-    print(show.summary(read_journal(out), [s.label for s in suite.solvers]))
-    written = workbench.report(out, FORMATS)
+    records = read_journal(out)
+    print(show.summary(records, [s.label for s in suite.solvers]))
+    if unbuilt_cases:
+        cases = "case" if len(unbuilt_cases) == 1 else "cases"
+        print(f"{len(unbuilt_cases)} {cases} could not be built: {some(unbuilt_cases)}")
+    written = workbench.report(out, FORMATS) if records else []
     for page in (file for file in written if file.suffix == ".html"):
         print(page)
-    return 0
+    return 1 if unbuilt_cases else 0
 
 
 def solve(workbench: Workbench, options: Namespace) -> int:
-    """Measure one solver on one case in this process; 0 if we can verify its answer."""
+    """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
     if not 0 < options.tol < 1:
         raise InputError(f"--tol = {options.tol}; expected a number between 0 and 1")
     if options.plot is not None:
@@ -111,18 +120,17 @@ def solve(workbench: Workbench, options: Namespace) -> int:
         _check_writable(options.vtu, (".vtu",))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
-    family = workbench.families[name.family]
     spec = SolverSpec(name=options.solver, label=options.solver)
     solver = resolve(spec, workbench.solvers)
-    case = family.build(name.form, name.params, workbench.reference)
+    case = _built(workbench, name)
     record = blank(
         name,
-        canonical(name, family),
+        canonical(name, workbench.families[name.family]),
         spec,
         options=options_of(solver),
         tol=options.tol,
         repeat=0,
-        environment=digest(capture()),
+        environment=digest(capture(options.plugin)),
     )
     pictures = {
         option: (draw, path)
@@ -137,12 +145,13 @@ def solve(workbench: Workbench, options: Namespace) -> int:
             f"{record.case} has no bodies to draw; leave out {', '.join(pictures)}"
         )
 
-    measurement = measure(solver, case.qp, options.tol)
-    record = judged(record, case, measurement)
+    with redirect_stdout(sys.stderr):  # whatever the family prints
+        command = workbench.worker_command(spec, options.plugin)
+        record, solution = measured_once(command, case, record)
     _show(record, options.json)
     if pictures and case.fields is not None:
-        if has_point(measurement.solution):
-            fields = case.fields(measurement.solution)
+        if solution is not None and has_point(solution):
+            fields = case.fields(solution)
             for draw, path in pictures.values():
                 draw(fields, path)
         else:
@@ -155,10 +164,9 @@ def export(workbench: Workbench, options: Namespace) -> int:
     _check_writable(options.file, (".npz", ".mat"))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
-    family = workbench.families[name.family]
-    case = family.build(name.form, name.params, workbench.reference)
+    case = _built(workbench, name)
     meta = {
-        "name": canonical(name, family),
+        "name": canonical(name, workbench.families[name.family]),
         "family": name.family,
         "params": name.params,
         "form": name.form,
@@ -192,19 +200,8 @@ def doctor(_workbench: Workbench, _options: Namespace) -> int:
     return 0
 
 
-def worker_command(spec: SolverSpec, plugins: Iterable[Path]) -> list[str]:
-    """Make the command that starts the worker of a solver, less its two pipes."""
-    request = {
-        "name": spec.name,
-        "options": spec.options,
-        "plugins": [str(path.resolve()) for path in plugins],
-    }
-    # -P: what lies in the working directory must not pass for a library
-    return [sys.executable, "-P", "-m", "harness", "worker", json.dumps(request)]
-
-
 def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
-    """Be the worker that `worker_command` starts."""
+    """Be the worker that `Workbench.worker_command` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     workbench = workbench.with_files([Path(file) for file in request["plugins"]])
@@ -213,6 +210,28 @@ def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
     )
     serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
     return 0
+
+
+def _built(workbench: Workbench, name: CaseName) -> Case:
+    """Build a case; what a plug-in or too little memory prevents is no fault of ours.
+
+    Raises
+    ------
+    InputError
+        For both, and what the family itself refuses.
+
+    """
+    family = workbench.families[name.family]
+    origin = workbench.origins.get(name.family)
+    try:
+        return build(name, family, workbench.reference)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as e:
+        if origin is None and not isinstance(e, MemoryError):
+            raise
+        text = unbuilt(canonical(name, family), e)
+        raise InputError(f"{origin}: {text}" if origin else text) from e
 
 
 def _show(record: Record, as_json: bool) -> None:
@@ -230,9 +249,12 @@ def _check_writable(path: Path, suffixes: tuple[str, ...]) -> None:
         raise InputError(
             f"{path}: unknown format {path.suffix!r}; expected {' or '.join(suffixes)}"
         )
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a file")
     if not path.parent.is_dir():
         raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
 
 
 def _say(text: str) -> None:
-    print(f"mortarbench: {text}", file=sys.stderr)
+    with suppress(BrokenPipeError):  # nobody listens: no reason to stop
+        print(f"mortarbench: {text}", file=sys.stderr)

@@ -13,6 +13,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -45,14 +46,17 @@ CHOLMOD_OWNERS = ("system", "scikit_sparse")  #: whose libraries CHOLMOD may cal
 
 VOLATILE = ("now",)  #: the parts of an environment that its digest leaves out
 
+_CODE = ("harness", "problems", "solvers", "reports")  #: of a checkout
 _CPU = Path("/sys/devices/system/cpu")
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def capture() -> dict[str, Any]:
+def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
     """Describe this process: nested plain data, None where something is unreadable.
 
     The threads are those of the calling process: for a worker's, use `capture_in`.
+
+    plugins : files whose code is measured along with ours
     """
     # Only libraries in memory can be asked for their threads.
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
@@ -66,7 +70,8 @@ def capture() -> dict[str, Any]:
         "machine": _machine(),
         "versions": {"python": platform.python_version()}
         | {name: _version(name) for name in PACKAGES},
-        "source": _source(Path(__file__).resolve().parents[1]),
+        "source": source(Path(__file__).resolve().parents[1]),
+        "plugins": _plugins(plugins),
         "threads": {
             "variables": {
                 k: os.environ[k] for k in THREAD_VARIABLES if k in os.environ
@@ -110,6 +115,33 @@ def digest(environment: Mapping[str, Any]) -> str:
     lasting = {k: v for k, v in environment.items() if k not in VOLATILE}
     canonical = json.dumps(lasting, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
+
+
+def source(root: Path) -> dict[str, Any] | None:
+    """Name the commit of a checkout, and the changes since then by a digest.
+
+    dirty : whether code differs from the commit
+    changes : 12 hex digits of what differs and of new Python files; None if clean
+    """
+
+    def git(*arguments: str) -> bytes:
+        command = ("git", "-C", str(root), *arguments)
+        return subprocess.run(command, capture_output=True, check=True).stdout
+
+    if not (root / ".git").exists():
+        return None
+    try:
+        commit = git("rev-parse", "HEAD").decode().strip()
+        dirty = git("status", "--porcelain", "--", *_CODE) != b""
+        changes = hashlib.sha256(git("diff", "--no-ext-diff", "HEAD", "--", *_CODE))
+        listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
+        for name in sorted(listed.split(b"\0")):
+            if name.endswith(b".py"):
+                changes.update(name + b"\0" + (root / os.fsdecode(name)).read_bytes())
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    digits = changes.hexdigest()[:12] if dirty else None
+    return {"commit": commit, "dirty": dirty, "changes": digits}
 
 
 def mapped_libraries() -> list[str]:
@@ -196,23 +228,12 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _source(root: Path) -> dict[str, Any] | None:
-    """Name the commit of a checkout; dirty means that code differs from it."""
-
-    def git(*arguments: str) -> str:
-        command = ("git", "-C", str(root), *arguments)
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        return done.stdout.strip()
-
-    if not (root / ".git").exists():
-        return None
-    code = ("harness", "problems", "solvers", "reports")
-    try:
-        commit = git("rev-parse", "HEAD")
-        dirty = git("status", "--porcelain", "--", *code) != ""
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return {"commit": commit, "dirty": dirty}
+def _plugins(files: Iterable[Path]) -> dict[str, str]:
+    """Name the content of files by 12 hex digits; those of one name are as one."""
+    contents: dict[str, Any] = defaultdict(hashlib.sha256)
+    for file in files:
+        contents[file.name].update(file.read_bytes())
+    return {name: content.hexdigest()[:12] for name, content in contents.items()}
 
 
 def _physical_cores() -> int | None:

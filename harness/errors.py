@@ -16,9 +16,16 @@ class InputError(Exception):
 def unknown(what: str, got: str, known: Iterable[str], where: str = "") -> InputError:
     """Build the error for a name that is not among `known`, with the nearest one."""
     names = sorted(known)
-    near = get_close_matches(got, names, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    folded = {name.casefold(): name for name in names}
+    near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
+    hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
     return InputError(
         f"{prefix}unknown {what} {got!r}; {hint}known: {', '.join(names) or 'none'}"
     )
+
+
+def some(names: Iterable[str], most: int = 3) -> str:
+    """Enumerate the first few of `names`, and say how many more there are."""
+    first, rest = (listed := list(names))[:most], len(listed) - most
+    return ", ".join(first) + (f" and {rest} more" if rest > 0 else "")

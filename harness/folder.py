@@ -6,17 +6,40 @@ import fcntl
 import json
 import os
 import shutil
+import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
+from harness.environment import VOLATILE
+from harness.errors import InputError, some
 from harness.suite import Suite
 
 #: all that a run writes, which `fresh` deletes and nothing else
 _FOLDERS = ("journal", "vectors", "report")
 _FILES = ("environment.json", "suite.toml")
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Refuse a folder where we would write over, or delete, what is not ours.
+
+    Raises
+    ------
+    InputError
+        When something there has a name that we use, but no run made it.
+
+    """
+    if all((folder / name).is_file() for name in _FILES):
+        return
+    if next((folder / "journal").glob("*.jsonl"), None) is not None:
+        return
+    taken = [name for name in _FOLDERS + _FILES if os.path.lexists(folder / name)]
+    if taken:
+        raise InputError(
+            f"{folder} holds {some(taken)} but is no result folder (no suite.toml with "
+            "environment.json, no journal/*.jsonl); choose another --out"
+        )
 
 
 @contextmanager
@@ -48,6 +71,21 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(fd)  # which unlocks
 
 
+@contextmanager
+def scratch_in(folder: Path) -> Iterator[Path]:
+    """Make room in a locked folder for files that only last as long as a run.
+
+    What a killed run left there is deleted first.
+    """
+    scratch = folder / ".scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    try:
+        yield scratch.resolve()
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
 def claim(
     out: Path, suite: Suite, environment: Mapping[str, Any], *, fresh: bool
 ) -> None:
@@ -69,27 +107,48 @@ def claim(
             (out / name).unlink(missing_ok=True)
     remedy = "choose another --out or use --fresh"
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
-    if suite_file.exists() and suite_file.read_text("utf-8") != suite.text:
+    if suite_file.exists() and _toml(suite_file) != tomllib.loads(suite.text):
         raise InputError(
             f"{out} holds another suite ({suite_file} is not {suite.name!r} as it is "
             f"now); {remedy}"
         )
     if environment_file.exists():
-        then, now = _digest_in(environment_file), environment["digest"]
-        if then != now:
+        then = _environment(environment_file)
+        if then["digest"] != environment["digest"]:
+            keys = some(_differing(then, environment))
             raise InputError(
-                f"{out} was measured in another environment ({then}, now {now}); "
-                f"{remedy}"
+                f"{out} was measured in another environment ({then['digest']}, now "
+                f"{environment['digest']}{keys and f': {keys} changed'}); {remedy}"
             )
     _replace_text(suite_file, suite.text)
     _replace_text(environment_file, json.dumps(environment, indent=1) + "\n")
 
 
-def _digest_in(path: Path) -> str:
+def _toml(path: Path) -> dict[str, Any] | None:
     try:
-        return str(json.loads(path.read_text("utf-8"))["digest"])
-    except (ValueError, KeyError, TypeError):
+        return tomllib.loads(path.read_text("utf-8"))
+    except ValueError:  # no TOML, or no UTF-8: no suite of ours
+        return None
+
+
+def _environment(path: Path) -> dict[str, Any]:
+    try:
+        environment = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        environment = None
+    if not isinstance(environment, dict) or "digest" not in environment:
         raise InputError(f"{path}: no JSON object with a digest") from None
+    return environment
+
+
+def _differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the dotted keys of the lasting parts that are not the same in both."""
+    for key in sorted((then.keys() | now.keys()) - {"digest", *VOLATILE}):
+        a, b = then.get(key), now.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            yield from (f"{key}.{inner}" for inner in _differing(a, b))
+        elif a != b:
+            yield key
 
 
 def _replace_text(path: Path, text: str) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -21,6 +22,8 @@ from harness.errors import InputError, unknown
 from harness.plugin import Family, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+_TOO_LARGE = 2**63  #: integers from here on fit into no array
+_SHOWN = 40  #: characters of a wrong value
 _CALLED = {int: "integer", float: "finite number", str: "text"}
 
 
@@ -53,7 +56,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
         path, parts = _split_path(text, head, suffix)
         given = {"path": path}
         if not suffix:
-            return assemble(family, given, family.forms[0])
+            return assemble(family, given, family.forms[0], texts=True)
     if not parts or "=" in parts[-1]:
         forms = ", ".join(family.forms)
         raise InputError(f"{text}: no form at the end; expected one of {forms}")
@@ -64,11 +67,15 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
         if key in given:
             raise InputError(f"{head}: key {key!r} is set twice; set it once")
         given[key] = value
-    return assemble(family, given, parts[-1])
+    return assemble(family, given, parts[-1], texts=True)
 
 
-def assemble(family: Family, given: Mapping[str, object], form: str) -> CaseName:
-    """Make the checked name of the case with the keys `given`, texts or typed values.
+def assemble(
+    family: Family, given: Mapping[str, object], form: str, *, texts: bool = False
+) -> CaseName:
+    """Make the checked name of the case with the keys `given`.
+
+    texts : whether texts stand for numbers, as in a name
 
     Raises
     ------
@@ -83,6 +90,8 @@ def assemble(family: Family, given: Mapping[str, object], form: str) -> CaseName
         if key not in family.defaults:
             raise unknown("key", key, family.defaults, where=family.name)
         where, kind = f"{family.name}: {key}", type(family.defaults[key])
+        if texts and kind is not str and isinstance(value, str):
+            value = _number(value, kind)
         typed[key] = _typed(where, value, kind, free=key == _path_key(family))
     params = completed(family, typed)
     if (check := getattr(family, "check", None)) is not None:
@@ -137,30 +146,30 @@ def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
     return "/".join(parts[: ends[0]]), parts[ends[0] :]
 
 
+def _number(text: str, kind: type) -> object:
+    """Read a finite number; what is none, or absurdly long, stays a text."""
+    if kind is int and not _INTEGER.fullmatch(text):
+        return text
+    try:
+        number = kind(text)
+        return number if math.isfinite(number) else text
+    except (ValueError, OverflowError):
+        return text
+
+
 def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
-    """Convert a text, or check a typed value, to the type of the key's default.
+    """Check that a value has the type of the key's default, or convert it.
 
     free : whether a text may hold the signs that separate the parts of a name
     """
-    if kind is str and isinstance(value, str) and value:  # noqa: SIM102
-        if free or not set("/=") & set(value):
+    match value:
+        case str() if kind is str and value and (free or not set("/=") & set(value)):
             return value
-    if kind is int:
-        if isinstance(value, str) and _INTEGER.fullmatch(value):
-            return int(value)
-        if isinstance(value, int) and not isinstance(value, bool):
+        case bool():
+            pass
+        case int() if kind is int and abs(value) < _TOO_LARGE:
             return value
-    if kind is float and (number := _float(value)) is not None:
-        return number
-    raise InputError(f"{where}={value!r} is no {_CALLED[kind]}")
-
-
-def _float(value: object) -> float | None:
-    """Read a finite number, or None where `value` is none; a bool is none."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return None
-    try:
-        number = float(value)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
+        case int() | float() if kind is float and abs(value) <= sys.float_info.max:
+            return float(value)
+    shown = f"{value!r}" if len(f"{value!r}") <= _SHOWN else f"{value!r:.{_SHOWN}}…"
+    raise InputError(f"{where}={shown} is no {_CALLED[kind]}")

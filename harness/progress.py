@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TextIO
 
 from rich.console import Console
@@ -47,6 +47,9 @@ class _Bar:
     def say(self, text: str) -> None:
         self._bar.update(self._task, description=escape(text))
 
+    def warn(self, text: str) -> None:
+        self._bar.console.print(escape(text), highlight=False, soft_wrap=True)
+
     def advance(self, record: Record | None) -> None:
         self._bar.advance(self._task)
 
@@ -58,10 +61,14 @@ class _Lines:
 
     def start(self, total: int) -> None:
         self._total = total
-        print(f"{total} measurements", file=self._stream, flush=True)
+        self.warn(f"{total} measurements")
 
     def say(self, text: str) -> None:
         """Be silent: the line that follows says what was done."""
+
+    def warn(self, text: str) -> None:
+        with suppress(BrokenPipeError):  # nobody listens: no reason to stop measuring
+            print(text, file=self._stream, flush=True)
 
     def advance(self, record: Record | None) -> None:
         self._done += 1
@@ -69,9 +76,7 @@ class _Lines:
             return
         seconds = record.total_seconds
         took = "" if seconds is None else f" in {seconds:.3g} s"
-        print(
+        self.warn(
             f"{self._done}/{self._total} {record.solver} on {record.case}: "
-            f"{record.status}{took}",
-            file=self._stream,
-            flush=True,
+            f"{record.status}{took}"
         )

@@ -7,9 +7,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import StrEnum
+from functools import cache
 from typing import Any, Self
 
 SCHEMA = 1  #: version of the journal line; raised whenever a field changes its meaning
+
+
+_JSON_TYPES: Mapping[str, set[type]] = {
+    "None": {type(None)}, "str": {str}, "Verdict": {str}, "int": {int},
+    "float": {int, float}, "Mapping": {dict},
+}  # fmt: skip
 
 
 class Verdict(StrEnum):
@@ -82,18 +89,30 @@ class Record:
         Raises
         ------
         ValueError
-            When the line is no JSON object, lacks a field, or has another schema.
+            When the line is no JSON object, lacks a field, has another schema, or a
+            field of the wrong type.
 
         """
         row = json.loads(line)
         if not isinstance(row, dict) or row.get("schema") != SCHEMA:
             raise ValueError(f"not a journal line of schema {SCHEMA}")
-        known = {f.name for f in fields(cls)}
+        known = {f.name: str(f.type) for f in fields(cls)}
+        given = {k: v for k, v in row.items() if k in known}
+        for name, value in given.items():
+            if type(value) not in _json_types(known[name]):
+                raise ValueError(f"{name} = {value!r}; expected {known[name]}")
         try:
-            record = cls(**{k: v for k, v in row.items() if k in known})
+            record = cls(**given)
         except TypeError as e:
             raise ValueError(f"incomplete journal line: {e}") from None
         return replace(record, status=Verdict(record.status))
+
+
+@cache
+def _json_types(annotation: str) -> set[type]:
+    """List what JSON gives for a field with that annotation, e.g. "float | None"."""
+    kinds = [kind.partition("[")[0] for kind in annotation.split(" | ")]
+    return set().union(*(_JSON_TYPES[kind] for kind in kinds))
 
 
 def finite(data: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from hashlib import blake2s
 from importlib.metadata import entry_points
@@ -43,6 +44,7 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
+    origin: str = ""  #: its file, or "entry points"
 
 
 def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
@@ -104,7 +106,8 @@ def entry_point_plugins() -> Plugin:
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
             try:
-                entries[point.name] = point.load()
+                with redirect_stdout(sys.stderr):
+                    entries[point.name] = point.load()
             except Exception as e:  # somebody else's code
                 raise _import_error(f"entry point {point.value}", e) from None
     return _checked("entry points", found["solvers"], found["problems"])
@@ -185,7 +188,8 @@ def _imported(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        with redirect_stdout(sys.stderr):
+            spec.loader.exec_module(module)
     except (Exception, SystemExit) as e:  # somebody else's code
         del sys.modules[name]
         raise _import_error(str(path), e) from None
@@ -219,7 +223,27 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; "
                 "expected the same name twice"
             )
-    return Plugin(solvers=dict(solvers), problems=dict(problems))
+        _check_names(f"{where}: PROBLEMS[{key!r}]", family)
+    return Plugin(solvers=dict(solvers), problems=dict(problems), origin=where)
+
+
+def _check_names(where: str, family: Any) -> None:
+    """Refuse a family whose case names could not be read or written."""
+    defaults, forms = family.defaults, family.forms
+    if not isinstance(defaults, Mapping) or not all(
+        isinstance(key, str) and type(value) in (int, float, str)
+        for key, value in defaults.items()
+    ):
+        raise InputError(
+            f"{where}: defaults = {defaults!r}; "
+            "expected a dict from texts to integers, floats or texts"
+        )
+    if (
+        not isinstance(forms, tuple | list)
+        or not forms
+        or not all(isinstance(form, str) and form for form in forms)
+    ):
+        raise InputError(f"{where}: forms = {forms!r}; expected a tuple of texts")
 
 
 def _import_error(where: str, e: BaseException) -> InputError:

@@ -11,31 +11,27 @@ import logging
 import random
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from itertools import count
+from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
+from harness.build import build, unbuilt
 from harness.errors import InputError
-from harness.folder import claim, locked
+from harness.folder import claim, locked, refuse_foreign, scratch_in
 from harness.journal import Journal, read_journal
-from harness.judge import blank, has_point, judged, noted
-from harness.measure import Measurement
+from harness.judge import blank, has_point, noted
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference, Solver
-from harness.qpfile import save_qp
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec, options_of
-from harness.solution import Solution, Status
-from harness.store import read_point, save_fields, save_solution
+from harness.remote import hand_over, measured
+from harness.solution import Solution
+from harness.store import save_fields, save_solution
 from harness.suite import Suite
 from harness.supervisor import WorkerProcess
 
 _log = logging.getLogger(__name__)
-
-_MEASURED = ("prepare_seconds", "solve_seconds", "total_seconds", "peak_mib")
 
 
 class Progress(Protocol):
@@ -46,6 +42,9 @@ class Progress(Protocol):
 
     def say(self, text: str) -> None:
         """Show what happens now."""
+
+    def warn(self, text: str) -> None:
+        """Show what went wrong, in a line that stays."""
 
     def advance(self, record: Record | None) -> None:
         """Count one cell as done; None where nothing had to be measured."""
@@ -90,8 +89,11 @@ def run(
     digest: str,
     progress: Progress,
     fresh: bool = False,
-) -> None:
+) -> list[str]:
     """Measure what the result folder `out` lacks of `suite`, in worker processes.
+
+    Returns the names of the cases that could not be built: they have no records, so
+    that the same command tries them again.
 
     reference : the injected high-accuracy solve that families may build with
     command : starts the worker of a solver; two file descriptors are appended to it
@@ -102,13 +104,14 @@ def run(
     Raises
     ------
     InputError
-        When `out` holds another suite, case or environment or is in use, and for what a
-        family refuses to build. Any other failure costs the measurements it concerns.
+        When `out` is no result folder, holds another suite, case or environment, or is
+        in use. Any other failure costs the measurements it concerns.
 
     """
+    refuse_foreign(out)
     with locked(out), ExitStack() as stack:
         claim(out, suite, {"digest": digest, **environment}, fresh=fresh)
-        scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
+        scratch = stack.enter_context(scratch_in(out))
         journal = stack.enter_context(Journal(out, digest))
         past = read_journal(out)
         _check_same(out, past, suite, families)
@@ -137,8 +140,8 @@ def run(
         )
         cells = len(suite.cases) * len(suite.tolerances) * suite.repeats * len(entrants)
         progress.start(cells)
-        for name in suite.cases:
-            _run_case(bench, name)
+        failed = [name for name in suite.cases if not _run_case(bench, name)]
+        return [canonical(name, families[name.family]) for name in failed]
 
 
 def _check_same(
@@ -156,23 +159,23 @@ def _check_same(
                 )
 
 
-def _run_case(bench: _Bench, name: CaseName) -> None:
-    """Measure the cells of one case that are not in the journal yet."""
+def _run_case(bench: _Bench, name: CaseName) -> bool:
+    """Measure the cells of one case that are not in the journal; False if unbuilt."""
     blocks = [block for block in _blocks(bench, name) if block]
     if not blocks:
-        return
+        return True
+    family = bench.families[name.family]
+    canonical_name = canonical(name, family)
+    bench.progress.say(f"building {canonical_name}")
     try:
-        case, qp_file = _built(bench, name)
-    except InputError:
-        raise
-    except Exception as e:  # the family's code
-        _log.warning("%s could not be built", blocks[0][0][1].case, exc_info=True)
-        message = f"case could not be built: {type(e).__name__}: {e}"
-        for block in blocks:
-            number = next(bench.blocks)
-            for _, record in block:
-                _append(bench, record.but(block=number, message=message))
-        return
+        case = build(name, family, bench.reference)
+    except (Exception, SystemExit) as e:  # the family's code
+        _log.debug("%s could not be built", canonical_name, exc_info=True)
+        bench.progress.warn(unbuilt(canonical_name, e))
+        for _ in chain.from_iterable(blocks):
+            bench.progress.advance(None)
+        return False
+    qp_file = hand_over(case, canonical_name, bench.scratch)
     declined: set[tuple[str, float]] = set()
     for block in blocks:
         number = next(bench.blocks)
@@ -181,10 +184,22 @@ def _run_case(bench: _Bench, name: CaseName) -> None:
                 bench.progress.advance(None)
                 continue
             bench.progress.say(f"{record.solver} on {record.case}")
-            record = _measured(bench, case, qp_file, (entrant, record))
-            _append(bench, record.but(block=number))
+            record, solution = measured(
+                entrant.worker,
+                case,
+                qp_file,
+                record,
+                time_limit=bench.suite.time_limit,
+                memory_limit=bench.suite.memory_limit,
+            )
+            if solution is not None:
+                record = _stored(bench.out, case, record, solution)
+            record = record.but(block=number)
+            bench.journal.append(record)
+            bench.progress.advance(record)
             if record.status is Verdict.DECLINED:
                 declined.add((record.solver, record.tol))
+    return True
 
 
 def _blocks(bench: _Bench, name: CaseName) -> Iterator[list[Cell]]:
@@ -215,46 +230,6 @@ def _blocks(bench: _Bench, name: CaseName) -> Iterator[list[Cell]]:
             yield block
 
 
-def _built(bench: _Bench, name: CaseName) -> tuple[Case, Path]:
-    """Build a case and write its QP for the workers."""
-    family = bench.families[name.family]
-    canonical_name = canonical(name, family)
-    bench.progress.say(f"building {canonical_name}")
-    case = family.build(name.form, name.params, bench.reference)
-    qp_file = bench.scratch / "qp.npz"
-    save_qp(qp_file, case.qp, {"name": canonical_name})
-    return case, qp_file
-
-
-def _measured(bench: _Bench, case: Case, qp_file: Path, cell: Cell) -> Record:
-    """Have a worker make one measurement; judge and store what it returned."""
-    entrant, record = cell
-    record = record.but(
-        sizes=case.qp.sizes,
-        started=datetime.now(UTC).isoformat(timespec="milliseconds"),
-    )
-    point = bench.scratch / "point.npz"
-    reply = entrant.worker.ask(
-        {"qp": str(qp_file), "tol": record.tol, "out": str(point)},
-        time_limit=bench.suite.time_limit,
-        memory_limit=bench.suite.memory_limit,
-    )
-    if reply.answer is None:
-        return record.but(
-            status=reply.verdict, message=reply.message, peak_mib=reply.peak_mib
-        )
-    answer = reply.answer
-    solution = replace(
-        read_point(point, Status(answer["claimed"])),
-        iterations=answer["iterations"],
-        counts=answer["counts"],
-        message=answer["message"],
-    )
-    measured = {name: answer[name] for name in _MEASURED}
-    record = judged(record, case, Measurement(solution=solution, **measured))
-    return _stored(bench.out, case, record, solution)
-
-
 def _stored(out: Path, case: Case, record: Record, solution: Solution) -> Record:
     """Store the point and, of a first verified repeat, the deformed state."""
     if not has_point(solution):
@@ -267,8 +242,3 @@ def _stored(out: Path, case: Case, record: Record, solution: Solution) -> Record
     except Exception as e:  # the family's code; its fault must not lose the record
         return noted(record, "fields", e)
     return record.but(fields=save_fields(out, fields))
-
-
-def _append(bench: _Bench, record: Record) -> None:
-    bench.journal.append(record)
-    bench.progress.advance(record)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 from harness.record import Record, Verdict
 from harness.solution import Status
 
-#: of the quantities that the interface promises; others are shown bare
+#: of the quantities that the interface promises of elastic bodies; others are bare
 UNITS = {
     "energy": "J/m",
     "tip": "m",
@@ -81,6 +82,7 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
 def outcome(r: Record) -> str:
     """Lay out one measurement, in SI units."""
     options = ", ".join(f"{key}={value}" for key, value in r.options.items())
+    units = UNITS if "dofs" in r.quantities else {}
     rows = [
         ("case", r.case),
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
@@ -94,12 +96,12 @@ def outcome(r: Record) -> str:
         ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
         *(
-            (f"{name} residual", _text(getattr(r, name), digits=2))
+            (f"{name} residual", _text(_known(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
-        ("objective", _text(r.objective)),
+        ("objective", _text(_known(r.objective))),
         *(
-            (name.replace("_", " "), _text(value, UNITS.get(name, "")))
+            (name.replace("_", " "), _text(value, units.get(name, "")))
             for name, value in r.quantities.items()
         ),
     ]
@@ -119,6 +121,11 @@ def aligned(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
         for row in table
     )
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _known(value: float | None) -> float | None:
+    """Take NaN for what it says: there is no such number."""
+    return None if value is None or math.isnan(value) else value
 
 
 def _text(value: Any, unit: str = "", digits: int = 9) -> str:

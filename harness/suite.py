@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from harness import checked
-from harness.errors import InputError, unknown
-from harness.names import CaseName, assemble, canonical, match
+from harness.errors import InputError, some, unknown
+from harness.names import CaseName, assemble, canonical, match, parse
 from harness.plugin import Family, Solver
 from harness.registry import SolverSpec, resolve
 
@@ -90,7 +90,7 @@ def with_overrides(
     """Narrow a suite as the options of the command line say.
 
     solvers : labels of the suite to keep, or names of the registry to add
-    cases : shell globs over canonical names to keep
+    cases : what to keep: shell globs over canonical names, or names
 
     Raises
     ------
@@ -144,14 +144,25 @@ def _chosen_cases(
     named = {canonical(case, families[case.family]): case for case in suite.cases}
     kept: set[str] = set()
     for pattern in patterns:
-        matched = match(pattern, named)
+        matched = match(_canonical_pattern(pattern, families), named)
         if not matched:
             raise InputError(
                 f"--case {pattern!r} matches none of the {len(named)} cases of suite "
-                f"{suite.name!r}; the first is {next(iter(named))}"
+                f"{suite.name!r}; there are {some(named)}"
             )
         kept.update(matched)
     return tuple(case for name, case in named.items() if name in kept)
+
+
+def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
+    """Write a pattern that is the name of a case canonically."""
+    if set("*?[") & set(pattern):
+        return pattern
+    try:
+        name = parse(pattern, families)
+    except InputError:
+        return pattern
+    return canonical(name, families[name.family])
 
 
 def _read(path: Path) -> str:
@@ -169,6 +180,8 @@ def _toml(text: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as e:  # "Expected … (at line 3, column 5)"
         what, _, place = str(e).removesuffix(")").rpartition(" (at ")
         raise InputError(f"{place}: {what}") from None
+    except ValueError:  # Python's own limit
+        raise InputError("an integer with too many digits") from None
 
 
 def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
@@ -207,7 +220,9 @@ def _cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ..
         with checked.located(f"problems[{i}]"):
             table = checked.table("entry", block)
             checked.only_keys(table, _PROBLEM_KEYS)
-            name = checked.text("family", table.get("family", ""))
+            if "family" not in table:
+                raise InputError("family is missing")
+            name = checked.text("family", table["family"])
             if name not in families:
                 raise unknown("family", name, families)
             family = families[name]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import json
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from harness.errors import InputError, unknown
 from harness.plugin import Family, Fields, Reference, Solver
-from harness.registry import Plugin, load_plugin, merged
+from harness.registry import Plugin, SolverSpec, load_plugin, merged
 
 SUITES = Path(__file__).parents[1] / "suites"  #: of the checkout
 FORMATS = ("html", "md", "tex", "csv")  #: of a report
@@ -25,6 +27,11 @@ class Workbench:
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
     suites: Path = SUITES
+    #: which plug-in a family came in, for those that did
+    origins: Mapping[str, str] = field(default_factory=dict)
+    #: starts `harness.commands.worker`; less its arguments. -P: what lies in the
+    #: working directory must not pass for a library
+    worker: Sequence[str] = (sys.executable, "-P", "-m", "harness", "worker")
 
     def extended(self, plugin: Plugin) -> Workbench:
         """Add the solvers and problems of a plug-in.
@@ -39,6 +46,7 @@ class Workbench:
             self,
             families=merged("problem", self.families, plugin.problems),
             solvers=merged("solver", self.solvers, plugin.solvers),
+            origins={**self.origins, **dict.fromkeys(plugin.problems, plugin.origin)},
         )
 
     def with_files(self, files: Sequence[Path]) -> Workbench:
@@ -58,6 +66,15 @@ class Workbench:
             except InputError as e:
                 raise InputError(f"{file}: {e}") from None
         return extended
+
+    def worker_command(self, spec: SolverSpec, plugins: Iterable[Path]) -> list[str]:
+        """Make the command that starts the worker of a solver, less its two pipes."""
+        request = {
+            "name": spec.name,
+            "options": spec.options,
+            "plugins": [str(path.resolve()) for path in plugins],
+        }
+        return [*self.worker, json.dumps(request)]
 
     def suite_path(self, text: str) -> Path:
         """Find a suite by path, or by its bare name among the suites of the checkout.

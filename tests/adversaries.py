@@ -35,6 +35,10 @@ class Tiny:
             raise ZeroDivisionError("no stiffness")
         if params["fault"] == "input":
             raise InputError("tiny: fault=input is out of range")
+        if params["fault"] == "memory":
+            raise MemoryError("Unable to allocate 1 PiB")
+        if params["fault"] == "exit":
+            sys.exit(3)
 
         def quantities(s):
             if params["fault"] == "quantities":

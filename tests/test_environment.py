@@ -6,8 +6,10 @@ import os
 import platform
 import re
 import socket
+import subprocess
 import sys
 import tomllib
+from hashlib import sha256
 from itertools import count
 from pathlib import Path
 
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 
 from harness.doctor import advice, noise_floor, render
-from harness.environment import capture, capture_in, digest, system_blas
+from harness.environment import capture, capture_in, digest, source, system_blas
 
 ROOT = Path(__file__).resolve().parents[1]
 DEBIAN = "/usr/lib/x86_64-linux-gnu"
@@ -100,6 +102,58 @@ def test_a_capture_tells_no_host_name_and_no_absolute_path(monkeypatch):
     assert host not in text
     assert not re.search(r'"/|\s/\w|\w/\w+/', text)
     assert str(Path.home()) not in text
+
+
+def test_plugins_are_named_by_their_content(tmp_path):
+    (tmp_path / "other").mkdir()
+    file, namesake = tmp_path / "a.py", tmp_path / "other" / "a.py"
+    file.write_text("x = 1")
+    namesake.write_text("")
+
+    plain = capture([file])
+    both = capture([file, namesake])
+    file.write_text("x = 2")
+    changed_one = capture([file])
+    namesake.write_text("y = 3")
+
+    assert plain["plugins"] == {"a.py": sha256(b"x = 1").hexdigest()[:12]}
+    assert both["plugins"] == plain["plugins"]  # nothing in it
+    assert changed_one["plugins"] != plain["plugins"]
+    assert capture([file, namesake])["plugins"] != changed_one["plugins"]
+    assert digest(changed_one) != digest(plain)
+    assert capture()["plugins"] == {}
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A repository with one commit."""
+    for who in ("AUTHOR", "COMMITTER"):
+        monkeypatch.setenv(f"GIT_{who}_NAME", "A")
+        monkeypatch.setenv(f"GIT_{who}_EMAIL", "a@example.org")
+    (tmp_path / "harness").mkdir()
+    (tmp_path / "harness" / "a.py").write_text("x = 1\n")
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "First"]):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True)
+    return tmp_path
+
+
+def test_a_checkout_as_committed_is_clean(checkout):
+    (checkout / "notes.py").write_text("elsewhere")
+
+    assert source(checkout).keys() == {"commit", "dirty", "changes"}
+    assert (source(checkout)["dirty"], source(checkout)["changes"]) == (False, None)
+
+
+@pytest.mark.parametrize("name", ["a.py", "new file.py"])
+def test_two_states_of_a_dirty_checkout_are_told_apart(checkout, name):
+    states = []
+    for text in ("x = 2\n", "x = 3\n", "x = 2\n"):
+        (checkout / "harness" / name).write_text(text)
+        states.append(source(checkout))
+
+    assert all(state["dirty"] for state in states)
+    assert states[0] == states[2] != states[1]
+    assert re.fullmatch("[0-9a-f]{12}", states[0]["changes"])
 
 
 def test_a_capture_holds_the_versions_that_the_modules_themselves_tell():

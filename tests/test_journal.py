@@ -95,6 +95,32 @@ def test_a_bad_line_that_is_whole_is_named(tmp_path, bad):
         read_journal(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "expected"),
+    [
+        ("case", 3, "str"),
+        ("params", [], "Mapping[str, Any]"),
+        ("repeat", 1.5, "int"),
+        ("repeat", True, "int"),
+        ("tol", "1e-6", "float"),
+        ("tol", None, "float"),
+        ("solve_seconds", "fast", "float | None"),
+        ("status", 3, "Verdict"),
+    ],
+)
+def test_a_field_of_the_wrong_type_is_named_with_its_line(
+    tmp_path, field, value, expected
+):
+    row = json.loads(record("a", solve_seconds=1, message="").to_json())
+    file = tmp_path / "journal" / "here.jsonl"
+    file.parent.mkdir()
+    file.write_text(json.dumps(row) + "\n" + json.dumps(row | {field: value}) + "\n")
+
+    with pytest.raises(InputError) as e:
+        read_journal(tmp_path)
+    assert str(e.value) == (f"{file}, line 2: {field} = {value!r}; expected {expected}")
+
+
 def test_a_folder_without_journal_is_named(tmp_path):
     with pytest.raises(InputError, match="no journal in "):
         read_journal(tmp_path / "nowhere")

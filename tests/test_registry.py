@@ -179,6 +179,12 @@ def test_plugins_of_the_same_file_name_do_not_mix(tmp_path):
     assert type(solvers[0]).__module__ != type(solvers[1]).__module__
 
 
+FAMILY = (
+    "from types import SimpleNamespace as S\n"
+    "PROBLEMS = {{'a': S(name='a', defaults={}, forms={}, build=None)}}"
+)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -200,6 +206,16 @@ def test_plugins_of_the_same_file_name_do_not_mix(tmp_path):
             "PROBLEMS = {'a': S(name='b', defaults={}, forms=(), build=None)}",
             "PROBLEMS['a'] is named 'b'; expected the same name twice",
         ),
+        (FAMILY.format("['n']", "('a',)"), "PROBLEMS['a']: defaults = ['n']; expected"),
+        (
+            FAMILY.format("{'n': None}", "('a',)"),
+            "PROBLEMS['a']: defaults = {'n': None}; expected a dict from texts to int",
+        ),
+        (FAMILY.format("{'n': True}", "('a',)"), "PROBLEMS['a']: defaults = {'n': T"),
+        (FAMILY.format("{1: 1}", "('a',)"), "PROBLEMS['a']: defaults = {1: 1}; expe"),
+        (FAMILY.format("{}", "'dual'"), "PROBLEMS['a']: forms = 'dual'; expected a t"),
+        (FAMILY.format("{}", "()"), "PROBLEMS['a']: forms = (); expected a tuple of "),
+        (FAMILY.format("{}", "(1,)"), "PROBLEMS['a']: forms = (1,); expected a tuple"),
     ],
 )
 def test_what_is_wrong_with_a_plugin_is_said_in_one_line(tmp_path, text, message):

@@ -28,7 +28,9 @@ class Tally:
     def __init__(self, interrupt_after=None):
         self.total = None
         self.records = []
+        self.warnings = []
         self.skipped = 0
+        self.unbuilt = None
         self._left = interrupt_after
 
     def start(self, total):
@@ -36,6 +38,9 @@ class Tally:
 
     def say(self, text):
         pass
+
+    def warn(self, text):
+        self.warnings.append(text)
 
     def advance(self, record):
         if record is None:
@@ -68,18 +73,26 @@ def suite(*solvers, cases=({},), **changes):
 def measure(tmp_path):
     """Run a suite in worker processes and return what it told while doing so."""
 
-    def measure(suite, *, interrupt_after=None, digest="here", fresh=False):
+    def measure(
+        suite,
+        *,
+        interrupt_after=None,
+        digest="here",
+        fresh=False,
+        out=tmp_path,
+        environment=None,
+    ):
         tally = Tally(interrupt_after)
-        run(
+        tally.unbuilt = run(
             suite,
             families=FAMILIES,
             reference=None,
-            out=tmp_path,
+            out=out,
             command=lambda spec: [
                 sys.executable, "-P", str(PLUGIN), spec.name
             ],
             resolve=lambda spec: resolve(spec, SOLVERS),
-            environment={"machine": "test"},
+            environment=environment or {"machine": "test"},
             digest=digest,
             progress=tally,
             fresh=fresh,
@@ -266,25 +279,31 @@ def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
     assert [r.block for r in read_journal(tmp_path)] == [0, 1, 2, 2]
 
 
-def test_a_case_that_cannot_be_built_costs_its_own_records_only(
-    measure, tmp_path, caplog
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("build", "ZeroDivisionError: no stiffness"),
+        ("input", "tiny: fault=input is out of range"),
+        ("memory", "it needs more memory than there is"),
+        ("exit", "SystemExit: 3"),
+    ],
+)
+def test_a_case_that_cannot_be_built_is_said_and_tried_again(
+    measure, tmp_path, caplog, fault, reason
 ):
-    with caplog.at_level(logging.WARNING):
-        measure(suite("honest", "zero", cases=[{"fault": "build"}, {}], repeats=2))
-    records = read_journal(tmp_path)
-    lost = [r for r in records if r.params["fault"] == "build"]
+    whole = suite("honest", "zero", cases=[{"fault": fault}, {}], repeats=2)
+    with caplog.at_level(logging.DEBUG):
+        first, second = measure(whole), measure(whole)
+    case = f"tiny/fault={fault}/plain"
 
-    assert len(lost) == 4
-    assert {(r.status, r.message) for r in lost} == {
-        (Verdict.FAILED, "case could not be built: ZeroDivisionError: no stiffness")
-    }
-    assert sum(r.status is Verdict.VERIFIED for r in records) == 2
-    assert "no stiffness" in caplog.text
-
-
-def test_a_case_that_is_refused_ends_the_run(measure):
-    with pytest.raises(InputError, match="out of range"):
-        measure(suite("honest", cases=[{"fault": "input"}]))
+    assert {r.case for r in read_journal(tmp_path)} == {"tiny/plain"}
+    assert (len(first.records), len(second.records)) == (4, 0)
+    for tally in (first, second):
+        assert tally.unbuilt == [case]
+        assert tally.warnings == [f"{case} could not be built: {reason}"]
+        assert len(tally.records) + tally.skipped == tally.total
+    assert "Traceback" in caplog.text
+    assert all(entry.levelno < logging.WARNING for entry in caplog.records)
 
 
 @pytest.mark.parametrize(
@@ -325,6 +344,85 @@ def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_
     measure(other, digest="there", fresh=True)
     assert [r.solver for r in read_journal(tmp_path)] == ["zero"]
     assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_another_environment_is_refused_with_what_differs(measure):
+    machine = {"cpu": "A", "cores": 2, "kernel": "6.1", "governor": None}
+    now = {"now": {"load": 1.0}, "plugins": {}}
+    measure(suite("honest"), environment={"machine": machine, **now})
+    faster = {"cpu": "B", "cores": 4, "kernel": "6.2", "governor": None, "turbo": True}
+    with pytest.raises(InputError, match=r"machine\.cpu, machine\.turbo changed\)"):
+        measure(
+            suite("honest"), digest="there",
+            environment={"machine": machine | {"cpu": "B", "turbo": True}, **now},
+        )  # fmt: skip
+    with pytest.raises(InputError) as e:
+        measure(
+            suite("honest"), digest="there",
+            environment={"machine": faster, "now": {}, "plugins": {"a.py": "0" * 12}},
+        )  # fmt: skip
+
+    expected = ": machine.cores, machine.cpu, machine.kernel and 2 more changed)"
+    assert expected in str(e.value)
+
+
+def test_a_comment_makes_no_other_suite(measure, tmp_path):
+    measure(suite("honest"))
+    commented = suite("honest", text='name = "test"  # for tests\n')
+
+    assert measure(commented).records == []
+    assert (tmp_path / "suite.toml").read_text() == commented.text
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(
+    "name", ["journal/a.txt", "vectors/a.npz", "report/a.html", "suite.toml"]
+)
+def test_a_folder_with_other_things_under_our_names_is_left_alone(
+    measure, tmp_path, name, fresh
+):
+    mine = tmp_path / "home" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+
+    with pytest.raises(InputError, match="but is no result folder"):
+        measure(suite("honest"), out=tmp_path / "home", fresh=fresh)
+
+    files = [p for p in (tmp_path / "home").rglob("*") if p.is_file()]
+    assert files == [mine]
+    assert mine.read_text() == "mine"
+
+
+def test_a_journal_alone_is_a_result_folder(measure, tmp_path):
+    measure(suite("honest"))
+    for name in ("suite.toml", "environment.json"):
+        (tmp_path / name).unlink()
+
+    assert measure(suite("honest")).records == []
+
+
+def test_scratch_files_lie_in_the_folder_while_a_run_lasts(
+    measure, tmp_path, monkeypatch
+):
+    seen = []
+    old = tmp_path / ".scratch" / "of a run that was killed"
+    old.mkdir(parents=True)
+    monkeypatch.setattr(
+        Tally, "advance", lambda *_: seen.append([*old.parent.iterdir()])
+    )
+    measure(suite("honest"))
+
+    (files,) = seen
+    assert {"qp.npz", "worker-0.log"} <= {file.name for file in files}
+    assert old not in files
+    assert not old.parent.exists()
+
+
+def test_an_interrupted_run_leaves_no_scratch(measure, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        measure(suite("honest", repeats=2), interrupt_after=1)
+
+    assert not (tmp_path / ".scratch").exists()
 
 
 def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(

@@ -171,7 +171,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (HEAD, "problems is missing"),
         (HEAD + "problems = []", "problems is empty; expected at least one entry"),
         (HEAD + "problems = [1]", "problems[0]: entry = 1; expected a table"),
-        (HEAD + "[[problems]]", "problems[0]: family = ''; expected a text, not empty"),
+        (HEAD + "[[problems]]", "problems[0]: family is missing"),
         (
             MINIMAL + "form = []",
             "problems[0]: unknown key 'form'; did you mean 'forms'",
@@ -183,6 +183,14 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + "params = { n = [] }", "problems[0]: params.n is empty; expected"),
         (MINIMAL + "params = { k = 1 }", "problems[0]: well: unknown key 'k'; "),
         (MINIMAL + "params = { n = 2.0 }", "problems[0]: well: n=2.0 is no integer"),
+        (MINIMAL + "params = { n = '4' }", "problems[0]: well: n='4' is no integer"),
+        (MINIMAL + "params = { n = true }", "problems[0]: well: n=True is no integer"),
+        (f"repeats = {5000 * '9'}\n" + MINIMAL, "an integer with too many digits"),
+        (f"time_limit = {400 * '9'}\n" + MINIMAL, "time_limit = 999"),
+        (
+            MINIMAL + f"params = {{ n = {20 * '9'} }}",
+            "problems[0]: well: n=99999999999999999999 is no integer",
+        ),
         (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
         (MINIMAL + "zip = ['n']", "problems[0]: zip = 'n'; expected a list"),
@@ -284,6 +292,22 @@ def test_patterns_choose_cases_in_the_suite_s_order(narrowed):
     chosen = narrowed(cases=["*/n=12/*", "well/n=2/dual", "*/n=12/dual"])
 
     assert names(chosen) == ["well/n=2/dual", "well/n=12/primal", "well/n=12/dual"]
+
+
+@pytest.mark.parametrize(
+    "written", ["well/n=2/kind=soft/dual", "well/m=1/n=+2/dual", "well/n=2/dual"]
+)
+def test_a_case_may_be_named_in_any_way_that_parses(narrowed, written):
+    assert names(narrowed(cases=[written])) == ["well/n=2/dual"]
+
+
+def test_a_pattern_in_vain_is_told_what_there_is(narrowed):
+    with pytest.raises(InputError) as e:
+        narrowed(cases=["well/n=3/dual"])
+
+    assert str(e.value).endswith(
+        "there are well/n=2/primal, well/n=2/dual, well/n=12/primal and 1 more"
+    )
 
 
 def test_limits_change_the_suite_as_run_and_nothing_else_does(narrowed):
