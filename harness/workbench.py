@@ -24,6 +24,8 @@ class Workbench:
     report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
+    paper: Callable[[Path, bool, Callable[[str], None]], list[Path]]
+    """Measure and write the paper's figures: folder, quick?, progress."""
     suites: Path = SUITES
 
     def extended(self, plugin: Plugin) -> Workbench:

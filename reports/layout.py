@@ -61,6 +61,7 @@ class Page:
     title: str
     dateline: str
     sections: tuple[Section, ...]
+    footer: str = ""  #: where the numbers are, if not in a result folder
 
 
 def source(outcome: Outcome) -> str:

@@ -97,6 +97,11 @@ SOLVERS = {
 }
 
 
+def paper(out, quick, say):
+    say("Figure 1")
+    return [out / f"index-{quick}.html", out / "figure1.pdf"]
+
+
 @pytest.fixture
 def workbench(tmp_path):
     suites = tmp_path / "suites"
@@ -112,6 +117,7 @@ def workbench(tmp_path):
         report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),
+        paper=paper,
         suites=suites,
     )
 
@@ -373,6 +379,10 @@ WRONG = {
         ("run", "tiny", "--solver", "exat"),
         "--solver: unknown solver 'ex",
     ),
+    "folder of paper": (
+        ("paper", "--out", "bad.toml"),
+        "--out bad.toml: File exists; expected a folder",
+    ),
     "pattern of run": (
         ("run", "tiny", "--case", "*/duel"),
         "--case '*/duel' matches none of the 2 cases of suite 'tiny'; the first is",
@@ -403,6 +413,15 @@ def test_wrong_input_is_one_line_with_the_remedy_and_exits_with_2(
 
 
 SUITE = "solvers = ['exact']\n[[problems]]\nfamily = 'well'\n"
+
+
+def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli):
+    assert cli("paper") == (
+        0,
+        "out/paper/index-False.html\n",
+        "mortarbench: Figure 1\n",
+    )
+    assert cli("paper", "--quick", "--out", "a")[1] == "a/index-True.html\n"
 
 
 def test_help_is_no_error(cli, capsys):
