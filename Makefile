@@ -16,8 +16,8 @@ setup: .venv/.ready  ## make .venv: system packages, Python packages
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 
-demo: setup  ## compare the solvers on the demo suite, write out/demo/report
-	@$(BIN)/mortarbench run suites/demo.toml --out out/demo --fresh
+demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
+	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
 test: setup check  ## check, then run the tests
 	$(BIN)/pytest -q

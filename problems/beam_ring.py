@@ -33,6 +33,7 @@ from problems.stepping import LoadPath
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
 BEAM = Material(E=200e9, nu=0.3)
+MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 RING = Material(E=20e9, nu=0.3)
 
 
@@ -62,6 +63,13 @@ class BeamRing:
         for key in ("Nr", "Nh", "radial", "steps", "step", "relin"):
             if p[key] < 1:
                 raise InputError(f"{self.name}: {key}={p[key]} must be at least 1")
+        nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
+        nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
+        if nodes > MOST_NODES:
+            raise InputError(
+                f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
+                f"expected at most {MOST_NODES:.2g}"
+            )
         if p["step"] > p["steps"]:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from harness import QP, Reference, Vector
+from harness import QP, Reference, Vector, kkt_residuals
 from problems.bodies import Bodies
 from problems.contact import ContactRows
 from problems.dual import Transformed, dual_bounds
@@ -23,9 +23,20 @@ Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
 Transform = Callable[[QP, GeneralisedInverse, Vector], Transformed]
 
 
+#: residual that a reference solve may leave: the next step is linearised there
+REFERENCE = 1e-6
+
+
 @dataclass(frozen=True, eq=False)
 class LoadPath:
-    """The load steps of one analysis; what was solved once is remembered."""
+    """The load steps of one analysis; what was solved once is remembered.
+
+    Raises
+    ------
+    ArithmeticError
+        When a reference solve is not accurate.
+
+    """
 
     bodies: Bodies
     linearise: Linearise
@@ -56,7 +67,13 @@ class LoadPath:
 
     def _solve(self, primal: QP, load_factor: float) -> Vector:
         dual = self.transform(primal, self.inverse, self._free * load_factor)
-        return dual.recover(self.reference(dual.qp)).x
+        s = self.reference(dual.qp)
+        if not (worst := kkt_residuals(dual.qp, s).worst) <= REFERENCE:
+            raise ArithmeticError(
+                f"the reference solve at load factor {load_factor:g} left a residual "
+                f"of {worst:.1e}, more than {REFERENCE:g}"
+            )
+        return dual.recover(s).x
 
     @cached_property
     def _free(self) -> Vector:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import eye_array, triu, vstack
 
 from harness import QP, Solution, Status
-from solvers.conversion import csc, needs_matrices
+from solvers.conversion import csc, needs_matrices, positive
 
 CLAIMS = {
     "Solved": Status.SOLVED,
@@ -34,14 +34,18 @@ class Clarabel:
     closed when it is below tol absolutely *or* relative to max(1, |objective|): for a
     QP with a small objective all that is absolute, and tol = 1e-6 leaves five digits
     fewer at an energy of 1e-5. Multiplying the objective until ‖q‖∞ = 1e4 makes each
-    test the relative one, so that tol is passed on as it is. (The steps hardly change:
-    Clarabel equilibrates the objective anyway.)
+    test the relative one where x is of order one, as in every QP emitted here, so that
+    tol is passed on as it is. (The steps hardly change: Clarabel equilibrates the
+    objective anyway.) In units that make x tiny, Clarabel may stop early.
 
     Equalities go to the zero cone; inequalities and finite bounds, one row each, to the
     nonnegative cone.
     """
 
     max_iter: int = 200
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

@@ -38,3 +38,10 @@ def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
     """
     z_box = np.where(np.isfinite(qp.lb), z_box, np.maximum(z_box, 0.0))
     return np.where(np.isfinite(qp.ub), z_box, np.minimum(z_box, 0.0))
+
+
+def positive(**options: float) -> None:
+    """Raise ValueError unless every option of a solver is positive."""
+    for name, value in options.items():
+        if not value > 0:
+            raise ValueError(f"{name} = {value}; expected a positive number")

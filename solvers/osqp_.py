@@ -13,7 +13,13 @@ import numpy as np
 from scipy.sparse import eye_array, triu, vstack
 
 from harness import QP, Solution, Status
-from solvers.conversion import NEGLIGIBLE, csc, needs_matrices, on_present_bounds
+from solvers.conversion import (
+    NEGLIGIBLE,
+    csc,
+    needs_matrices,
+    on_present_bounds,
+    positive,
+)
 
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
@@ -37,6 +43,9 @@ class OSQP:
 
     max_iter: int = 1_000_000
     polishing: bool = False
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

@@ -14,7 +14,7 @@ from scipy.linalg import qr, solve_triangular
 from harness import QP, Matrix, Vector
 from solvers.spectrum import norm_estimate
 
-RANK = 1e-10  #: pivots of the normalised rows below this are zero
+RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 
 
 class Rows(NamedTuple):
@@ -36,6 +36,10 @@ class Projected:
     norm: float  #: ‖𝒫F𝒫‖
     b: Vector
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
+
+    def step(self, rho: float) -> float:
+        """Length ᾱ < 2/‖H‖ of a gradient projection step, ‖H‖ = max(1, ρ)."""
+        return 1.9 / max(1.0, rho if len(self.rows.C) else 0.0)
 
     def H(self, v: Vector, rho: float) -> Vector:
         """Apply H; one product with F."""
@@ -83,4 +87,7 @@ def projected_problem(qp: QP, lanczos_steps: int) -> Projected:
     norm = norm or 1.0
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
-    return Projected(F, counts, rows, norm, project(d) / norm, bounds)
+    b = project(d) / norm
+    if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / norm:
+        b = np.zeros_like(b)  # nothing but rounding errors is left of d
+    return Projected(F, counts, rows, norm, b, bounds)

@@ -21,6 +21,7 @@ from solvers.conversion import (
     dense,
     needs_matrices,
     on_present_bounds,
+    positive,
 )
 
 CLAIMS = {
@@ -51,6 +52,13 @@ class ProxQP:
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
     max_iter: int = 10_000
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+        if self.backend not in ("auto", "dense", "sparse"):
+            raise ValueError(
+                f"backend = {self.backend!r}; expected 'auto', 'dense' or 'sparse'"
+            )
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

@@ -15,6 +15,9 @@ Then, for k = 0, 1, …:
 6. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²: M ← βM.
 
 until ‖g^P‖ ≤ tol‖b‖ and ‖Cν‖ ≤ tol‖x̃‖. Without equalities one run of MPRGP is left.
+
+Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ; and if
+then no feasible step lessens ½‖Cν‖² although Cν ≠ 0, no feasible point exists.
 """
 
 from __future__ import annotations
@@ -22,12 +25,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
-from solvers.mprgp import mprgp
+from solvers.conversion import positive
+from solvers.mprgp import Minimum, mprgp, split
 from solvers.projected import Projected, projected_problem
 
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
@@ -48,7 +53,15 @@ class SMALBE:
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     lanczos_steps: int = 10  #: products spent on ‖𝒫F𝒫‖
-    max_steps: int = 20_000  #: of MPRGP, in total
+    max_steps: int = 20_000  #: of MPRGP and outer iterations, in total
+
+    def __post_init__(self) -> None:
+        positive(
+            rho=self.rho, M=self.M, eta=self.eta, Gamma=self.Gamma,
+            lanczos_steps=self.lanczos_steps, max_steps=self.max_steps,
+        )  # fmt: skip
+        if not 0 < self.beta < 1:
+            raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
@@ -79,27 +92,34 @@ class Iterate(NamedTuple):
     g: Vector  #: Hν − b + Cᵀμ
     mu: Vector  #: (r,) multipliers of Cν = 0, relative to ‖𝒫F𝒫‖
     M: float
+    rho: float
     outer: tuple[Outer, ...] = ()
-    converged: bool = False
+    status: Status = Status.ITERATION_LIMIT
 
     @property
     def steps(self) -> str:
         """All inner steps so far, one letter each."""
         return "".join(o.trace for o in self.outer)
 
+    @property
+    def stalled(self) -> bool:
+        """Whether neither of the last two outer iterations halved ‖Cν‖."""
+        errors = [o.infeasibility for o in self.outer[-3:]]
+        return len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
+
 
 def first_iterate(problem: Projected, options: SMALBE) -> Iterate:
     """Start from x = 0, moved into the bounds; one product."""
     nu = np.clip(-problem.rows.x_tilde, *problem.bounds)
     g = problem.H(nu, options.rho) - problem.b
-    return Iterate(nu, g, np.zeros(len(problem.rows.C)), options.M)
+    return Iterate(nu, g, np.zeros(len(problem.rows.C)), options.M, options.rho)
 
 
 def smalbe(problem: Projected, options: SMALBE, tol: float, at: Iterate) -> Iterate:
     """Run the outer loop, steps 4 to 6, on from `at`."""
-    C, b, rho = problem.rows.C, problem.b, options.rho
-    alpha = 1.9 / max(1.0, rho if len(C) else 0.0)
+    C, b = problem.rows.C, problem.b
     b_size, x_size = _norm(b) or _norm(at.g), _norm(problem.rows.x_tilde)
+    left = options.max_steps - len(at.steps) - len(at.outer)
     lagrangian = -np.inf
 
     def small(nu: Vector, projected: float) -> bool:
@@ -112,21 +132,50 @@ def smalbe(problem: Projected, options: SMALBE, tol: float, at: Iterate) -> Iter
 
     while True:
         run = mprgp(
-            lambda v: problem.H(v, rho), b - C.T @ at.mu, problem.bounds,
-            (at.nu, at.g), alpha=alpha, stop=precise, Gamma=options.Gamma,
-            max_steps=options.max_steps - len(at.steps),
+            partial(problem.H, rho=at.rho), b - C.T @ at.mu, problem.bounds,
+            (at.nu, at.g), alpha=problem.step(at.rho), stop=precise,
+            Gamma=options.Gamma, max_steps=max(left, 0),
         )  # fmt: skip
-        nu, Cnu = run.x, C @ run.x
-        mu = at.mu + rho * Cnu
-        g = run.g + rho * (C.T @ Cnu)
-        grown = float(0.5 * nu @ (g - b + C.T @ mu))
-        enough = grown >= lagrangian + rho / 2 * (Cnu @ Cnu)
-        done = Outer(run.trace, at.M, _norm(Cnu), grown)
-        M = at.M if enough else options.beta * at.M
-        converged = small(nu, run.projected_norm)
-        at, lagrangian = Iterate(nu, g, mu, M, (*at.outer, done), converged), grown
-        if converged or not run.stopped:
+        left -= len(run.trace) + 1
+        at = _updated(problem, options, at, run, lagrangian)
+        lagrangian = at.outer[-1].lagrangian
+        if small(at.nu, run.projected_norm):
+            return at._replace(status=Status.SOLVED)
+        if not run.stopped or left < 0:
             return at
+        if at.stalled:
+            if _infeasible(problem, at.nu):
+                return at._replace(status=Status.INFEASIBLE)
+            at = _with_penalty(problem, at, 10 * at.rho)
+
+
+def _updated(
+    problem: Projected, options: SMALBE, at: Iterate, run: Minimum, lagrangian: float
+) -> Iterate:
+    """Do steps 5 and 6 after an inner run."""
+    C, rho = problem.rows.C, at.rho
+    Cnu = C @ run.x
+    mu = at.mu + rho * Cnu
+    g = run.g + rho * (C.T @ Cnu)
+    grown = float(0.5 * run.x @ (g - problem.b + C.T @ mu))
+    enough = grown >= lagrangian + rho / 2 * (Cnu @ Cnu)
+    done = Outer(run.trace, at.M, _norm(Cnu), grown)
+    M = at.M if enough else options.beta * at.M
+    return Iterate(run.x, g, mu, M, rho, (*at.outer, done))
+
+
+def _infeasible(problem: Projected, nu: Vector) -> bool:
+    """Whether ν minimises ½‖Cν‖² over the bounds, though Cν ≠ 0."""
+    Cnu = problem.rows.C @ nu
+    downhill = split(nu, problem.rows.C.T @ Cnu, *problem.bounds, 1.0)
+    size = _norm(problem.rows.x_tilde) + _norm(nu)
+    return _norm(Cnu) > 1e-9 * size and downhill.projected_norm <= 1e-12 * _norm(Cnu)
+
+
+def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:
+    """Change ρ; the gradient follows without a product."""
+    Qnu = problem.rows.C.T @ (problem.rows.C @ at.nu)
+    return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu)
 
 
 def _certified(qp: QP, problem: Projected, options: SMALBE, tol: float) -> Solution:
@@ -134,11 +183,14 @@ def _certified(qp: QP, problem: Projected, options: SMALBE, tol: float) -> Solut
     at = first_iterate(problem, options)
     for tighter in (1.0, 0.1, 0.01):
         at = smalbe(problem, options, tighter * tol, at)
+        if at.status is Status.INFEASIBLE:
+            message = "no point within the bounds meets the equality rows"
+            return Solution.without_point(qp, at.status, message)
         problem.counts["P_products"] += 1  # of the residuals that follow
         point = _point(qp, problem, at)
         if kkt_residuals(qp, point).worst <= CLAIM * tol:
             return point
-        if not at.converged:
+        if at.status is not Status.SOLVED:
             break
     message = "step limit, unbounded cost, or no further progress in rounding"
     return replace(point, status=Status.ITERATION_LIMIT, message=message)

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from harness import InputError, kkt_residuals
-from problems.beam_ring import BeamRing, model
+from problems.beam_ring import BeamRing, _path, model
+from problems.bodies import clamped, floating
+from problems.contact import node_to_segment
+from problems.dual import dual_bounds, dualise
+from problems.stepping import primal_qp
 from solvers.clarabel_ import Clarabel
 from solvers.osqp_ import OSQP
 from solvers.proxqp_ import ProxQP
@@ -108,6 +112,66 @@ def test_every_form_gives_the_same_displacement_energy_and_multipliers(plane):
     assert cases["primal"].qp.objective(u / 2.0) * 2e8 == pytest.approx(
         expected["energy"], rel=1e-9
     )
+
+
+@pytest.mark.parametrize("transform", ["dual", "dual-bounds"])
+def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
+    transform,
+):
+    bodies = model(4, 3, 6, "strain")
+    rows = node_to_segment(bodies.mesh.points, np.zeros(848), *bodies.pairs[0])
+    primal = primal_qp(bodies, rows)
+    way = dualise if transform == "dual" else dual_bounds
+    inverse = floating(bodies) if transform == "dual" else clamped(bodies)
+    new = way(primal, inverse)
+
+    back = new.recover(SMALBE().prepare(new.qp, 1e-11)())
+
+    assert kkt_residuals(primal, back).worst < 1e-9
+    assert abs(back.y).max() > 0.1  # the clamps carry the load
+
+
+def test_steps_are_the_same_in_whatever_order_they_are_asked_for():
+    def gaps(step, params):
+        return FAMILY.build("primal", params, reference_solution).qp.h
+
+    orders = [(5, 2, 4), (2, 4, 5)]
+    seen = []
+    for order in orders:
+        _path.cache_clear()
+        given = {k: FAMILY.complete(dict(Nr=4, Nh=3, steps=5, step=k)) for k in order}
+        seen.append({k: gaps(k, given[k]) for k in order})
+
+    for k in (2, 4, 5):
+        assert (seen[0][k] == seen[1][k]).all()
+    assert abs(seen[0][2] - seen[0][4]).max() > 1e-3
+
+
+def test_results_are_those_of_each_body_and_of_the_rows_that_push():
+    case = build("dual-bounds", Nr=4, Nh=3, steps=1)
+    s = reference_solution(case.qp)
+    result, state = case.quantities(s), case.fields(s)
+    stress = state.nodal["von_mises"]
+    planted = np.zeros(37)
+    planted[:3] = [1.0, 2e-6, 5e-7]  # the threshold is 10⁻⁶ of the largest
+
+    assert result["max_von_mises"]["beam"] == stress[:165].max()
+    assert result["max_von_mises"]["ring"] == stress[165:].max()
+    assert case.quantities(replace(s, x=planted))["active"] == 2
+
+
+def test_an_inaccurate_reference_defines_no_case():
+    def lying(qp):
+        return replace(reference_solution(qp), x=np.zeros(qp.q.size))
+
+    with pytest.raises(ArithmeticError, match="reference solve at load factor"):
+        FAMILY.build("primal", FAMILY.complete(dict(Nr=4, Nh=3, steps=2)), lying)
+
+
+@pytest.mark.parametrize(("Nr", "Nh"), [(100_000, 5), (10, 10**9)])
+def test_sizes_beyond_the_index_type_are_refused_before_any_work(Nr, Nh):
+    with pytest.raises(InputError, match="nodes; expected at most"):
+        FAMILY.check(FAMILY.complete({"Nr": Nr, "Nh": Nh}))
 
 
 def test_forces_are_in_equilibrium():

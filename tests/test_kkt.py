@@ -15,6 +15,12 @@ from harness import (
     no_rows,
     verdict,
 )
+from problems.beam_ring import BeamRing
+from solvers.clarabel_ import Clarabel
+from solvers.osqp_ import OSQP
+from solvers.proxqp_ import ProxQP
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
 
 
 def one_variable(q=1.0, h=0.0):
@@ -65,28 +71,87 @@ def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
     assert r.gap == pytest.approx(2 / 4)
 
 
-@pytest.mark.parametrize("seed", [271828, 314159, 161803])
-@pytest.mark.parametrize("condition", ["A x = b", "G x <= h", "lb <= x", "x <= ub"])
-def test_each_violated_constraint_is_measured_relative_to_its_terms(
-    planted, seed, condition
-):
-    qp, s = planted("everything", seed=seed, dense=True)
-    x_size = abs(s.x).max()
-    match condition:
-        case "A x = b":
-            broken = replace(qp, b=qp.b + 0.25)
-            scale = abs(qp.A).sum(axis=1) * x_size + abs(broken.b)
-        case "G x <= h":
-            broken = replace(qp, h=qp.G @ s.x - 0.25)
-            scale = abs(qp.G).sum(axis=1) * x_size + abs(broken.h)
-        case "lb <= x":
-            broken = replace(qp, lb=s.x + 0.25, ub=s.x + 1)
-            scale = x_size + abs(broken.lb)
-        case _:
-            broken = replace(qp, lb=s.x - 1, ub=s.x - 0.25)
-            scale = x_size + abs(broken.ub)
+@pytest.mark.parametrize(
+    ("broken", "expected"),
+    [
+        # |a|·|x| + |b| = 2 + 1.75, and X = 3.75/2 is the largest size of x known of
+        (dict(A=np.ones((1, 2)), b=np.array([1.75])), 0.25 / 3.75),
+        (dict(A=np.ones((1, 2)), b=np.array([2.25])), 0.25 / 4.25),
+        (dict(G=np.ones((1, 2)), h=np.array([1.75])), 0.25 / 3.75),
+        (dict(lb=np.array([1.25, -np.inf])), 0.25 / 2.25),  # X = |x| + |lb|
+        (dict(ub=np.array([np.inf, 0.75])), 0.25 / 1.75),
+    ],
+    ids=["A x > b", "A x < b", "G x > h", "x < lb", "x > ub"],
+)
+def test_each_violated_constraint_is_measured_relative_to_its_terms(broken, expected):
+    """At x = (1, 1), violated by ¼."""
+    free = dict(
+        P=np.eye(2), q=-np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
+        h=np.zeros(0), lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
+    )  # fmt: skip
+    qp = QP(**free | broken)
+    s = Solution(status=Status.SOLVED, x=np.ones(2), y=np.zeros(qp.b.size),
+                 z=np.zeros(qp.h.size), z_box=np.zeros(2))  # fmt: skip
 
-    assert kkt_residuals(broken, s).primal == pytest.approx((0.25 / scale).max())
+    assert kkt_residuals(qp, s).primal == pytest.approx(expected)
+
+
+def diagonal(P, q, *, A=None, b=(), lb=-np.inf, ub=np.inf):
+    q = np.asarray(q, dtype=float)
+    n = q.size
+    return QP(P=np.diag(np.asarray(P, dtype=float)), q=q,
+              A=no_rows(n) if A is None else np.asarray(A, dtype=float),
+              b=np.asarray(b, dtype=float), G=no_rows(n), h=np.zeros(0),
+              lb=np.broadcast_to(lb, n).astype(float),
+              ub=np.broadcast_to(ub, n).astype(float))  # fmt: skip
+
+
+def at(x, y=(), z_box=(0, 0)):
+    x, y, z_box = (np.asarray(v, dtype=float) for v in (x, y, z_box))
+    return Solution(status=Status.SOLVED, x=x, y=y, z=np.zeros(0), z_box=z_box)
+
+
+@pytest.mark.parametrize(
+    ("qp", "s"),
+    [
+        # x₂ appears nowhere: its size must not excuse x₁ ≥ 1, or x₁ = 1, violated by 1
+        (diagonal([1, 0], [0, 0], lb=[1, -np.inf]), at([0, 1e12])),
+        (diagonal([1, 0], [0, 0], A=[[1, 0]], b=[1]), at([0, 1e12], [0])),
+        # y and z_box cancel: their size must not excuse x₂ = 0 where x₂* = 1
+        (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[0], lb=[0, -np.inf]),
+         at([0, 0], [1e12], [-1e12, 0])),
+        (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[1], lb=[1, -np.inf], ub=[1, np.inf]),
+         at([1, 100], [1e12], [-1e12, 0])),
+        # |a|·|x| overflows
+        (diagonal([1, 1], [0, 0], A=[[1e200, 0]], b=[1e200]), at([0, 1e200], [0])),
+    ],
+    ids=["bound", "row", "gradient", "energy", "overflow"],
+)  # fmt: skip
+def test_no_part_of_an_answer_can_excuse_another(qp, s):
+    assert not kkt_residuals(qp, s).worst <= 0.1
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-12, -1e-12])
+def test_rounding_errors_about_a_zero_solution_are_small(size):
+    """min ½x² + x, x ≥ 0 has x* = 0: all terms that could serve as a scale vanish."""
+    qp = diagonal([1, 1], [1, 1], lb=0)
+    s = at([size, abs(size)], z_box=[-1, -1])
+
+    assert kkt_residuals(qp, s).worst <= 1e3 * abs(size)
+
+
+@pytest.mark.parametrize("solver", [Clarabel(), OSQP(), ProxQP(), SMALBE()])
+@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
+def test_a_load_step_without_contact_is_verified(solver, form):
+    family = BeamRing()
+    given = {"Nr": 4, "Nh": 3, "steps": 100, "step": 1}
+    qp = family.build(form, family.complete(given), reference_solution).qp
+    if solver.declines(qp):
+        return
+
+    s = solver.prepare(qp, 1e-8)()
+
+    assert kkt_residuals(qp, s).worst <= 1e-7
 
 
 @pytest.mark.parametrize("seed", [271828, 314159])
@@ -153,3 +218,8 @@ def test_the_trivial_solution_of_a_trivial_problem_is_verified():
 )
 def test_the_verdict_follows_from_the_residuals_at_tol_1e_8(claimed, worst, expected):
     assert verdict(claimed, Residuals(0, worst, 0, 0), 1e-8) is expected
+
+
+def test_a_loose_tolerance_does_not_verify_a_refutation():
+    assert verdict(Status.SOLVED, Residuals(0, 1.0, 0, 0), 0.5) is Verdict.WRONG
+    assert verdict(Status.SOLVED, Residuals(0, 0.05, 0, 0), 0.5) is Verdict.VERIFIED

@@ -86,6 +86,22 @@ def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one():
     assert run.x == pytest.approx([0.0, 0.3])
 
 
+def test_a_fallback_is_a_half_step_and_a_gradient_projection():
+    """By hand: the CG step as far as x₁ = 0, then −ᾱφ on what is still free."""
+    A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
+    before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1)
+    after, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=2)
+    target = np.array([-1.0, 0.0])  # of the unconstrained CG step
+    p = before.x - target
+    half = before.x - before.x[0] / p[0] * p
+    g = A @ half - b
+    alpha = 1.9 / np.linalg.norm(A, 2)
+
+    assert after.trace == "cf"
+    assert half[0] == pytest.approx(0, abs=1e-15)
+    assert after.x == pytest.approx([0, half[1] - alpha * g[1]])
+
+
 def test_a_fixed_variable_neither_moves_nor_delays():
     run, _ = minimise(np.diag([1.0, 2.0]), [3.0, 4.0], [0.5, -np.inf], [0.5, np.inf])
 

@@ -1,0 +1,43 @@
+"""What the documents show works."""
+
+import re
+from pathlib import Path
+
+from harness import kkt_residuals
+from harness.registry import load_plugin
+from problems.beam_ring import BeamRing
+from solvers.reference import reference_solution
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_solver_of_the_contributing_guide_solves(tmp_path):
+    """In under 30 lines, and right on a dual with bounds only."""
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
+    )
+    path = tmp_path / "lbfgsb.py"
+    path.write_text(code)
+    solver = load_plugin(path).solvers["lbfgsb"]
+    family = BeamRing()
+    params = family.complete({"Nr": 4, "Nh": 3, "steps": 1})
+    qp = family.build("dual-bounds", params, reference_solution).qp
+    s = solver.prepare(qp, 1e-8)()
+
+    assert len(code.splitlines()) <= 30
+    assert solver.declines(family.build("primal", params, reference_solution).qp)
+    assert kkt_residuals(qp, s).primal == 0
+    assert qp.objective(s.x) - qp.objective(reference_solution(qp).x) <= 1e-7 * abs(
+        qp.objective(s.x)
+    )
+
+
+def test_every_family_and_suite_that_the_readme_names_exists():
+    from problems import PROBLEMS
+
+    text = (ROOT / "README.md").read_text()
+
+    names = re.findall(r"mortarbench solve ([\w-]+)[/:]", text)
+    assert {"beam-ring", "contact-patch", "file"} <= set(names) <= set(PROBLEMS)
+    for suite in re.findall(r"suites/[\w-]+\.toml", text):
+        assert (ROOT / suite).is_file()
