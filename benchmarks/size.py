@@ -2,8 +2,8 @@
 
     make size        or   .venv/bin/python benchmarks/size.py [FORM] [Nr ...]
 
-Nh = Nr/2. Each size runs in a process of its own, so that peaks are its own; prints a table and
-the exponents of c·n^p, least squares on logarithms with 95 % intervals.
+Nh = Nr/2. Each size runs in a process of its own, so that peaks are its own; prints a
+table and the exponents of c·n^p, least squares on logarithms with 95 % intervals.
 """
 
 import json
