@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from harness import Fields
+from harness import Fields, InputError
 from harness.errors import unknown
 from harness.store import load_fields
+from reports.cases import cases
 from reports.data import Evidence, Outcome, read_evidence
 from reports.figures import accuracy_figure, save, scaling_figure
 from reports.latex import latex
@@ -22,7 +24,7 @@ from reports.scaling import Ladder, ladders, scaling
 from reports.setting import definitions, environment
 from reports.sheets import sheets
 from reports.summary import dateline, summary
-from reports.wording import clean, tolerance
+from reports.wording import TIMED, clean, tolerance
 
 FORMATS = ("html", "md", "tex", "csv")
 
@@ -71,6 +73,7 @@ def compose(evidence: Evidence) -> Page:
     found = ladders(evidence)
     sections = (
         summary(evidence),
+        cases(evidence),
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
         iterations(evidence),
@@ -109,7 +112,8 @@ def _grown(found: Sequence[Ladder], evidence: Evidence) -> Section | None:
         Picture(
             name=f"scaling-{i}",
             caption=f"Growth of time and iterations: {ladder.title}. Bars: interval of "
-            "the median. p: exponent of the time with its 95 % interval.",
+            "the median. p: exponent of the time against n with its 95 % interval. "
+            f"{TIMED}",
             figure=scaling_figure(ladder, evidence.solvers),
         )
         for i, ladder in enumerate(found, 1)
@@ -123,12 +127,14 @@ def deformed(evidence: Evidence) -> Section | None:
     if not drawable:
         return None
     chosen = max(drawable, key=_importance)
-    fields = load_fields(evidence.directory, chosen.first.fields or "")
-    picture = Picture(
-        name="deformed",
-        caption=_caption(chosen, fields),
-        figure=deformed_figure(fields),
-    )
+    try:
+        fields = load_fields(evidence.directory, chosen.first.fields or "")
+        figure = deformed_figure(fields)
+    except InputError as e:  # the journal alone must do
+        missing = str(e).removeprefix(f"{evidence.directory}{os.sep}")
+        why = f"There is no picture of {clean(chosen.case)}: {clean(missing, 200)}."
+        return Section(name="deformed", title="Deformed bodies", prose=(why,))
+    picture = Picture(name="deformed", caption=_caption(chosen, fields), figure=figure)
     return Section(name="deformed", title="Deformed bodies", pictures=(picture,))
 
 
@@ -153,7 +159,7 @@ def _caption(outcome: Outcome, fields: Fields) -> str:
     return (
         f"{caption} Colours: patch-recovered von Mises stress, one scale for all "
         f"bodies, clipped at the {PERCENTILE:g} % quantile of the nodal values "
-        f"({limits[0] / 1e9:.3g} GPa), since stresses are singular at clamped and "
+        f"({limits[0] / 1e9:.3g} GPa), since stresses may be singular at clamped and "
         f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
     )
 

@@ -27,20 +27,21 @@ def latex(tables: tuple[Table, ...]) -> str:
 
 
 def _table(table: Table) -> str:
-    names = table.text_columns
-    columns = "l" * names + "r" * (len(table.columns) - names)
+    columns = "".join("lr"[not table.wordy(i)] for i in range(len(table.columns)))
     lines = [
         r"\begin{table}",
         r"  \centering",
-        rf"  \caption{{{escaped(table.caption)}}}",
+        rf"  \caption{{{escaped(table.legend)}}}",
         rf"  \begin{{tabular}}{{{columns}}}",
         r"    \toprule",
         _row([escaped(c) for c in table.columns]),
         r"    \midrule",
     ]
+    before = ""
     for row in table.rows:
-        if row[0].kind == "total":
+        if row[0].kind == "total" != before:
             lines.append(r"    \midrule")
+        before = row[0].kind
         lines.append(_row([_cell(c) for c in row]))
     lines += [r"    \bottomrule", r"  \end{tabular}", r"\end{table}", ""]
     return "\n".join(lines)

@@ -31,6 +31,17 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
     text_columns: int = 1  #: how many columns from the left hold names, not numbers
+    notes: tuple[str, ...] = ()  #: what must be known to read it; after the caption
+
+    def wordy(self, column: int) -> bool:
+        """Whether a column holds words, which begin at the left, not numbers."""
+        first = self.rows[0][column].kind if self.rows else ""
+        return column < self.text_columns or first == "words"
+
+    @property
+    def legend(self) -> str:
+        """Caption and notes in one paragraph."""
+        return " ".join((self.caption, *self.notes))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

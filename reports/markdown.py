@@ -21,7 +21,7 @@ def _section(section: Section) -> list[str]:
     if section.points:
         parts.append("\n".join(f"- {escaped(p)}" for p in section.points))
     for table in section.tables:
-        parts += [_table(table), f"*{escaped(table.caption)}*"]
+        parts += [_table(table), f"*{escaped(table.legend)}*"]
     for picture in section.pictures:
         caption = escaped(picture.caption)
         parts += [f"![{picture.name}](figures/{picture.name}.png)", f"*{caption}*"]
@@ -30,8 +30,7 @@ def _section(section: Section) -> list[str]:
 
 def _table(table: Table) -> str:
     heads = [escaped(c) for c in table.columns]
-    names = table.text_columns
-    rule = ["---" if i < names else "--:" for i in range(len(heads))]
+    rule = [":--" if table.wordy(i) else "--:" for i in range(len(heads))]
     rows = [[_cell(c) for c in row] for row in table.rows]
     return "\n".join(f"| {' | '.join(row)} |" for row in (heads, rule, *rows))
 

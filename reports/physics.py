@@ -8,17 +8,16 @@ from typing import NamedTuple
 
 from reports.data import Evidence, Outcome, energies
 from reports.layout import Cell, Section, Table, name_cell, source
-from reports.summary import flatten
+from reports.quantities import (
+    MOST_DIGITS,
+    elastic,
+    head,
+    known_digits,
+    leaves,
+    quantity,
+    unit,
+)
 from reports.wording import clean, plural, power, significant, tolerance
-
-_SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
-_UNITS = {
-    "energy": "J/m",
-    "tip": "m",
-    "contact_force": "N/m",
-    "multiplier_sum": "N/m",
-    "max_von_mises": "Pa",
-}
 
 
 class Spread(NamedTuple):
@@ -31,7 +30,13 @@ class Spread(NamedTuple):
     @property
     def best(self) -> Outcome:
         """The answer with the smallest worst residual."""
-        return min(self.answers, key=lambda o: (_residual(o), o.case, o.solver))
+        return _best(self.answers)
+
+    @property
+    def digits(self) -> int:
+        """As many as the energies agree on and one more; alone, as tol promises."""
+        doubt = self.answers[0].tol if self.relative is None else self.relative
+        return known_digits(doubt, MOST_DIGITS["energy"])
 
 
 def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
@@ -90,9 +95,10 @@ def agreement(evidence: Evidence) -> Section | None:
             Table(
                 caption="Energies of verified answers and their largest pairwise "
                 "difference. The energy is that of the answer with the smallest "
-                "residuals.",
+                "worst residual, in as many digits as the answers agree on and one "
+                "more, at most 12.",
                 columns=(
-                    "physical case", "tol", "answers", "energy in J/m",
+                    "physical case", "tol", "answers", "energy",
                     "largest relative difference", "between",
                 ),
                 rows=tuple(map(_spread_row, found)),
@@ -109,7 +115,8 @@ def _spread_row(s: Spread) -> tuple[Cell, ...]:
         Cell(text=tolerance(first.tol), value=first.tol),
         Cell(text=str(len(s.answers)), value=len(s.answers)),
         Cell(
-            text=significant(s.best.energy, 12),
+            text=significant(s.best.energy, s.digits),
+            after=unit(s.best, "energy"),
             value=s.best.energy,
             title=source(s.best),
         ),
@@ -125,84 +132,83 @@ def _who(outcome: Outcome) -> str:
 
 def physics(evidence: Evidence) -> Section | None:
     """Show sizes and physical results, one verified answer per physical case."""
-    chosen = _best_per_case([o for o in evidence.flat if o.verified and o.quantities])
-    if not chosen:
+    groups: dict[str, list[Outcome]] = {}
+    for o in evidence.flat:
+        if o.verified and o.quantities:
+            groups.setdefault(o.physical, []).append(o)
+    if not groups:
         return None
+    chosen = [(_best(answers), answers) for answers in groups.values()]
     tables = []
-    for family in dict.fromkeys(o.first.family for o in chosen):
-        mine = [o for o in chosen if o.first.family == family]
+    for family in dict.fromkeys(best.first.family for best, _ in chosen):
+        mine = [(b, answers) for b, answers in chosen if b.first.family == family]
         tables += [
             _quantities(mine, family, sizes=True),
             _quantities(mine, family, sizes=False),
         ]
+    si = " Units are SI." if any(elastic(o) for o, _ in chosen) else ""
     return Section(
         name="physics",
         title="Physical results",
         prose=(
-            "One answer per physical case, of all verified ones at the tightest "
-            "tolerance that with the smallest residuals. SI units.",
+            "One answer per physical case: of all verified ones that with the smallest "
+            "worst residual; the last column says whose. Numbers have as many digits "
+            "as the verified answers at the same tolerance agree on, and one more; a "
+            f"lone answer has as many as its tolerance promises.{si}",
         ),
         tables=tuple(t for t in tables if t is not None),
     )
 
 
-def _best_per_case(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    best: dict[str, Outcome] = {}
-    for o in outcomes:
-        held = best.get(o.physical)
-        if held is None or (o.tol, _residual(o)) < (held.tol, _residual(held)):
-            best[o.physical] = o
-    return list(best.values())
+def _best(answers: Sequence[Outcome]) -> Outcome:
+    """Take the answer with the smallest worst residual; names break ties."""
+    return min(answers, key=lambda o: (_residual(o), o.case, o.solver))
 
 
 def _quantities(
-    outcomes: Sequence[Outcome], family: str, *, sizes: bool
+    chosen: Sequence[tuple[Outcome, list[Outcome]]], family: str, *, sizes: bool
 ) -> Table | None:
-    rows = [dict(_leaves(o, sizes=sizes)) for o in outcomes]
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    if not names:
+    outcomes = [best for best, _ in chosen]
+    paths = list(dict.fromkeys(p for o in outcomes for p in leaves(o, sizes=sizes)))
+    if not paths:
         return None
-    cells = [
-        (
-            name_cell(o.physical),
-            *(_quantity(row.get(name), o) for name in names),
-            Cell(text=_who(o), kind="words", title=source(o)),
-        )
-        for o, row in zip(outcomes, rows, strict=True)
-    ]
+    rows = []
+    for best, answers in chosen:
+        peers = [o for o in answers if o.tol == best.tol]
+        which = f"{_who(best)}, {power(best.worst)} at tol {tolerance(best.tol)}"
+        answer = Cell(text=which, kind="words", title=source(best))
+        cells = [quantity(path, best, peers) for path in paths]
+        rows.append((name_cell(best.physical), *cells, *([] if sizes else [answer])))
     what = "Sizes" if sizes else "Physical results"
-    heads = tuple(clean(name.replace("_", " "), 40) for name in names)
     return Table(
-        caption=f"{what} of {clean(family, 40)}: {plural(len(cells), 'case')}.",
-        columns=("physical case", *heads, "answer of"),
-        rows=tuple(cells),
+        caption=f"{what} of {clean(family, 40)}: {plural(len(rows), 'case')}.",
+        notes=_caveats({path[0] for path in paths}),
+        columns=(
+            "physical case",
+            *(head(path, outcomes) for path in paths),
+            *([] if sizes else ["answer of"]),
+        ),
+        rows=tuple(rows),
     )
 
 
-def _leaves(outcome: Outcome, *, sizes: bool) -> list[tuple[str, object]]:
-    """Name every scalar, with its unit, vectors by component."""
-    found: list[tuple[str, object]] = []
-    for name, value in outcome.quantities.items():
-        if (name in _SIZES) is not sizes:
-            continue
-        unit = f" in {_UNITS[name]}" if name in _UNITS else ""
-        if isinstance(value, list | tuple):
-            axes = "xyz" if len(value) <= 3 else range(len(value))
-            pairs = zip(axes, value, strict=False)
-            found += [(f"{name} {axis}{unit}", v) for axis, v in pairs]
-        else:
-            leaves = flatten(value, name)
-            found += [(f"{key.replace('.', ' ')}{unit}", v) for key, v in leaves]
-    return found
-
-
-def _quantity(value: object, outcome: Outcome) -> Cell:
-    match value:
-        case bool() | None:
-            return Cell()
-        case int():
-            return Cell(text=str(value), value=value, title=source(outcome))
-        case float():
-            return Cell(text=significant(value, 7), value=value, title=source(outcome))
-        case _:
-            return Cell(text=clean(str(value), 40), kind="words")
+def _caveats(names: set[str]) -> tuple[str, ...]:
+    """Say what the numbers of a table do not mean."""
+    found = []
+    if "active" in names:
+        found.append(
+            "active: rows with λ_i > 1e-6 max λ; a range where verified answers differ "
+            "on it, as they do where a multiplier is below the accuracy asked for."
+        )
+    if "max_von_mises" in names:
+        singular = ", being singular under the point load" if "tip" in names else ""
+        found.append(
+            "max von Mises: the largest nodal value, to three digits; it depends on "
+            f"the mesh{singular}."
+        )
+    if "tip" in names:
+        found.append(
+            "A point load makes tip displacement and energy mesh-dependent too: they "
+            "grow without bound as the mesh is refined; compare them on one mesh only."
+        )
+    return tuple(found)

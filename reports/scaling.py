@@ -9,8 +9,13 @@ from typing import Any
 from reports.data import Evidence, Outcome
 from reports.intervals import PowerLaw, power_law
 from reports.layout import Cell, Section, Table, source
-from reports.wording import ABSENT, clean, exponent, seconds, span, tolerance
+from reports.wording import ABSENT, TIMED, clean, exponent, seconds, span, tolerance
 
+#: What the sizes of a ladder count, wherever they are shown.
+SIZES_NAMED = (
+    "n: displacement components (degrees of freedom); m: dual size, the rows of "
+    "equality and contact constraints."
+)
 SIZES = 3  #: fewer different sizes make no table
 
 
@@ -26,15 +31,23 @@ class Ladder:
         """Sizes n and verified answers of one solver, smallest first."""
         return [(n, row[solver]) for n, _, row in self.rungs if solver in row]
 
-    def time_law(self, solver: str) -> PowerLaw | None:
-        """Fit median total time ~ nᵖ; None with fewer than three sizes."""
-        timed = [(n, o.seconds("total")) for n, o in self.curve(solver)]
-        return _law([(n, t.value) for n, t in timed if t is not None])
+    def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
+        """Fit median total time ~ nᵖ or mᵖ; None with fewer than three sizes."""
+        timed = [(s, o.seconds("total")) for s, o in self._sized(solver, against)]
+        return _law([(s, t.value) for s, t in timed if t is not None])
 
-    def iteration_law(self, solver: str) -> PowerLaw | None:
-        """Fit iterations ~ nᵖ, repeats averaged; None with fewer than three sizes."""
-        counted = [(n, o.iterations) for n, o in self.curve(solver)]
-        return _law([(n, sum(i) / 2) for n, i in counted if i is not None])
+    def iteration_law(self, solver: str, against: str = "n") -> PowerLaw | None:
+        """Fit iterations ~ nᵖ or mᵖ, repeats averaged; None below three sizes."""
+        counted = [(s, o.iterations) for s, o in self._sized(solver, against)]
+        return _law([(s, sum(i) / 2) for s, i in counted if i is not None])
+
+    def _sized(self, solver: str, against: str) -> list[tuple[int, Outcome]]:
+        """Sizes n or m and the answers of one solver; those without are left out."""
+        return [
+            (size, row[solver])
+            for n, m, row in self.rungs
+            if solver in row and (size := n if against == "n" else m) is not None
+        ]
 
 
 def _law(points: list[tuple[int, float]]) -> PowerLaw | None:
@@ -105,12 +118,13 @@ def scaling(found: Sequence[Ladder]) -> Section | None:
         name="scaling",
         title="Scaling",
         prose=(
-            "Verified answers only. n: degrees of freedom; m: rows of equality and "
-            "contact constraints. The exponent p of t = c·nᵖ is fitted by least "
-            "squares on logarithms, one point (the median of the repeats) per size; "
-            "its 95 % interval is Student's with two degrees of freedom fewer than "
-            "sizes, exact if the logarithms scatter normally about the line. It is a "
-            "statement about the sizes in the table, not beyond them.",
+            "Verified answers only. The exponents p of t = c·nᵖ and of t = c·mᵖ are "
+            "fitted by least squares on logarithms, one point (the median of the "
+            "repeats) per size; the 95 % interval is Student's with two degrees of "
+            "freedom fewer than sizes, exact if the logarithms scatter normally about "
+            "the line. It is a statement about the sizes in the table, not beyond "
+            "them. Where m grows more slowly than n, as it does for contact on a "
+            "boundary, the exponent against m is the larger for the same times.",
         ),
         tables=tuple(t for ladder in found for t in _tables(ladder)),
     )
@@ -124,20 +138,24 @@ def _tables(ladder: Ladder) -> tuple[Table, Table]:
         present = [row.get(s) for s in ladder.solvers]
         times.append((*size, *map(_time, present)))
         counts.append((*size, *map(_iterations, present)))
-    label = (Cell(text="p [95 %]", kind="total"), Cell(text="", kind="total"))
-    laws = [ladder.time_law(s) for s in ladder.solvers]
-    growth = [ladder.iteration_law(s) for s in ladder.solvers]
-    times.append((*label, *map(_exponent, laws)))
-    counts.append((*label, *map(_exponent, growth)))
+    for against in ("n", "m"):
+        head = f"p against {against} [95 %]"
+        label = (Cell(text=head, kind="total"), Cell(text="", kind="total"))
+        laws = [ladder.time_law(s, against) for s in ladder.solvers]
+        growth = [ladder.iteration_law(s, against) for s in ladder.solvers]
+        times.append((*label, *map(_exponent, laws)))
+        counts.append((*label, *map(_exponent, growth)))
     return (
         Table(
             caption=f"Total time against size: {ladder.title}.",
+            notes=(SIZES_NAMED, TIMED),
             columns=heads,
             rows=tuple(times),
             text_columns=0,
         ),
         Table(
             caption=f"Iterations against size: {ladder.title}.",
+            notes=(SIZES_NAMED,),
             columns=heads,
             rows=tuple(counts),
             text_columns=0,

@@ -8,7 +8,7 @@ from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence
 from reports.layout import Cell, Section, Table
 from reports.summary import flatten
-from reports.wording import clean, tolerance
+from reports.wording import TIMED, clean, tolerance
 
 
 def environment(evidence: Evidence) -> Section:
@@ -84,18 +84,22 @@ def definitions() -> Section:
             "lb ≤ x ≤ ub, with multipliers such that  Px + q + Aᵀy + Gᵀz + z_box = 0, "
             "z ≥ 0, z_box ≤ 0 at an active lower and ≥ 0 at an active upper bound. "
             "Four residuals vanish exactly at a solution. None changes when the "
-            "objective, a row or the unit of x is scaled. S is the largest of ‖Px‖, "
-            "‖q‖, ‖Aᵀy‖, ‖Gᵀz‖ and ‖z_box‖ in the maximum norm; E is the largest of "
-            "|xᵀPx|, |qᵀx|, |bᵀy|, |hᵀz| and the bounds' term.",
+            "objective, a row or the unit of x is scaled. X is the size of x, the "
+            "largest that a row ((|aᵢ|·|x| + |bᵢ|)/‖aᵢ‖₁), a bound or the curvature of "
+            "a variable knows of; S is the largest of ‖Px‖, ‖q‖ and ‖Aᵀy + Gᵀz + "
+            "z_box‖ in the maximum norm; E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + "
+            "hᵀz + the bounds' term|. X and E are at least a hundredth of the median "
+            "of |qᵢ|/Pᵢᵢ and of qᵢ²/Pᵢᵢ.",
         ),
         points=(
-            "Primal: the worst violation of a row or bound, relative to "
-            "‖aᵢ‖₁‖x‖∞ + |bᵢ|.",
+            "Primal: the worst violation of a row or bound, relative to the larger of "
+            "|aᵢ|·|x| + |bᵢ| and ‖aᵢ‖₁X.",
             "Dual: ‖Px + q + Aᵀy + Gᵀz + z_box‖∞ / S, and likewise every multiplier of "
             "the wrong sign; one on an absent bound has the wrong sign.",
             "Complementarity: the largest |multiplier × slack| / E.",
             "Gap: |primal objective − dual objective| / E.",
-            f"Verified: every residual ≤ {factor} × tol, whatever was claimed. "
+            f"Verified: every residual ≤ {factor} × tol (and ≤ 0.1), whatever was "
+            "claimed. "
             "Inaccurate: success was claimed and refuted, but at least half of the "
             f"digits are there (worst residual ≤ √({factor} × tol)). Wrong: refuted "
             "beyond that.",
@@ -104,8 +108,8 @@ def definitions() -> Section:
             "said beforehand why it cannot).",
             "Limitation: the same tolerance is not the same accuracy. Each solver "
             "tests it in its own norm, and many deliver more than they were asked for.",
-            "Limitation: times hold for the machine and the versions listed above; "
-            "conversion to the solver's own format counts as preparation.",
+            f"{TIMED} Conversion to the solver's own format counts as preparation.",
+            "Limitation: times hold for the machine and the versions listed above.",
             "Limitation: multipliers are not unique where constraints are redundant, "
             "so energies and displacements are compared, never multipliers.",
         ),

@@ -94,7 +94,9 @@ def _law(ladder: Ladder, solver: str) -> dict[str, Any]:
     }
     laws: dict[str, PowerLaw | None] = {
         "time": ladder.time_law(solver),
+        "time_against_m": ladder.time_law(solver, "m"),
         "iterations": ladder.iteration_law(solver),
+        "iterations_against_m": ladder.iteration_law(solver, "m"),
     }
     for what, law in laws.items():
         for part in ("exponent", "low", "high", "factor"):

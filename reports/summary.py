@@ -11,6 +11,7 @@ from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell
 from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
 
+QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 _LIMITS = (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
 _GROUPS: dict[str, tuple[Verdict, ...]] = {
     "verified": (Verdict.VERIFIED,),
@@ -39,7 +40,7 @@ def summary(evidence: Evidence) -> Section:
     cases = len({o.case for o in evidence.flat})
     tols = sorted({o.tol for o in evidence.flat}, reverse=True)
     prose = [
-        f"{plural(len(evidence.records), 'measurement')}: "
+        f"{_made(evidence)}: "
         f"{plural(len(evidence.solvers), 'solver')}, {plural(cases, 'case')}, "
         f"tolerance {', '.join(map(tolerance, tols))}. A solver claims; the harness "
         "verifies: every verdict below comes from residuals that we evaluated at the "
@@ -51,6 +52,7 @@ def summary(evidence: Evidence) -> Section:
             f"Warning: the measurements come from {len(digests)} different "
             f"environments ({listing(digests)}); their times are not comparable."
         )
+    prose += [text for text in (_busy(evidence), _unequal(evidence)) if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
     return Section(
         name="summary",
@@ -61,12 +63,70 @@ def summary(evidence: Evidence) -> Section:
     )
 
 
+def _made(evidence: Evidence) -> str:
+    """Count the measurements made, those that a solver declined, and those missing.
+
+    The journal holds one line for a case that a solver declined, whatever the repeats.
+    """
+    made = sum(r.status is not Verdict.DECLINED for r in evidence.records)
+    repeats = _repeats(evidence)
+    declined = sum(o.verdict is Verdict.DECLINED for o in evidence.flat)
+    cells = len(evidence.outcomes) * len(evidence.solvers)
+    taken = sum(
+        max(repeats, len(o.records))
+        for o in evidence.flat
+        if o.verdict is not Verdict.DECLINED
+    )
+    total = taken + (cells - len(evidence.flat) + declined) * repeats
+    text = f"{plural(made, 'measurement')}"
+    if total == made:
+        return text
+    text += f" of the {total} that the suite has on these cases"
+    if declined:
+        text += f", {declined * repeats} not made because a solver declined"
+    missing = total - made - declined * repeats
+    return f"{text}, {missing} not made yet" if missing else text
+
+
+def _repeats(evidence: Evidence) -> int:
+    """Repeats that the suite asks for, or else the most that were made."""
+    asked = evidence.suite.get("repeats")
+    most = max(len(o.records) for o in evidence.flat)
+    return asked if isinstance(asked, int) and asked > 0 else most
+
+
+def _busy(evidence: Evidence) -> str:
+    """Warn of a machine that other programs used when the measurements began."""
+    now = evidence.environment.get("now")
+    load = now.get("load") if isinstance(now, Mapping) else None
+    if not isinstance(load, int | float) or load <= QUIET_LOAD:
+        return ""
+    return (
+        f"Warning: the machine was not idle when the measurements began (load average "
+        f"{load:.2f}; quiet is at most {QUIET_LOAD}): times may be too long, and their "
+        "scatter is not that of the solvers alone."
+    )
+
+
+def _unequal(evidence: Evidence) -> str:
+    """Say so if some cells were repeated more often than others."""
+    tried = [o for o in evidence.flat if o.verdict is not Verdict.DECLINED]
+    counts = {len(o.records) for o in tried}
+    if len(counts) < 2:
+        return ""
+    return (
+        f"Numbers of repeats are unequal: {min(counts)} to {max(counts)} for one "
+        "solver on one case; intervals of different numbers cover differently."
+    )
+
+
 def _counts(evidence: Evidence) -> Table:
     rows = []
     for solver in evidence.solvers:
         mine = [r for r in evidence.records if r.solver == solver]
         count = Counter(r.status for r in mine)
-        row = [name_cell(solver), Cell(text=str(len(mine)), value=len(mine))]
+        made = len(mine) - count[Verdict.DECLINED]
+        row = [name_cell(solver), Cell(text=str(made), value=made)]
         for verdicts in _GROUPS.values():
             n = sum(count[v] for v in verdicts)
             symbol, _ = VERDICTS[verdicts[0]]
@@ -75,7 +135,8 @@ def _counts(evidence: Evidence) -> Table:
         rows.append(tuple(row))
     return Table(
         caption="Measurements by verdict. Inaccurate and wrong: the solver claimed "
-        "success and its point refutes the claim.",
+        "success and its point refutes the claim. Declined: cases that were not "
+        "measured, at one tolerance each; they are not among the measurements.",
         columns=("solver", "measurements", *_GROUPS),
         rows=tuple(rows),
     )
@@ -93,12 +154,16 @@ def sentences(evidence: Evidence, solver: str) -> list[str]:
         if tried and not missed:
             worst = max((o.worst or 0.0 for o in tried), default=0.0)
             missed = [
-                f"verified on all {plural(len(tried), 'case')} at tol "
+                f"verified on {_all(len(tried))} at tol "
                 f"{tolerance(tol)}; worst residual {power(worst)}"
             ]
         missed += _unclaimed(tried) + _declined(at_tol)
         said.append(f"{name}: {'; '.join(missed)}.")
     return said
+
+
+def _all(count: int) -> str:
+    return f"all {count} cases" if count > 1 else "its only case"
 
 
 def _missed(tried: Sequence[Outcome], tol: float) -> list[str]:

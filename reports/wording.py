@@ -11,10 +11,16 @@ from reports.intervals import Interval, PowerLaw
 
 ABSENT = "–"  #: what was not or cannot be measured
 
+#: What a time is, wherever times are shown.
+TIMED = (
+    "Times are those of the solver from the emitted QP on; assembling, linearising "
+    "and, for dual forms, dualising are the generator's and not in them."
+)
+
 #: Symbol and words of every verdict: colour alone says nothing to many readers.
 VERDICTS = {
     Verdict.VERIFIED: ("✓", "verified"),
-    Verdict.INACCURATE: ("≈", "inaccurate"),
+    Verdict.INACCURATE: ("△", "inaccurate"),
     Verdict.WRONG: ("✗", "wrong"),
     Verdict.INFEASIBLE_CLAIM: ("∅", "infeasible claim"),
     Verdict.ITERATION_LIMIT: ("↻", "iteration limit"),
@@ -47,21 +53,23 @@ def _invisible(char: str) -> bool:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print `digits` significant digits without an exponent where that is short."""
+    """Print `digits` significant digits, no more; no exponent if that is short."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:
         return "0"
     exponent = math.floor(math.log10(abs(value)))
-    if -3 <= exponent < max(digits, 6):
+    if -3 <= exponent < digits:  # beyond, zeros would pose as digits
         return f"{value:.{max(digits - 1 - exponent, 0)}f}"
     return _short(f"{value:.{digits - 1}e}")
 
 
 def power(value: float | None) -> str:
-    """Print an order of magnitude with one decimal: 3.2e-9."""
+    """Print an order of magnitude with two digits: 3.2e-9, 1.4, 0.25."""
     if value is None or not math.isfinite(value):
         return ABSENT
+    if 0.095 <= abs(value) < 9.95:
+        return significant(value, 2)
     return "0" if value == 0 else _short(f"{value:.1e}")
 
 
@@ -80,24 +88,33 @@ def tolerance(value: float) -> str:
 def seconds(interval: Interval | None) -> str:
     """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
 
-    Both ends are printed to the digit of the median. A single run has no uncertainty
-    that one could know, and the text says so.
+    Both ends are printed to the digit of the median, which has as many digits as tell
+    the ends apart, and at least three. A single run has no uncertainty that one could
+    know, and the text says so.
     """
     if interval is None:
         return ABSENT
     unit, name = next((u for u in _UNITS if interval.value >= u[0]), _UNITS[-1])
     scaled = interval.value / unit
     exponent = math.floor(math.log10(scaled)) if scaled > 0 else 0
-    decimals = max(2 - exponent, 0)
-    low, high = (f"{v / unit:.{decimals}f}" for v in (interval.low, interval.high))
-    ends = f"{low}, {high}" if interval.samples > 1 else "1 run"
-    return f"{scaled:.{decimals}f} {name} [{ends}]"
+    low, high = interval.low / unit, interval.high / unit
+    decimals = _telling(low, high, max(2 - exponent, 0))
+    ends = f"{low:.{decimals}f}, {high:.{decimals}f}"
+    shown = ends if interval.samples > 1 else "1 run"
+    return f"{scaled:.{decimals}f} {name} [{shown}]"
+
+
+def _telling(low: float, high: float, decimals: int) -> int:
+    """Find how many decimals tell two numbers apart; as given where none do."""
+    further = range(decimals, decimals + 7)
+    return next((d for d in further if f"{low:.{d}f}" != f"{high:.{d}f}"), decimals)
 
 
 def exponent(fit: PowerLaw) -> str:
     """Print the exponent of a power law with its 95 % interval."""
-    p, low, high = (round(v, 2) + 0.0 for v in (fit.exponent, fit.low, fit.high))
-    return f"{p:.2f} [{low:.2f}, {high:.2f}]"
+    d = _telling(fit.low, fit.high, 2)
+    p, low, high = (round(v, d) + 0.0 for v in (fit.exponent, fit.low, fit.high))
+    return f"{p:.{d}f} [{low:.{d}f}, {high:.{d}f}]"
 
 
 def span(least_most: tuple[int, int] | None) -> str:

@@ -13,6 +13,7 @@ from harness.store import save_fields
 from reports import write_report
 from reports.data import Evidence, arrange
 from reports.folder import compose
+from reports.intervals import power_law
 from reports.latex import escaped, latex
 from reports.markdown import escaped as md_escaped
 from reports.markdown import markdown
@@ -20,7 +21,7 @@ from reports.page import breakable
 from reports.physics import spreads
 from reports.scaling import ladders
 from reports.summary import sentences
-from reports.wording import clean, seconds, significant
+from reports.wording import clean, exponent, seconds, significant
 
 HOSTILE = (
     '<script>alert(1)</script>"><img src=http://evil.example/x onerror=alert(1)>',
@@ -175,7 +176,7 @@ def test_each_tolerance_has_a_sentence_of_its_own(measured, evidence):
     found = evidence([measured("a"), measured("a", tol=1e-4, status=Verdict.WRONG)])
     loose, tight = sentences(found, "a")
     assert "wrong at tol 1e-4" in loose
-    assert "verified on all 1 case at tol 1e-8" in tight
+    assert "verified on its only case at tol 1e-8" in tight
 
 
 def test_measurements_of_two_machines_are_flagged(measured, evidence):
@@ -236,7 +237,12 @@ def test_a_planted_exponent_is_found_from_the_records(measured, evidence):
         ("20", "14"),
         ("60", "34"),
     ]
-    assert rows[-1]["a"].text == "1.50 [1.50, 1.50]"
+    against_n, against_m = rows[-2:]
+    assert against_n["n"].text == "p against n [95 %]"
+    assert against_n["a"].text == "1.50 [1.50, 1.50]"
+    assert against_m["n"].text == "p against m [95 %]"
+    law = power_law([14, 34, 104, 304], [(2 * n) ** 1.5 for n in (10, 30, 100, 300)])
+    assert against_m["a"].text == exponent(law)
     assert "****" not in markdown(compose(evidence(records)))
 
 

@@ -1,0 +1,327 @@
+"""A report stands on its own, and prints no digit that is not known."""
+
+import re
+
+import pytest
+
+from harness import Record, Verdict
+from harness.journal import Journal
+from reports import write_report
+from reports.data import Evidence, arrange
+from reports.folder import compose
+from reports.intervals import PowerLaw, median_interval
+from reports.latex import latex
+from reports.layout import Cell, Table
+from reports.markdown import markdown
+from reports.wording import TIMED, exponent, power, seconds, significant
+
+ELASTIC = {
+    "dofs": 20, "equality_rows": 4, "contact_rows": 10, "active": 5,
+    "energy": -12345.678901234, "tip": [0.25, -0.5],
+    "max_von_mises": {"beam": 798608592.4, "ring": 127410816.1},
+}  # fmt: skip
+
+
+@pytest.fixture
+def measured():
+    """Factory: one record of beam-ring, verified unless told otherwise."""
+
+    def make(solver="a", repeat=0, *, form="dual", physical="beam-ring", **changes):
+        defaults = dict(
+            run_id=f"{solver}-{form}-{physical}-{changes.get('tol', 1e-8)}-{repeat}",
+            case=f"{physical}/{form}", family="beam-ring", params={"step": 10},
+            form=form, sizes={"variables": 14, "equalities": 3, "inequalities": 0,
+                              "bounds": 10},
+            solver=solver, options={}, tol=1e-8, repeat=repeat, block=repeat,
+            status=Verdict.VERIFIED, claimed="solved", iterations=7,
+            prepare_seconds=0.001, solve_seconds=0.002, total_seconds=0.003,
+            primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
+            quantities=ELASTIC, environment="abc",
+        )  # fmt: skip
+        return Record(**(defaults | changes))
+
+    return make
+
+
+@pytest.fixture
+def page(tmp_path):
+    def make(records, **more):
+        return compose(Evidence(directory=tmp_path, records=arrange(records), **more))
+
+    return make
+
+
+def section(page, name):
+    (found,) = (s for s in page.sections if s.name == name)
+    return found
+
+
+def rows(table):
+    return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+
+
+def grown(measured, sizes=(10, 20, 40), **changes):
+    return [
+        measured(
+            physical=f"beam-ring/n={n}", params={"n": n}, total_seconds=1e-6 * n,
+            quantities=ELASTIC | {"dofs": n * n, "contact_rows": n}, **changes,
+        )
+        for n in sizes
+    ]  # fmt: skip
+
+
+def test_wherever_times_are_shown_the_report_says_what_is_not_in_them(measured, page):
+    assert "dualising are the generator's and not in them" in TIMED
+    made = page(grown(measured))
+    assert TIMED in section(made, "times").tables[0].legend
+    assert TIMED in section(made, "scaling").tables[0].legend
+    assert TIMED in section(made, "scaling").pictures[0].caption
+    assert any(TIMED in point for point in section(made, "definitions").points)
+
+
+def test_exponents_are_given_against_both_sizes_and_both_are_named(measured, page):
+    records = [
+        r.but(quantities=r.quantities | {"equality_rows": 0}) for r in grown(measured)
+    ]
+    times, counts = section(page(records), "scaling").tables
+    against_n, against_m = rows(times)[-2:]
+    assert (against_n["n"].text, against_n["a"].value) == (
+        "p against n [95 %]", pytest.approx(0.5),
+    )  # fmt: skip
+    assert (against_m["n"].text, against_m["a"].value) == (
+        "p against m [95 %]", pytest.approx(1.0),
+    )  # fmt: skip
+    for table in (times, counts):
+        assert "n: displacement components" in table.legend
+        assert "m: dual size" in table.legend
+
+
+def test_a_reader_sees_every_parameter_and_the_sizes_of_the_qp(measured, page):
+    shared = {"steps": 10, "plane": "strain"}
+    records = [
+        measured(physical=f"beam-ring/step={k}", params={"step": k} | shared)
+        for k in (1, 10)
+    ]
+    (table,) = section(page(records), "cases").tables
+    assert "steps = 10, plane = strain" in table.legend
+    first = rows(table)[0]
+    assert {k: cell.text for k, cell in first.items()} == {
+        "case": "beam-ring/step=1/dual", "form": "dual", "step": "1",
+        "variables": "14", "equalities": "3", "inequalities": "0", "bounds": "10",
+    }  # fmt: skip
+
+
+def energies(measured, *values, **changes):
+    return [
+        measured(f"s{i}", quantities=ELASTIC | {"energy": e}, **changes)
+        for i, e in enumerate(values)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("others", "text"),
+    [
+        ([-333734.443434567 * (1 + 2e-6)], "-333734"),  # five digits agree
+        ([-333734.443434567 * (1 + 2e-4)], "-3.337e5"),  # never zeros as digits
+        ([-333734.443434567], "-333734.443435"),  # no more than twelve
+        ([], "-333734.443"),  # alone: what the tolerance 1e-8 promises
+    ],
+)
+def test_energies_have_the_digits_that_answers_agree_on_and_one_more(
+    measured, page, others, text
+):
+    made = page(energies(measured, -333734.443434567, *others))
+    assert rows(section(made, "energies").tables[0])[0]["energy"].text == text
+    assert rows(section(made, "physics").tables[1])[0]["energy in J/m"].text == text
+
+
+def test_a_stress_has_three_digits_and_the_caveats_stand_beside_it(measured, page):
+    table = section(page([measured()]), "physics").tables[1]
+    assert rows(table)[0]["max von Mises beam in Pa"].text == "7.99e8"
+    assert "singular under the point load" in table.legend
+    assert "tip displacement and energy mesh-dependent" in table.legend
+
+
+def test_a_component_has_no_digits_that_its_vector_lacks(measured, page):
+    forces = ([4e-7, -999999.7], [-6e-3, -999999.8])
+    tips = ([0.00123456789, 1.0], [0.00123456789, 1.00002])
+    records = [
+        measured(f"s{i}", quantities=ELASTIC | {"contact_force": f, "tip": u})
+        for i, (f, u) in enumerate(zip(forces, tips, strict=True))
+    ]
+    (row,) = rows(section(page(records), "physics").tables[1])
+    assert row["contact force x in N/m"].text == "0"
+    assert row["contact force y in N/m"].text == "-999999.7"
+    assert row["tip x in m"].text == "0.001235"  # seven digits of a vector of 1
+    assert row["tip y in m"].text == "1.0000"
+
+
+def test_physical_results_are_those_of_the_smallest_residual_and_say_whose(
+    measured, page
+):
+    records = [
+        measured("tight", dual=9e-9, quantities=ELASTIC | {"tip": [1.0, 1.0]}),
+        measured("best", tol=1e-6, dual=3e-9, quantities=ELASTIC | {"tip": [2.0, 2.0]}),
+        measured("liar", dual=0.0, primal=0.0, gap=0.0, complementarity=0.0,
+                 status=Verdict.WRONG),
+    ]  # fmt: skip
+    (row,) = rows(section(page(records), "physics").tables[1])
+    assert row["tip x in m"].value == 2.0
+    assert row["answer of"].text == "best on dual, 3.0e-9 at tol 1e-6"
+
+
+def test_active_rows_on_which_answers_differ_are_a_range(measured, page):
+    records = [
+        measured("a", quantities=ELASTIC | {"active": 5}),
+        measured("b", dual=1e-9, quantities=ELASTIC | {"active": 6}),
+        measured("c", quantities=ELASTIC | {"active": 9}, status=Verdict.WRONG),
+    ]
+    table = section(page(records), "physics").tables[1]
+    assert rows(table)[0]["active"].text == "5–6"
+    assert "λ_i > 1e-6 max λ" in table.legend
+
+
+def test_units_are_those_of_elastic_bodies_and_of_no_others(measured, page):
+    found = {"dofs": 9, "energy": 4.25, "force": {"left": [1.0, 2.0]}, "x": [0.0] * 99}
+    made = page([measured(quantities=found, family="obstacle")])
+    table = section(made, "physics").tables[1]
+    assert table.columns == (
+        "physical case", "energy", "force left x", "force left y", "x", "answer of",
+    )  # fmt: skip
+    assert rows(table)[0]["x"].text == "99 values"
+    assert rows(section(made, "energies").tables[0])[0]["energy"].after == ""
+    assert "point load" not in table.legend
+    assert not any("SI" in text for text in section(made, "physics").prose)
+
+
+def test_one_sign_means_one_thing(measured, page):
+    times = {"fast": (1, 2, 3), "tied": (2, 3, 4), "bad": (1, 2, 3)}
+    records = [
+        measured(s, i, total_seconds=t / 1000,
+                 status=Verdict.INACCURATE if s == "bad" else Verdict.VERIFIED)
+        for s, ts in times.items() for i, t in enumerate(ts)
+    ]  # fmt: skip
+    made = page(records)
+    assert rows(section(made, "times").tables[0])[0]["tied"].symbol == "≈"
+    verdicts = rows(section(made, "verdicts").tables[0])[0]
+    assert verdicts["bad"].symbol not in ("", "≈")
+
+
+@pytest.mark.parametrize(("load", "said"), [(0.51, True), (0.5, False), (None, False)])
+def test_a_busy_machine_is_flagged_in_the_summary(measured, page, load, said):
+    made = page([measured()], environment={"now": {"load": load}})
+    text = " ".join(section(made, "summary").prose)
+    assert ("the machine was not idle" in text) is said
+
+
+def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
+    three = [measured("a", i) for i in range(3)]
+    ten = [measured("b", i) for i in range(10)]
+    declined = [measured("c", status=Verdict.DECLINED)]
+    equal = " ".join(section(page(three + declined), "summary").prose)
+    assert "unequal" not in equal
+    assert "3 to 10" in " ".join(section(page(three + ten), "summary").prose)
+
+
+def test_what_a_solver_declined_is_no_measurement(measured, page):
+    records = [
+        *(measured("a", i) for i in range(3)),
+        measured("shy", status=Verdict.DECLINED, total_seconds=None),
+    ]
+    made = section(page(records, suite={"repeats": 3}), "summary")
+    assert made.prose[0].startswith(
+        "3 measurements of the 6 that the suite has on these cases, 3 not made because "
+        "a solver declined: 2 solvers"
+    )
+    shy = rows(made.tables[0])[1]
+    assert (shy["measurements"].text, shy["declined"].text) == ("0", "1")
+    unfinished = section(page(records[:2], suite={"repeats": 3}), "summary")
+    assert "2 measurements of the 3" in unfinished.prose[0]
+    assert "1 not made yet" in unfinished.prose[0]
+    assert section(page(records[:1]), "summary").prose[0].startswith("1 measurement: ")
+
+
+def test_the_energy_bound_is_explained_only_where_there_is_one(measured, page):
+    without = section(page([measured()]), "errors").prose[0]
+    bounded = section(page([measured(energy_bound=1e-6)]), "errors").prose[0]
+    assert "nergy bound" not in without
+    assert "Energy bound" in bounded
+
+
+def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, page):
+    found = section(page([measured(tol=0.05, dual=0.2, gap=0.05)]), "errors")
+    (row,) = rows(found.tables[0])
+    assert (row["dual"].kind, row["gap"].kind) == ("over", "")
+
+
+@pytest.mark.parametrize("damaged", [False, True])
+def test_the_journal_alone_makes_a_report(measured, tmp_path, damaged):
+    with Journal(tmp_path, "test") as journal:
+        journal.append(measured(fields="0123456789abcdef"))
+    if damaged:
+        (tmp_path / "vectors").mkdir()
+        (tmp_path / "vectors/0123456789abcdef.npz").write_bytes(
+            b"PK\x03\x04 and no more"
+        )
+    write_report(tmp_path, ["html", "md", "tex", "csv"])
+    text = (tmp_path / "report/report.md").read_text("utf-8")
+    (why,) = re.findall(r"^There is no picture of .*$", text, flags=re.MULTILINE)
+    assert "vectors/0123456789abcdef.npz" in why
+    assert not (tmp_path / "report/figures/deformed.png").exists()
+
+
+def test_an_interval_of_a_time_never_collapses():
+    narrow = median_interval([0.1196, 0.1199, 0.1201])
+    assert seconds(narrow) == "119.9 ms [119.6, 120.1]"
+    nearly = median_interval([0.11998, 0.12, 0.12001])
+    assert seconds(nearly) == "120.00 ms [119.98, 120.01]"
+    assert exponent(PowerLaw(1.5, 1.4999, 1.5001, 1, 4)) == "1.5000 [1.4999, 1.5001]"
+
+
+def test_the_text_says_what_an_interval_presumes_and_how_weak_it_is(measured, page):
+    three = section(page([measured("a", i) for i in range(3)]), "times")
+    text = " ".join(three.prose)
+    assert "independent and identically distributed" in text
+    assert "with 3 repeats an interval misses the true median once in 4" in text
+    assert "75 %" in text
+    seven = section(page([measured("a", i) for i in range(7)]), "times")
+    assert "weak" not in " ".join(seven.prose)
+
+
+def test_numbers_are_written_as_one_writes_them():
+    assert [power(v) for v in (1.4, 0.25, 3.2e-9, 14.0)] == (
+        ["1.4", "0.25", "3.2e-9", "1.4e1"]
+    )
+    assert significant(140000.0, 2) == "1.4e5"
+    assert significant(-1.67787364123456e7, 12) == "-16778736.4123"
+
+
+def test_the_last_rows_of_a_table_are_ruled_off_once(measured, page):
+    times, _ = section(page(grown(measured)), "scaling").tables
+    body = latex((times,)).split(r"\midrule")
+    assert len(body) == 3  # heads, sizes, the two exponents
+    assert body[2].count("p against") == 2
+
+
+def test_words_begin_at_the_left_in_every_medium(measured, page):
+    text = markdown(page([measured()], environment={"machine": {"cpu": "x"}}))
+    assert "| key | value |\n| :-- | :-- |" in text
+    words = Table(
+        caption="", columns=("n", "who"), rows=((Cell(), Cell(kind="words")),),
+        text_columns=0,
+    )  # fmt: skip
+    assert [words.wordy(i) for i in range(2)] == [False, True]
+
+
+def test_a_wide_table_says_that_it_scrolls_and_keeps_its_first_column(
+    measured, tmp_path
+):
+    with Journal(tmp_path, "test") as journal:
+        journal.append(measured())
+    write_report(tmp_path, ["html"])
+    text = (tmp_path / "report/index.html").read_text("utf-8")
+    tables = text.count('<div class="scroll"')
+    assert tables > 5
+    hint = '<p class="hint" hidden>more columns: scroll sideways →</p>'
+    assert len(re.findall(rf'{hint}\s*<div class="scroll"', text)) == tables
+    assert re.search(r"\.wide td:first-child \{ position: sticky; left: 0;", text)
