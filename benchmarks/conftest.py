@@ -42,6 +42,6 @@ def pytest_terminal_summary(terminalreporter, config):
         for name, times in seconds.items():
             low, _, high = quantiles(times, n=4) if len(times) > 1 else 3 * times
             terminalreporter.write_line(
-                f"{name:<32} {1e3 * median(times):10.2f} ms"
-                f"   [{1e3 * low:.2f}, {1e3 * high:.2f}]   × {median(times) / first:.2f}"
+                f"{name:<32} {1e3 * median(times):10.2f} ms   "
+                f"[{1e3 * low:.2f}, {1e3 * high:.2f}]   × {median(times) / first:.2f}"
             )

@@ -5,21 +5,12 @@ No two cells are congruent: the mesh is distorted smoothly. Compilation is done 
 
 import numpy as np
 import pytest
-from scipy.sparse import coo_array, csc_array
 from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from problems.elasticity import (
-    GAUSS,
-    Material,
-    cell_dofs,
-    elasticity_matrix,
-    shape_gradients,
-    sparsity,
-    stiffness,
-    strain_matrix,
-)
+from problems.elasticity import Material, elasticity_matrix, sparsity, stiffness
 from problems.mesh import rectangle
+from problems.triplets import stiffness_by_triplets
 
 STEEL = Material(E=200e9, nu=0.3)
 D = elasticity_matrix(STEEL, "strain")
@@ -30,19 +21,6 @@ def distorted_beam(Nr):
     x, y = mesh.points.T
     mesh.points[:, 1] += 0.02 * np.sin(7 * x) * np.cos(5 * y)
     return mesh
-
-
-def by_triplets(mesh):
-    """The straightforward way: all element matrices, then COO to CSC."""
-    corners, Ke = mesh.points[mesh.cells], 0.0
-    for point in GAUSS:
-        gradients, det = shape_gradients(corners, point)
-        B = strain_matrix(gradients)
-        Ke = Ke + np.swapaxes(B, 1, 2) @ (D @ B) * det[:, None, None]
-    dof = cell_dofs(mesh)
-    i, j = np.repeat(dof, 8, axis=1), np.tile(dof, 8)
-    shape = (mesh.dofs, mesh.dofs)
-    return csc_array(coo_array((Ke.ravel(), (i.ravel(), j.ravel())), shape=shape))
 
 
 @pytest.mark.parametrize("Nr", [30, 120])
@@ -58,7 +36,7 @@ def test_assembly(race, Nr):
     medians = race(
         first_time=lambda: stiffness(mesh, D),
         pattern_reused=lambda: stiffness(mesh, D, pattern=pattern),
-        triplets=lambda: by_triplets(mesh),
+        triplets=lambda: stiffness_by_triplets(mesh, D),
         scikit_fem=library,
     )
 

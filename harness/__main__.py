@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from harness import cli
+from harness import QP, Solution, cli
+from harness.environment import capture
+from harness.experiment import save_experiment
 from harness.plugin import Fields
 from harness.supervisor import ONE_THREAD
 from harness.workbench import Workbench
@@ -29,6 +31,7 @@ def main() -> None:
         report=_report,
         plot=_plot,
         vtu=_vtu,
+        paper=_paper,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
@@ -49,6 +52,18 @@ def _vtu(fields: Fields, path: Path) -> None:
     from reports.vtu import write_vtu
 
     write_vtu(fields, path)
+
+
+def _paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
+    from problems.experiments import PAPER, QUICK, paper_experiment
+    from reports.paper import write_paper
+
+    def solve(qp: QP) -> Solution:
+        return SOLVERS["smalbe"].prepare(qp, 1e-8)()
+
+    plan = QUICK if quick else PAPER
+    save_experiment(paper_experiment(plan, solve, capture(), say), out / "data")
+    return write_paper(out)
 
 
 if __name__ == "__main__":

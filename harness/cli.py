@@ -133,6 +133,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.set_defaults(run=commands.report, parser=command)
 
+    command = add("paper", help="every figure of the paper", allow_abbrev=False)
+    command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))
+    command.add_argument(
+        "--quick", action="store_true", help="fewer sizes and repeats: a minute or so"
+    )
+    command.set_defaults(run=commands.paper, parser=command)
+
     command = add("doctor", help="is this machine fit to measure", allow_abbrev=False)
     command.set_defaults(run=commands.doctor, parser=command)
     return parser

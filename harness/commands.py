@@ -193,6 +193,20 @@ def report(workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
+def paper(workbench: Workbench, options: Namespace) -> int:
+    """Measure what the paper's figures and tables show, and write them."""
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise InputError(
+            f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
+        ) from None
+    for file in workbench.paper(options.out, options.quick, _say):
+        if file.suffix == ".html":
+            print(file)
+    return 0
+
+
 def doctor(_workbench: Workbench, _options: Namespace) -> int:
     """Describe this machine and say what to change before measuring."""
     environment = capture()

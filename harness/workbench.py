@@ -26,6 +26,8 @@ class Workbench:
     report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
+    paper: Callable[[Path, bool, Callable[[str], None]], list[Path]]
+    """Measure and write the paper's figures: folder, quick?, progress."""
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)

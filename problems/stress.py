@@ -14,16 +14,13 @@ from numpy.typing import NDArray
 
 from harness import Vector
 from problems.elasticity import (
-    CORNERS,
+    GAUSS,
     Plane,
     cell_dofs,
     shape_gradients,
     strain_matrix,
 )
 from problems.mesh import Mesh
-
-#: 2×2 Gauss points of the reference square [−1, 1]², all of weight 1
-GAUSS = CORNERS / np.sqrt(3)
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

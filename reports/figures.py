@@ -121,9 +121,9 @@ def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
             ]
             if counted:
                 right.plot(*zip(*counted, strict=True), **style)
-        _finish(left, "degrees of freedom $n$", "total time in s")
+        log_log(left, "degrees of freedom $n$", "total time in s")
         _slopes(left)
-        _finish(right, "degrees of freedom $n$", "iterations")
+        log_log(right, "degrees of freedom $n$", "iterations")
         handles, labels = left.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=2)
     return figure
@@ -145,7 +145,7 @@ def _times(axes: Axes, ladder: Ladder, solver: str, *, style: dict[str, Any]) ->
     )  # fmt: skip
 
 
-def _finish(axes: Axes, xlabel: str, ylabel: str) -> None:
+def log_log(axes: Axes, xlabel: str, ylabel: str) -> None:
     """Make both axes logarithmic, with labels that leave each other room."""
     axes.loglog()
     axes.set(xlabel=xlabel, ylabel=ylabel)
@@ -201,7 +201,7 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
             ha="right",
             fontsize=8.5,
         )
-        _finish(axes, "median total time in s", "worst residual / tolerance")
+        log_log(axes, "median total time in s", "worst residual / tolerance")
         names = list(dict.fromkeys(o.solver for o in shown))
         keys = [
             Line2D([], [], **look(evidence.solvers.index(s), line=False)) for s in names

@@ -72,6 +72,7 @@ class Page:
     title: str
     dateline: str
     sections: tuple[Section, ...]
+    footer: str = ""  #: where the numbers are, if not in a result folder
 
 
 def source(outcome: Outcome) -> str:

@@ -132,7 +132,7 @@ def _bodies(axes: Axes, fields: Fields, colours: Normalize | None) -> None:
         )
         if len(fields.cells) <= _MESH_SHOWN:
             lines = LineCollection(
-                list(moved[_edges(cells)]), color="white", linewidth=0.25, alpha=0.35
+                list(moved[edges(cells)]), color="white", linewidth=0.25, alpha=0.35
             )
             lines.set_rasterized(True)
             axes.add_collection(lines)
@@ -140,7 +140,7 @@ def _bodies(axes: Axes, fields: Fields, colours: Normalize | None) -> None:
         axes.plot(*moved[loop].T, color=INK, linewidth=0.7, zorder=3)
 
 
-def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     """Every edge of quadrilaterals once, (k, 2) node numbers."""
     edges: NDArray[np.int64] = np.unique(np.sort(_sides(cells), axis=1), axis=0)
     return edges

@@ -24,6 +24,11 @@ SOLVERS = load_plugin(WELLS).solvers
 FAMILIES = load_plugin(WELLS).problems
 
 
+def paper(out, quick, say):
+    say("Figure 1")
+    return [out / f"index-{quick}.html", out / "figure1.pdf"]
+
+
 @pytest.fixture
 def workbench(tmp_path):
     suites = tmp_path / "suites"
@@ -39,6 +44,7 @@ def workbench(tmp_path):
         report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),
+        paper=paper,
         suites=suites,
         worker=(sys.executable, "-P", str(WELLS)),
     )
@@ -429,6 +435,10 @@ WRONG = {
         ("run", "tiny", "--solver", "exat"),
         "--solver: unknown solver 'ex",
     ),
+    "folder of paper": (
+        ("paper", "--out", "bad.toml"),
+        "--out bad.toml: File exists; expected a folder",
+    ),
     "pattern of run": (
         ("run", "tiny", "--case", "*/duel"),
         "the 2 cases of suite 'tiny'; there are well/primal, well/dual",
@@ -476,6 +486,15 @@ class Nothing:
 well = load_plugin(Path({!r})).problems["well"]
 PROBLEMS = {{"deeper": replace(well, name="deeper"), "nothing": Nothing()}}
 """
+
+
+def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli):
+    assert cli("paper") == (
+        0,
+        "out/paper/index-False.html\n",
+        "mortarbench: Figure 1\n",
+    )
+    assert cli("paper", "--quick", "--out", "a")[1] == "a/index-True.html\n"
 
 
 def test_help_is_no_error(cli, capsys):

@@ -94,6 +94,7 @@ def solve(tmp_path, capsys):
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
+        paper=None,
     )  # fmt: skip
 
     def solve(case, name="a.vtu"):

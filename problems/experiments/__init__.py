@@ -1,0 +1,54 @@
+"""The paper's experiments: what its figures and tables show, measured here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from harness import Reference
+from harness.experiment import Experiment
+from problems.beam_ring import BEAM, LOAD, RING
+from problems.experiments.analysis import scaling, states
+from problems.experiments.parts import Rows, assembly, contact, counts, inverse
+from problems.experiments.plan import PAPER, QUICK, Plan
+
+__all__ = ["PAPER", "QUICK", "Plan", "paper_experiment"]
+
+
+def paper_experiment(
+    plan: Plan,
+    solve: Reference,
+    environment: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> Experiment:
+    """Measure all of it, single-threaded if the caller has seen to that.
+
+    Parameters
+    ----------
+    solve : of the dual QPs; part of what is timed
+    environment : recorded with the measurements
+    say : called with one line before each experiment
+
+    """
+    tables = {"table1": list(counts(plan.scaling[-1], plan.Nh))}
+    experiments: tuple[tuple[str, str, Callable[[], Rows]], ...] = (
+        ("figure3", "Figure 3: assembly", lambda: assembly(plan)),
+        ("figure4", "Figure 4: contact rows", lambda: contact(plan)),
+        ("figure5", "Figure 5: generalised inverse", lambda: inverse(plan)),
+        ("figure6", "Figure 6: the whole analysis", lambda: scaling(plan, solve)),
+    )
+    for name, title, rows in experiments:
+        say(title)
+        tables[name] = list(rows())
+    say("Figures 2 and 7: deformed bodies")
+    return Experiment(
+        setting={
+            "plan": asdict(plan),
+            "load": LOAD,
+            "materials": {"beam": asdict(BEAM), "ring": asdict(RING)},
+            "environment": environment,
+        },
+        tables=tables,
+        states=states(plan, solve),
+    )

@@ -1,0 +1,119 @@
+"""The whole analysis, mesh to displacement, timed part by part (Figure 6, Section 5).
+
+Two ways through the same ten load steps, both with all Dirichlet rows in the dual:
+``per-row``, the paper's, solves with the factor of K for each row of B in each step;
+``condensed`` gets K⁺ on the interface once, and each step costs one small product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+from harness import QP, Fields, Reference, Solution, Status, Vector
+from problems.beam_ring import model
+from problems.bodies import Bodies, floating
+from problems.contact import ContactRows
+from problems.dual import dualise
+from problems.experiments.clock import Laps, Stopwatch, race
+from problems.experiments.parts import Rows
+from problems.experiments.plan import Plan
+from problems.linearise import linearisation
+from problems.results import fields
+from problems.stepping import LoadPath
+
+WAYS = {"per-row": False, "condensed": True}  #: condense?
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """One analysis, done."""
+
+    bodies: Bodies
+    primal: QP  #: of the last step
+    solution: Solution  #: of it
+    dual: QP
+    laps: Laps
+
+
+def analyse(
+    Nr: int, Nh: int, *, solve: Reference, condense: bool, steps: int, radial: int = 0
+) -> Analysis:
+    """Run all load steps; radial = 0 stands for 2·Nh layers of the ring."""
+    watch = Stopwatch()
+    bodies = model.__wrapped__(Nr, Nh, radial or 2 * Nh, "strain")
+    watch.lap("assembly")
+    inverse = floating(bodies, condense=condense)
+    watch.lap("factor")
+    rows_of = linearisation(bodies, "nts", "dual")
+    solved: list[tuple[QP, Solution]] = []
+
+    def linearise(u: Vector) -> ContactRows:
+        watch.lap("recovery")
+        rows = rows_of(u)
+        watch.lap("contact")
+        return rows
+
+    def solve_dual(qp: QP) -> Solution:
+        watch.lap("dualisation")
+        solution = solve(qp)
+        watch.lap("qp")
+        if solution.status is not Status.SOLVED:
+            raise RuntimeError(f"the dual QP was not solved: {solution.message}")
+        solved.append((qp, solution))
+        return solution
+
+    path = LoadPath(
+        bodies, linearise, inverse, solve_dual, steps, transform=dualise
+    )  # fmt: skip
+    path.solution(steps)
+    watch.lap("recovery")
+    laps = dict(watch.laps)
+
+    qp, solution = solved[-1]
+    primal = path.primal(steps)
+    return Analysis(
+        bodies, primal, dualise(primal, inverse).recover(solution), qp, laps
+    )
+
+
+def scaling(plan: Plan, solve: Reference) -> Rows:
+    """Time both ways at each size of the rectangle, Figure 6."""
+    first = plan.scaling[0]
+    for Nr in plan.scaling:
+        run = partial(analyse, Nr, plan.Nh, solve=solve, steps=plan.steps)
+        done = run(condense=True)
+        contestants = {
+            way: partial(_laps, partial(run, condense=condense))
+            for way, condense in WAYS.items()
+        }
+        size = {
+            "Nr": Nr,
+            "Nh": plan.Nh,
+            "n": done.bodies.mesh.dofs,
+            "m_E": done.primal.b.size,
+            "m_I": done.primal.h.size,
+        }
+        # a warm round of the smallest is warm enough for those that take seconds
+        for row in race(contestants, plan.scaling_rounds, warm=Nr == first):
+            yield size | row
+
+
+def _laps(run: partial[Analysis]) -> Laps:
+    return run().laps
+
+
+def states(plan: Plan, solve: Reference) -> dict[str, Fields]:
+    """Solve the problems of Figure 2, with either rule for the ring, and Figure 7."""
+    Nr, Nh = plan.example
+    largest = plan.scaling[-1], plan.Nh, 2 * plan.Nh
+    chosen = {
+        "example-Nh": (Nr, Nh, Nh),
+        "example-2Nh": (Nr, Nh, 2 * Nh),
+        "largest": largest,
+    }
+    done = {
+        name: analyse(Nr, Nh, solve=solve, condense=True, steps=plan.steps, radial=r)
+        for name, (Nr, Nh, r) in chosen.items()
+    }
+    return {name: fields(a.bodies, a.primal, a.solution) for name, a in done.items()}

@@ -1,0 +1,124 @@
+"""Parts of the pipeline timed alone: assembly, contact rows, generalised inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Value
+from problems.beam_ring import BEAM, LENGTH, LOAD, model
+from problems.contact import node_to_segment
+from problems.elasticity import elasticity_matrix, rigid_modes, sparsity, stiffness
+from problems.experiments.clock import Laps, Stopwatch, race, whole
+from problems.experiments.plan import Plan
+from problems.fixing import fixing_nodes, spectral_fixing_nodes
+from problems.inverse import floating_inverse
+from problems.mesh import Mesh, Nodes, rectangle
+from problems.mortar import mortar
+from problems.triplets import stiffness_by_triplets
+
+Rows = Iterator[dict[str, Value]]
+
+
+def beam(Nr: int) -> Mesh:
+    """Mesh the rectangle alone: 8Nr × Nr cells."""
+    return rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr))
+
+
+def counts(Nr: int, Nh: int) -> Rows:
+    """Count the parameters of a problem as Table 1 does, per body."""
+    bodies = model(Nr, Nh, 2 * Nh, "strain")
+    (pair,) = bodies.pairs
+    for b, (name, N, chain) in enumerate(
+        (("rectangle", Nr, pair.master), ("ring", Nh, pair.slave))
+    ):
+        nodes = int((bodies.body_of_node == b).sum())
+        yield {
+            "body": name,
+            "N": N,
+            "nodes": nodes,
+            "elements": int((bodies.body == b).sum()),
+            "dofs": 2 * nodes,
+            "segments": len(chain) - 1,
+        }
+
+
+def assembly(plan: Plan) -> Rows:
+    """Time the stiffness matrix of the rectangle, Figure 3."""
+    D = elasticity_matrix(BEAM, "strain")
+    for Nr in plan.assembly:
+        mesh = beam(Nr)
+        pattern = sparsity(mesh)
+        contestants = {
+            "triplets": whole(partial(stiffness_by_triplets, mesh, D)),
+            "compiled": whole(partial(stiffness, mesh, D)),
+            "compiled-reused": whole(partial(stiffness, mesh, D, pattern=pattern)),
+        }
+        for row in race(contestants, plan.assembly_rounds):
+            yield {"Nr": Nr, "n": mesh.dofs} | row
+
+
+def contact(plan: Plan) -> Rows:
+    """Time one linearisation of the contact at u = 0, Figure 4."""
+    for Nr in plan.contact[0]:
+        for Nh in plan.contact[1]:
+            bodies = model(Nr, Nh, 2, "strain")  # the ring's layers do not matter
+            (pair,) = bodies.pairs
+            points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
+            contestants = {
+                "nts": whole(partial(node_to_segment, points, u, *pair)),
+                "mortar": whole(partial(mortar, points, u, *pair)),
+            }
+            size = {"master": len(pair.master) - 1, "slave": len(pair.slave) - 1}
+            for row in race(contestants, plan.contact_rounds):
+                yield {"Nr": Nr, "Nh": Nh} | size | row
+
+
+def inverse(plan: Plan) -> Rows:
+    """Time building K⁺ of the rectangle and applying it to a vector, Figure 5."""
+    D = elasticity_matrix(BEAM, "strain") * (LENGTH / LOAD)
+    random = np.random.default_rng(2024)
+    for Nr in plan.inverse:
+        mesh = beam(Nr)
+        K, v = stiffness(mesh, D), random.standard_normal(mesh.dofs)
+        contestants: dict[str, Callable[[], Laps]] = {
+            "geometric": partial(_cholesky, mesh, K, v, fixing_nodes),
+            "spectral": partial(_cholesky, mesh, K, v, partial(_spectral, mesh)),
+        }
+        rows = race(contestants, plan.inverse_rounds)
+        if mesh.dofs <= plan.dense:
+            pinv = {"pinv": partial(_pinv, K, v)}
+            # apart, so that its gigabytes do not push the others out of the caches
+            rows += race(pinv, plan.inverse_rounds, warm=False)
+        for row in rows:
+            yield {"Nr": Nr, "n": mesh.dofs} | row
+
+
+def _cholesky(
+    mesh: Mesh, K: Any, v: NDArray[np.float64], fixing: Callable[..., Nodes]
+) -> Laps:
+    watch = Stopwatch()
+    nodes = fixing(mesh.points)
+    inverse = floating_inverse(K, [rigid_modes(mesh.points)], [nodes])
+    watch.lap("build")
+    inverse(v)
+    watch.lap("multiply")
+    return watch.laps
+
+
+def _spectral(mesh: Mesh, points: NDArray[np.float64]) -> Nodes:
+    return spectral_fixing_nodes(mesh.cells, len(points))
+
+
+def _pinv(K: Any, v: NDArray[np.float64]) -> Laps:
+    dense = K.toarray()
+    watch = Stopwatch()
+    P = np.linalg.pinv(dense)  # by singular values, as Matlab's
+    watch.lap("build")
+    P @ v
+    watch.lap("multiply")
+    return watch.laps

@@ -1,0 +1,50 @@
+"""Which sizes and how many repeats: the paper's sweeps, and a shorter look at them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from problems.experiments.clock import Rounds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The parameters of all experiments; the paper leaves most of its sizes unsaid."""
+
+    assembly: tuple[int, ...]  #: Nr of Figure 3
+    assembly_rounds: Rounds
+    contact: tuple[tuple[int, ...], tuple[int, ...]]  #: Nr and Nh of Figure 4
+    contact_rounds: Rounds
+    inverse: tuple[int, ...]  #: Nr of Figure 5
+    inverse_rounds: Rounds
+    dense: int  #: dofs up to which a dense pseudoinverse is computed
+    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last is that of Table 1
+    scaling_rounds: Rounds
+    Nh: int = 15  #: of Figures 6, 7 and Table 1
+    example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
+    steps: int = 10  #: load steps
+
+
+PAPER = Plan(
+    assembly=(2, 4, 6, 10, 15, 20, 25, 30, 40, 50, 60, 80, 100),
+    assembly_rounds=Rounds(most=100, least=10, seconds=15),
+    contact=((5, 10, 20, 30, 60, 120), (5, 10, 15, 30, 60, 120)),
+    contact_rounds=Rounds(most=40),
+    inverse=(2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 15, 20, 25, 30, 40, 60),
+    inverse_rounds=Rounds(most=10, least=6, seconds=30),
+    dense=2000,
+    scaling=(2, 5, 10, 15, 20, 25, 30),
+    scaling_rounds=Rounds(most=10, least=6, seconds=60),
+)
+
+QUICK = Plan(
+    assembly=(3, 6, 10, 15, 20, 30, 40),
+    assembly_rounds=Rounds(most=30, least=6, seconds=1),
+    contact=((10, 20, 30, 60), (5, 10, 15, 30)),
+    contact_rounds=Rounds(most=15, least=6, seconds=0.5),
+    inverse=(2, 3, 4, 5, 6, 8, 10, 15, 20, 30),
+    inverse_rounds=Rounds(most=6, least=6, seconds=1),
+    dense=800,
+    scaling=(5, 15, 30),
+    scaling_rounds=Rounds(most=6, least=3, seconds=9),
+)

@@ -1,0 +1,50 @@
+"""The paper's figures and tables from measured data: no measuring happens here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from harness.experiment import load_experiment
+from reports.figures import save
+from reports.latex import latex
+from reports.page import html
+from reports.paper.page import compose
+from reports.paper.sheets import sheets
+
+
+def write_paper(folder: Path) -> list[Path]:
+    """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex) from data/.
+
+    The same data give the same bytes.
+
+    Raises
+    ------
+    InputError
+        When data/ is missing or damaged.
+
+    """
+    experiment = load_experiment(folder / "data")
+    page = compose(experiment)
+    written = [_write(folder / "index.html", html(page))]
+    figures, tables = folder / "figures", folder / "tables"
+    figures.mkdir(exist_ok=True)
+    for section in page.sections:
+        for picture in section.pictures:
+            written += [
+                save(picture.figure, figures / f"{picture.name}.{ending}")
+                for ending in ("pdf", "svg", "png")
+            ]
+        if section.tables:
+            path = tables / f"{section.name}.tex"
+            written.append(_write(path, latex(section.tables)))
+    written += [
+        _write(tables / f"{name}.csv", frame.to_csv(index=False))
+        for name, frame in sheets(experiment).items()
+    ]
+    return written
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path

@@ -1,0 +1,53 @@
+"""What the paper says, in numbers; its figures carry no tables."""
+
+from __future__ import annotations
+
+PAPER = "Pospíšil, Světlík, Varga, Čermák, CST 2024, doi:10.4203/ccc.9.10.5"
+MACHINE = "AMD Ryzen 5 3600, MATLAB R2020a"
+
+#: Section 5, seconds: Nr = 30, Nh = 15, ten steps
+SECONDS = {
+    "assembly": 0.087,
+    "factor": 0.078,
+    "contact": 2.064,
+    "dualisation": 26.6858,
+    "qp": 1.0739,
+}
+TOTAL = sum(SECONDS.values())
+STEPS = 10
+
+#: Table 1: body → N, nodes, elements, dofs, segments
+TABLE_1 = {
+    "rectangle": (30, 7471, 7200, 14942, 240),
+    "ring": (15, 5611, 5400, 11222, 180),
+}
+TOTALS = (13082, 12600, 26164)  #: nodes, elements, dofs
+DOFS = TOTALS[2]
+ROWS = 186 + 181  #: m_E + m_I there, by our count: the paper does not print them
+SEGMENTS = {"master": 240, "slave": 180}
+FIGURE_2_NODES = 313
+
+ERRATA = (
+    "Figure 2: 313 nodes (n = 626) do not fit the rule of the text, 2·Nh radial layers "
+    "of the ring, which gives 424 nodes (n = 848) for Nr = 4, Nh = 3; Nh layers give "
+    "313. Table 1 follows the rule of the text. Both are drawn here.",
+    "Section 3: “n is lower than m” is the wrong way round; m is much lower than n.",
+    "Equation (4): RᵀBᵀλ = Rᵀb must read RᵀBᵀλ = Rᵀf; R is n × r, not r × n.",
+    "Section 2: m_E is not the number of nodes with non-zero displacement but of "
+    "displacement components held at zero, 2(Nr + 1) + 4(2Nh + 1).",
+    "Plane strain and the unit of the load are not stated. Taken here: plane strain, "
+    "as in the library that the paper uses, and 0.1 GN per metre of thickness.",
+    "“Mortar” is node-to-segment collocation in the paper; both are timed in Figure 4.",
+    "Figure 5: a Cholesky factor with fixing nodes applies a generalised inverse, not "
+    "the Moore-Penrose one of pinv. On the feasible set they give the same dual "
+    "problem, but the two multiplications are by different matrices.",
+    "The text calls Figure 6 “Figure 7”, and Figure 5 “Figure ??”.",
+    "Tolerances, penalty, contact rows and active rows are not stated, nor whether "
+    "the 0.078 s of the Cholesky factor are for both bodies. Here each dual QP is "
+    "solved by SMALBE to 1e-8.",
+    "89 % of the published 29.99 s are dualisation and 3.6 % are the QPs: what the "
+    "paper concludes on QP algorithms rests on the latter.",
+    "Rotations reach 20°, bending stresses several GPa: far outside linear elasticity. "
+    "Stresses at the clamped and loaded corners grow without bound as the mesh is "
+    "refined. The benchmark is a numerical one.",
+)

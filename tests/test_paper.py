@@ -1,0 +1,335 @@
+"""The paper's figures and tables, measured in little and drawn by the real code."""
+
+import csv
+import subprocess
+import sys
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+from harness import InputError
+from harness.experiment import Experiment, load_experiment, save_experiment
+from problems.beam_ring import BEAM
+from problems.elasticity import elasticity_matrix, stiffness
+from problems.experiments import QUICK, paper_experiment
+from problems.experiments.analysis import WAYS, analyse
+from problems.experiments.clock import Rounds, Stopwatch, race, whole
+from problems.inverse import Factorised
+from problems.mesh import half_ring
+from problems.triplets import stiffness_by_triplets
+from reports.paper import write_paper
+from reports.paper.geometry import dimensions
+from reports.paper.page import compose
+from reports.paper.samples import curve, fit, medians
+from reports.paper.stress import extent
+from reports.paper.tables import PARTS
+from solvers.smalbe import SMALBE
+
+FIGURES = [f"figure{i}" for i in range(1, 8)]
+TWICE = Rounds(most=2, least=2)
+LITTLE = replace(
+    QUICK,
+    assembly=(1, 2, 3), assembly_rounds=TWICE,
+    contact=((1, 2), (1, 2)), contact_rounds=TWICE,
+    inverse=(1, 2, 3, 4), inverse_rounds=TWICE, dense=200,
+    scaling=(1, 2), scaling_rounds=TWICE, Nh=2, steps=2,
+)  # fmt: skip
+
+
+def solve(qp):
+    return SMALBE().prepare(qp, 1e-8)()
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    environment = {"machine": {"cpu": "Abacus & Sons <9>"}, "now": {"time": "noon"}}
+    said = []
+    done = paper_experiment(LITTLE, solve, environment, said.append)
+    assert len(said) == 5
+    return done
+
+
+@pytest.fixture(scope="module")
+def folder(experiment, tmp_path_factory):
+    path = tmp_path_factory.mktemp("paper")
+    save_experiment(experiment, path / "data")
+    write_paper(path)
+    return path
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_is_there_in_three_formats_and_not_blank(folder, name):
+    figures = folder / "figures"
+    pixels = image.imread(figures / f"{name}.png")
+
+    assert pixels.shape[1] > 1400
+    assert (pixels[..., :3].min(axis=-1) < 0.9).mean() > 0.01
+    assert (figures / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+    assert len(ElementTree.parse(figures / f"{name}.svg").findall(".//*")) > 30
+
+
+def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
+    page = (folder / "index.html").read_text()
+
+    assert page.count("<svg") == page.count("<b>Figure ") == 7
+    assert page.count("<b>Table ") == 2
+    assert "Abacus &amp; Sons &lt;9&gt;" in page
+    assert "AMD Ryzen 5 3600, MATLAB R2020a" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_same_data_are_drawn_to_the_same_bytes(folder, experiment, tmp_path):
+    """From the files in data/ alone: nothing is measured again."""
+    save_experiment(load_experiment(folder / "data"), tmp_path / "data")
+    again = write_paper(tmp_path)
+
+    assert len(again) == 1 + 7 * 3 + 1 + 6
+    for path in [*again, *(tmp_path / "data").glob("*.csv")]:
+        assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_table_1_counts_as_the_papers_formulas_do(experiment):
+    """(8Nr + 1)(Nr + 1) and (12Nh + 1)(2Nh + 1) nodes, 8Nr² and 24Nh² elements."""
+    beam, ring = experiment.tables["table1"]
+
+    assert list(beam.values()) == ["rectangle", 2, 17 * 3, 32, 102, 16]
+    assert list(ring.values()) == ["ring", 2, 25 * 5, 96, 250, 24]
+
+
+@pytest.mark.parametrize("Nr", [1, 2])
+def test_the_dual_has_the_sizes_of_the_papers_formulas(experiment, Nr):
+    """m_E = 2(Nr + 1) + 4(2Nh + 1) components held, m_I = 12Nh + 1 nodes of the arc."""
+    sizes = {
+        (r["n"], r["m_E"], r["m_I"])
+        for r in experiment.tables["figure6"] if r["Nr"] == Nr
+    }  # fmt: skip
+
+    largest = len(experiment.states["largest"].points)
+    assert largest == 17 * 3 + 25 * 5
+    assert sizes == {(2 * (8 * Nr + 1) * (Nr + 1) + 250, 2 * (Nr + 1) + 20, 25)}
+
+
+def test_figure_2_is_drawn_with_both_rules_for_the_ring(experiment, folder):
+    """Erratum: 313 nodes need Nh layers; the rule of the text, 2·Nh, has 424."""
+    nodes = [
+        len(experiment.states[s].points) for s in ("example-Nh", "example-2Nh")
+    ]  # fmt: skip
+
+    assert nodes == [313, 424]
+    assert "313 nodes" in (folder / "index.html").read_text()
+
+
+def test_figure_1_reads_the_papers_dimensions_off_the_mesh(experiment):
+    d = dimensions(experiment.states["example-2Nh"])
+
+    assert (d.l, d.h, d.a) == pytest.approx((2, 0.25, 0.5))
+    assert (*d.centre, d.r1, d.r2) == pytest.approx((1, 0, 0.3, 0.49))
+
+
+def test_both_ways_through_the_load_steps_end_in_the_same_displacement():
+    one, other = (
+        analyse(
+            2, 2, solve=lambda qp: SMALBE().prepare(qp, 1e-11)(), condense=c, steps=3
+        )
+        for c in WAYS.values()
+    )
+
+    assert one.solution.x == pytest.approx(other.solution.x, abs=1e-9)
+    assert set(one.laps) == set(other.laps) == {
+        "assembly", "factor", "contact", "dualisation", "qp", "recovery",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("way", "solves"), [("per-row", 3), ("condensed", 0)])
+def test_only_the_papers_way_solves_for_all_rows_in_each_step(way, solves, monkeypatch):
+    calls, congruence = [], Factorised.congruence
+    monkeypatch.setattr(
+        Factorised, "congruence", lambda s, B: calls.append(B) or congruence(s, B)
+    )
+    done = analyse(1, 1, solve=solve, condense=WAYS[way], steps=3)
+
+    assert len(calls) == (solves + 1 if solves else 0)  # one more to recover u
+    assert all(B.shape[0] == done.dual.q.size for B in calls)
+
+
+def test_an_analysis_solves_the_problem_of_its_last_step():
+    """Its solution satisfies the primal's stationarity and its contact rows."""
+    a = analyse(2, 2, solve=solve, condense=True, steps=2)
+    qp, s = a.primal, a.solution
+    residual = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z
+
+    assert abs(residual).max() < 1e-6
+    assert (qp.G @ s.x - qp.h).max() < 1e-6
+    assert s.z.min() >= 0
+    assert s.z.max() > 0.1
+
+
+def test_an_unsolved_qp_is_not_timed_in_silence():
+    def lost(qp):
+        return SMALBE(max_steps=1).prepare(qp, 1e-8)()
+
+    with pytest.raises(RuntimeError, match="not solved"):
+        analyse(1, 1, solve=lost, condense=True, steps=1)
+
+
+def test_what_was_not_measured_says_so(folder):
+    """Beyond the largest dense size: c·n³ to build, c·n² to multiply, marked fitted."""
+    rows = [r for r in rows_of(folder / "tables" / "figure5.csv")
+            if r["method"] == "pinv"]  # fmt: skip
+    kinds = {(r["part"], int(r["n"])): r["kind"] for r in rows}
+
+    assert kinds == {
+        (part, n): "measured" if n <= 200 else "fitted"
+        for part in ("build", "multiply") for n in (36, 102, 200, 330)
+    }  # fmt: skip
+    assert all(float(r["low"]) <= float(r["median"]) <= float(r["high"]) for r in rows)
+
+
+def cubes(*sizes, factor=lambda n: 2e-9):
+    return [
+        {"n": n, "repeat": k, "seconds": factor(n) * n**3 * (1 + 0.1 * k)}
+        for n in sizes for k in range(3)
+    ]  # fmt: skip
+
+
+def test_a_fit_of_cubes_returns_their_factor():
+    law = fit(curve(cubes(10, 20, 40, 80), "n"), 3)
+
+    assert (law.c, law.low, law.high) == pytest.approx((2.2e-9,) * 3)
+    assert (law.since, law.until) == (40, 80)
+
+
+def test_the_band_of_a_fit_holds_the_factors_of_the_sizes_it_rests_on():
+    law = fit(curve(cubes(10, 20, 40, 80, factor=lambda n: n * 1e-9), "n"), 3)
+
+    assert (law.low, law.high) == pytest.approx((44e-9, 88e-9))
+    assert law.c == pytest.approx(np.sqrt(44 * 88) * 1e-9)  # geometric mean
+
+
+def test_parts_are_summed_within_each_repeat_before_the_median_is_taken():
+    """Repeats take 1 + 9, 2 + 2 and 3 + 3: the median of sums is 6, not 2 + 3."""
+    seconds = {"a": (1, 2, 3), "b": (9, 2, 3)}
+    rows = [
+        {"n": 5, "part": part, "repeat": k, "seconds": s}
+        for part, values in seconds.items() for k, s in enumerate(values)
+    ]  # fmt: skip
+
+    assert medians(rows, ["n"])[(5,)][:3] == (6, 4, 10)
+    (point,) = curve(rows, "n", part=("a",))
+    assert (point.x, point.time.value) == (5, 2)
+
+
+def test_published_times_are_compared_at_the_published_size_only(experiment):
+    """A ratio of a smaller problem's time to the paper's would mislead."""
+
+    def ratios(experiment):
+        final = next(s for s in compose(experiment).sections if s.name == "results")
+        return [row[-1].text for row in final.tables[1].rows]
+
+    assert set(ratios(experiment)) == {"–"}
+    grown = [
+        dict(r, Nr=30, Nh=15) if r["Nr"] == 2 else r
+        for r in experiment.tables["figure6"]
+    ]  # fmt: skip
+    tables = {**experiment.tables, "figure6": grown}
+    compared = ratios(replace(experiment, tables=tables))
+    ours = [r for r in grown if r["Nr"] == 30]
+    total, set_up = (
+        curve(ours, "n", method="condensed", part=parts)[0].time.value
+        for parts in (PARTS, ("factor", "dualisation"))
+    )
+    assert float(compared[-1].split()[0]) == pytest.approx(29.99 / total, rel=0.01)
+    assert float(compared[4].split()[0]) == pytest.approx(26.764 / set_up, rel=0.01)
+    assert compared[6] == "–"  # the paper says nothing of recovery
+
+
+def test_colours_end_at_the_quantile_of_the_size(experiment):
+    fields = experiment.states["largest"]
+    values = np.zeros(len(fields.points))
+    values[:2] = -7e9, 3e9
+    ends = extent(replace(fields, nodal={"sxx": values}), "sxx")
+
+    assert ends.largest == 7e9
+    assert ends.clipped < 7e9
+
+
+def test_triplets_give_the_same_matrix_as_the_compiled_loops():
+    mesh = half_ring((1, 0), (0.3, 0.49), (6, 3))
+    D = elasticity_matrix(BEAM, "stress")
+    K = stiffness(mesh, D)
+
+    assert abs(K - stiffness_by_triplets(mesh, D)).max() <= 1e-13 * abs(K).max()
+
+
+def test_contestants_take_turns_and_every_lap_is_a_row():
+    calls = []
+    entrants = {name: whole(lambda name=name: calls.append(name)) for name in "ab"}
+    rows = race(entrants, Rounds(most=3))
+
+    assert calls == list("abababab")  # the first two warm up
+    assert [(r["method"], r["repeat"]) for r in rows] == [
+        (name, k) for k in range(3) for name in "ab"
+    ]
+    assert all(r["seconds"] >= 0 and r["part"] == "all" for r in rows)
+
+
+def test_rounds_end_when_time_is_spent_but_not_before_the_least():
+    calls = []
+    race({"a": whole(lambda: calls.append(1))}, Rounds(most=9, least=4, seconds=-1),
+         warm=False)  # fmt: skip
+
+    assert len(calls) == 4
+
+
+def test_a_stopwatch_sums_the_laps_of_a_part(monkeypatch):
+    times = iter([0.0, 1.0, 3.0, 6.0])
+    monkeypatch.setattr("problems.experiments.clock.perf_counter", lambda: next(times))
+    watch = Stopwatch()
+    for part in "aba":
+        watch.lap(part)
+
+    assert watch.laps == {"a": 4.0, "b": 2.0}
+
+
+def test_an_experiment_survives_its_files_to_the_last_digit(tmp_path):
+    rows = [{"n": 3, "method": "a, \"b\"", "seconds": 0.1 + 0.2},
+            {"n": 4, "method": "c", "seconds": 1e-17}]  # fmt: skip
+    given = Experiment(setting={"λ": [1, None]}, tables={"t": rows}, states={})
+    save_experiment(given, tmp_path / "d")
+    got = load_experiment(tmp_path / "d")
+
+    assert got.tables == {"t": rows}
+    assert got.setting == given.setting
+
+
+@pytest.mark.parametrize(
+    ("file", "text"), [("setting.json", "{"), ("setting.json", "[]"), ("t.csv", None)]
+)
+def test_damaged_data_are_named(tmp_path, file, text):
+    given = Experiment(setting={}, tables={"t": [{"n": 1}]}, states={})
+    save_experiment(given, tmp_path)
+    path = tmp_path / file
+    path.write_text(text) if text is not None else path.unlink()
+
+    with pytest.raises(InputError, match=file):
+        load_experiment(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_command_writes_it_all_within_a_minute_or_so(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", "paper", "--quick", "--out", tmp_path],
+        capture_output=True, text=True, timeout=300, check=True,
+    )  # fmt: skip
+
+    assert done.stdout == f"{tmp_path / 'index.html'}\n"
+    (beam, ring) = rows_of(tmp_path / "data" / "table1.csv")
+    assert (beam["dofs"], ring["dofs"]) == ("14942", "11222")

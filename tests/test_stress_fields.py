@@ -1,0 +1,75 @@
+"""The stress fields that pictures and files get: exact where the strain is constant."""
+
+import numpy as np
+import pytest
+
+from harness import Solution, Status
+from problems.beam_ring import model
+from problems.contact import node_to_segment
+from problems.elasticity import elasticity_matrix
+from problems.results import fields, nodal_stresses
+from problems.stepping import primal_qp
+
+STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
+
+
+def stretched(bodies):
+    """u = (ε_x x + γ y, ε_y y): linear, so the strain is the same everywhere."""
+    x, y = bodies.mesh.points.T
+    return np.column_stack([STRAIN[0] * x + STRAIN[2] * y, STRAIN[1] * y]).ravel()
+
+
+@pytest.mark.parametrize("plane", ["strain", "stress"])
+def test_each_body_has_the_stress_of_its_own_material_up_to_its_boundary(plane):
+    """An average across the bodies would mix 200 and 20 GPa where they touch."""
+    bodies = model(2, 2, 4, plane)
+    nodal = nodal_stresses(bodies, stretched(bodies))
+
+    for b, material in enumerate(bodies.materials):
+        expected = elasticity_matrix(material, plane) @ STRAIN
+        mine = bodies.body_of_node == b
+        for name, value in zip(("sxx", "syy", "sxy"), expected, strict=True):
+            assert nodal[name][mine] == pytest.approx(value, rel=1e-9)
+
+
+def test_plane_strain_has_a_stress_across_the_plane_and_plane_stress_none():
+    """σ_z keeps ε_z = (σ_z − ν(σ_x + σ_y))/E at zero."""
+    strain, stress = (
+        nodal_stresses(b, stretched(b)) for b in (model(2, 2, 4, p) for p in PLANES)
+    )
+
+    assert strain["szz"] == pytest.approx(0.3 * (strain["sxx"] + strain["syy"]))
+    assert "szz" not in stress
+
+
+PLANES = ("strain", "stress")
+
+
+@pytest.mark.parametrize("plane", PLANES)
+def test_von_mises_is_the_deviators_norm(plane):
+    """σ_vM² = 3/2 s:s with the deviator s of the full stress tensor."""
+    bodies = model(2, 2, 4, plane)
+    u = np.random.default_rng(11).standard_normal(bodies.mesh.dofs) * 1e-3
+    s = nodal_stresses(bodies, u)
+    z = s.get("szz", np.zeros_like(s["sxx"]))
+    mean = (s["sxx"] + s["syy"] + z) / 3
+    squares = sum((part - mean) ** 2 for part in (s["sxx"], s["syy"], z))
+
+    assert s["von_mises"] ** 2 == pytest.approx(1.5 * (squares + 2 * s["sxy"] ** 2))
+
+
+def test_fields_carry_the_stresses_of_the_dimensional_displacement():
+    bodies = model(2, 2, 4, "strain")
+    u = stretched(bodies)
+    rows = node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
+    primal = primal_qp(bodies, rows)
+    s = Solution(
+        status=Status.SOLVED, x=u / bodies.length, y=0 * primal.b, z=0 * primal.h,
+        z_box=0 * u,
+    )  # fmt: skip
+
+    nodal = fields(bodies, primal, s).nodal
+    expected = nodal_stresses(bodies, u)
+    assert list(nodal) == ["sxx", "syy", "sxy", "szz", "von_mises"]
+    for name, values in nodal.items():
+        assert values == pytest.approx(expected[name], rel=1e-12)
