@@ -31,6 +31,7 @@ def main() -> None:
         report=_report,
         plot=_plot,
         vtu=_vtu,
+        series=_series,
         paper=_paper,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
@@ -46,6 +47,12 @@ def _plot(fields: Fields, path: Path) -> None:
     from reports.mechanics import draw_deformed
 
     draw_deformed(fields, path)
+
+
+def _series(states: Sequence[tuple[float, Fields]], path: Path) -> None:
+    from reports.vtu import write_series
+
+    write_series(states, path)
 
 
 def _vtu(fields: Fields, path: Path) -> None:

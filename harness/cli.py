@@ -114,7 +114,10 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
     )
     command.add_argument(
-        "--vtu", metavar="FILE.vtu", type=Path, help="the same for ParaView"
+        "--vtu",
+        metavar="FILE.vtu",
+        type=Path,
+        help="the same for ParaView; FILE.pvd: all load steps up to this one",
     )
     _add_plugin(command)
     _add_json(command)

@@ -7,6 +7,7 @@ import sys
 from argparse import Namespace
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from harness.journal import read_journal
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
 from harness.names import CaseName, canonical, completed, parse
-from harness.plugin import Case
+from harness.plugin import Case, Fields
 from harness.progress import shown_on
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict
@@ -117,7 +118,7 @@ def solve(workbench: Workbench, options: Namespace) -> int:
     if options.plot is not None:
         _check_writable(options.plot, (".png",))
     if options.vtu is not None:
-        _check_writable(options.vtu, (".vtu",))
+        _check_writable(options.vtu, (".vtu", ".pvd"))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
     spec = SolverSpec(name=options.solver, label=options.solver)
@@ -132,31 +133,48 @@ def solve(workbench: Workbench, options: Namespace) -> int:
         repeat=0,
         environment=digest(capture(options.plugin)),
     )
-    pictures = {
-        option: (draw, path)
-        for option, draw, path in (
-            ("--plot", workbench.plot, options.plot),
-            ("--vtu", workbench.vtu, options.vtu),
-        )
-        if path is not None
-    }
-    if pictures and case.fields is None:
-        raise InputError(
-            f"{record.case} has no bodies to draw; leave out {', '.join(pictures)}"
-        )
+    drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
+    if drawn and case.fields is None:
+        wanted = ", ".join(f"--{o}" for o in drawn)
+        raise InputError(f"{record.case} has no bodies to draw; leave out {wanted}")
 
+    command = workbench.worker_command(spec, options.plugin)
     with redirect_stdout(sys.stderr):  # whatever the family prints
-        command = workbench.worker_command(spec, options.plugin)
         record, solution = measured_once(command, case, record)
     _show(record, options.json)
-    if pictures and case.fields is not None:
+    if drawn and case.fields is not None:
         if solution is not None and has_point(solution):
-            fields = case.fields(solution)
-            for draw, path in pictures.values():
-                draw(fields, path)
+            _draw(workbench, options, name, case.fields(solution))
         else:
             _say(f"no picture: {record.solver} returned no point")
     return 0 if record.status is Verdict.VERIFIED else 1
+
+
+def _draw(
+    workbench: Workbench, options: Namespace, name: CaseName, fields: Fields
+) -> None:
+    """Write the pictures that were asked for; for .pvd solve the steps before too."""
+    if options.plot is not None:
+        workbench.plot(fields, options.plot)
+    if options.vtu is None:
+        return
+    if options.vtu.suffix == ".vtu":
+        workbench.vtu(fields, options.vtu)
+        return
+    states, last = [], int(name.params.get("step", 1))
+    spec = SolverSpec(name=options.solver, label=options.solver)
+    command = workbench.worker_command(spec, options.plugin)
+    for step in range(1, last):
+        earlier = replace(name, params={**name.params, "step": step})
+        case = _built(workbench, earlier)
+        record = blank(
+            earlier, "", spec, options={}, tol=options.tol, repeat=0, environment=""
+        )
+        _, solution = measured_once(command, case, record)
+        if solution is None or not has_point(solution) or case.fields is None:
+            raise InputError(f"{options.vtu}: no point at step {step}; write a .vtu")
+        states.append((float(step), case.fields(solution)))
+    workbench.series([*states, (float(last), fields)], options.vtu)
 
 
 def export(workbench: Workbench, options: Namespace) -> int:

@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 
 PACKAGES = (
     "mortarbench", "numpy", "scipy", "scikit-sparse", "qpsolvers", "osqp", "clarabel",
-    "proxsuite", "cvxpy", "pandas",
+    "proxsuite", "cvxpy", "pandas", "numba",
 )  # fmt: skip
 
 THREAD_VARIABLES = (

@@ -26,6 +26,7 @@ class Workbench:
     report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
+    series: Callable[[Sequence[tuple[float, Fields]], Path], object]  #: of load steps
     paper: Callable[[Path, bool, Callable[[str], None]], list[Path]]
     """Measure and write the paper's figures: folder, quick?, progress."""
     suites: Path = SUITES

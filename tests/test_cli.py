@@ -44,6 +44,7 @@ def workbench(tmp_path):
         report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),
+        series=lambda states, path: path.write_bytes(b"series"),
         paper=paper,
         suites=suites,
         worker=(sys.executable, "-P", str(WELLS)),

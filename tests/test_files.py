@@ -358,7 +358,7 @@ def command(capsys):
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda out, formats: [], plot=lambda fields, path: None,
-        vtu=lambda fields, path: None, paper=None,
+        vtu=lambda fields, path: None, series=None, paper=None,
     )  # fmt: skip
 
     def run(*arguments):

@@ -94,6 +94,7 @@ def solve(tmp_path, capsys):
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
+        series=write_series,
         paper=None,
     )  # fmt: skip
 
@@ -120,7 +121,7 @@ def test_solve_refuses_what_it_cannot_write(solve, planted, tmp_path):
     assert err.endswith("has no bodies to draw; leave out --vtu\n")
     code, err, _ = solve("beam-ring/dual", "a.vtk")
     assert code == 2
-    assert err.endswith("a.vtk: unknown format '.vtk'; expected .vtu\n")
+    assert err.endswith("a.vtk: unknown format '.vtk'; expected .vtu or .pvd\n")
 
 
 def test_a_series_names_its_files_and_times_next_to_it(tmp_path):
@@ -140,3 +141,16 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
         write_vtu(FIELDS, tmp_path / "no" / "a.vtu")
     with pytest.raises(InputError, match=r"a\.pvd: cannot be written"):
         write_series([], tmp_path / "no" / "a.pvd")
+
+
+def test_a_series_holds_every_load_step_up_to_the_one_asked_for(solve, tmp_path):
+    code, _, path = solve("beam-ring/Nr=2/Nh=2/steps=4/step=3/dual-bounds", "a.pvd")
+    series = ElementTree.parse(path).getroot().findall("Collection/DataSet")
+    tips = [
+        meshio.read(tmp_path / entry.get("file")).point_data["displacement"][:, 1].min()
+        for entry in series
+    ]
+
+    assert code == 0
+    assert [float(entry.get("timestep")) for entry in series] == [1, 2, 3]
+    assert tips[0] > tips[1] > tips[2]  # ever lower

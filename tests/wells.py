@@ -137,6 +137,6 @@ SOLVERS = {
 PROBLEMS = {"well": Well()}
 
 if __name__ == "__main__":
-    nothing = dict.fromkeys(("reference", "report", "plot", "vtu", "paper"))
+    nothing = dict.fromkeys(("reference", "report", "plot", "vtu", "series", "paper"))
     workbench = Workbench(families=PROBLEMS, solvers=SOLVERS, **nothing)
     sys.exit(worker(workbench, sys.argv[1:]))
