@@ -10,10 +10,18 @@ from time import perf_counter
 import pytest
 
 RACES = pytest.StashKey[list]()
+NOTES = pytest.StashKey[list]()
 
 
 def pytest_configure(config):
     config.stash[RACES] = []
+    config.stash[NOTES] = []
+
+
+@pytest.fixture
+def note(request):
+    """``note(text)``: a line for the summary."""
+    return request.config.stash[NOTES].append
 
 
 @pytest.fixture
@@ -36,6 +44,8 @@ def race(request):
 
 
 def pytest_terminal_summary(terminalreporter, config):
+    for line in config.stash[NOTES]:
+        terminalreporter.write_line(line)
     for title, rounds, seconds in config.stash[RACES]:
         terminalreporter.section(f"{title}: medians of {rounds} interleaved rounds")
         first = median(next(iter(seconds.values())))

@@ -56,11 +56,11 @@ def analysis(form, Nr=30, Nh=15, steps=10):
 
 
 @pytest.mark.parametrize("form", WAYS)
-def test_table_1(race, form):
+def test_table_1(race, note, form):
     race(**{form: lambda: analysis(form)}, rounds=7)
 
     bodies, u, spent = analysis(form)
     for part, seconds in spent.items():
-        print(f"{part:<26} {1e3 * seconds:8.1f} ms")
+        note(f"{form}: {part:<26} {1e3 * seconds:8.1f} ms (one run)")
     corner = len(bodies.mesh.points[bodies.body_of_node == 0]) - 1
     assert u[2 * corner : 2 * corner + 2] == pytest.approx(TIP, abs=1e-6)

@@ -1,5 +1,7 @@
 """Contact linearisation at the paper's size, and what the search costs per segment."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -36,15 +38,22 @@ def test_search(benchmark, segments):
     assert len(found.segment) == segments
 
 
-@pytest.mark.parametrize("segments", [100, 1000, 10_000])
 @pytest.mark.parametrize("method", [node_to_segment, mortar])
-def test_linearisation_of_many_segments(benchmark, method, segments):
-    theta = np.pi * np.arange(segments + 1) / segments
-    ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
-    x = 2 * np.arange(segments + 1) / segments
-    points = np.concatenate([ring, np.column_stack([x, 0.5 - 0.025 * x**2])])
-    slave, master = np.arange(2 * segments + 2).reshape(2, -1)
+def test_cost_per_segment(race, note, method):
+    """Exponents of cost against segments, between successive decades."""
 
-    rows = benchmark(method, points, np.zeros(points.size), slave, master)
+    def sides(segments):
+        theta = np.pi * np.arange(segments + 1) / segments
+        ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
+        x = 2 * np.arange(segments + 1) / segments
+        points = np.concatenate([ring, np.column_stack([x, 0.5 - 0.025 * x**2])])
+        slave, master = np.arange(2 * segments + 2).reshape(2, -1)
+        return points, np.zeros(points.size), slave, master
 
-    assert rows.B.shape[1] == points.size
+    sizes = (100, 1000, 10_000)
+    inputs = {f"{n} segments": sides(n) for n in sizes}
+    medians = race(**{k: partial(method, *v) for k, v in inputs.items()})
+
+    exponents = np.diff(np.log10(list(medians.values())))
+    note(f"{method.__name__}: exponents {exponents[0]:.2f}, {exponents[1]:.2f}")
+    assert len(exponents) == 2
