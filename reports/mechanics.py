@@ -61,6 +61,8 @@ def deformed_figure(fields: Fields) -> Figure:
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError("displacement or stress holds NaN or inf: there is no picture")
+    if not np.ptp(fields.points, axis=0).all():
+        raise InputError("bodies of no width or no height: there is no picture")
     forces = fields.contact_forces
     loaded = forces is not None and bool(np.any(forces))
     with rc_context(STYLE):

@@ -171,3 +171,10 @@ def test_a_state_without_numbers_is_not_drawn(bodies, tmp_path):
     with pytest.raises(InputError, match="NaN"):
         draw_deformed(broken, tmp_path / "a.png")
     assert not (tmp_path / "a.png").exists()
+
+
+def test_bodies_without_extent_are_not_drawn(bodies, tmp_path):
+    flat = Fields(**{**vars(bodies), "points": 0 * bodies.points})
+
+    with pytest.raises(InputError, match="no width or no height"):
+        draw_deformed(flat, tmp_path / "a.png")
