@@ -100,16 +100,16 @@ def _scales(
 
     Where the solution is zero (λ = 0 without contact), X and E would be rounding
     errors. They are at least a hundredth of the median of |qᵢ|/Pᵢᵢ and of qᵢ²/Pᵢᵢ, the
-    minimisers and minima of single variables.
+    minimisers and minima of single variables. (An operator P has no Pᵢᵢ: no floors.)
     """
     S = max(map(_sup, gradients), key=_nan_first)
-    diagonal = np.asarray(qp.P.diagonal()) if qp.is_explicit else np.ones(x.size)
+    diagonal = np.asarray(qp.P.diagonal()) if qp.is_explicit else np.zeros(x.size)
     alone = (diagonal > 0) & (qp.q != 0)
     d, q = diagonal[alone], np.abs(qp.q[alone])
     floor_x = 0.01 * float(np.median(q / d)) if d.size else 0.0
     floor_E = 0.01 * float(np.median(q**2 / d)) if d.size else 0.0
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    felt = diagonal * np.abs(x) > 1e-12 * S
+    felt = diagonal * np.abs(x) > 1e-12 * S if qp.is_explicit else np.full(x.size, True)
     X = _largest(
         floor_x,
         _sup(x[felt]),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse.linalg import aslinearoperator
 
 from harness import (
     QP,
@@ -223,3 +224,18 @@ def test_the_verdict_follows_from_the_residuals_at_tol_1e_8(claimed, worst, expe
 def test_a_loose_tolerance_does_not_verify_a_refutation():
     assert verdict(Status.SOLVED, Residuals(0, 1.0, 0, 0), 0.5) is Verdict.WRONG
     assert verdict(Status.SOLVED, Residuals(0, 0.05, 0, 0), 0.5) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
+def test_an_operator_is_judged_alike_in_all_units(planted, unit):
+    qp, s = planted("everything", seed=314159, dense=True)
+    moved = replace(s, x=s.x + 1e-3)
+    scaled = replace(
+        qp, P=aslinearoperator(qp.P * unit**2), q=qp.q * unit, A=qp.A * unit,
+        G=qp.G * unit, lb=qp.lb / unit, ub=qp.ub / unit,
+    )  # fmt: skip
+    same = replace(moved, x=moved.x / unit, z_box=moved.z_box * unit)
+
+    assert kkt_residuals(scaled, same) == pytest.approx(
+        kkt_residuals(qp, moved), rel=1e-9
+    )
