@@ -68,12 +68,13 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
     rows = [header]
     present = {r.solver for r in latest}
     for solver in dict.fromkeys([*solvers, *sorted(present)]):
-        own = [r for r in latest if r.solver == solver]
+        every = [r for r in latest if r.solver == solver]
+        declined = [r for r in every if r.status is Verdict.DECLINED]
+        own = [r for r in every if r.status is not Verdict.DECLINED]
         claimed = [r for r in own if r.claimed == Status.SOLVED]
         verified = [r for r in own if r.status is Verdict.VERIFIED]
-        declined = [r for r in own if r.status is Verdict.DECLINED]
         refuted = [r for r in claimed if r.status is not Verdict.VERIFIED]
-        other = len(own) - len(verified) - len(declined) - len(refuted)
+        other = len(own) - len(verified) - len(refuted)
         counts = map(len, (own, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
     return aligned(rows, right=range(1, len(header)))

@@ -28,7 +28,8 @@
     slave = "arc"              # its nodes must not enter the master
     master = "bottom"
 
-Plane, contact, basis, steps and relin may be left out for the values above. So may
+Plane, contact, basis, steps and relin may be left out for the values above; bodies that
+contact alone holds need ``steps = 1`` and have no form dual-bounds. So may
 units, for the larger side of the box around the mesh and the sum of |load| over nodes.
 """
 

@@ -65,7 +65,12 @@ _METADATA: dict[str, dict[str, Any]] = {
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure in the format of the file's ending, the same bytes every time."""
     with rc_context(STYLE):
-        figure.savefig(path, facecolor=PAPER, metadata=_METADATA.get(path.suffix, {}))
+        figure.savefig(
+            path,
+            bbox_inches="tight",
+            facecolor=PAPER,
+            metadata=_METADATA.get(path.suffix, {}),
+        )
     return path
 
 

@@ -110,9 +110,15 @@ def _box(fields: Fields) -> tuple[Vector, Vector]:
 
 
 def _colours(fields: Fields) -> Normalize | None:
-    """One scale in GPa, shared by all bodies."""
+    """One scale in Pa, shared by all bodies."""
     limits = clipped_at(fields)
-    return None if limits is None else Normalize(0, (limits[0] or 1.0) / 1e9)
+    return None if limits is None else Normalize(0, limits[0] or 1.0)
+
+
+def _prefixed(value: float) -> tuple[float, str]:
+    """Choose the unit prefix in which `value` is between 1 and 1000."""
+    known = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+    return next((p for p in known if value >= p[0]), (1.0, ""))
 
 
 def _bodies(axes: Axes, fields: Fields, colours: Normalize | None) -> None:
@@ -122,11 +128,11 @@ def _bodies(axes: Axes, fields: Fields, colours: Normalize | None) -> None:
         cells = fields.cells[fields.bodies == body]
         triangles = np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
         mesh = Triangulation(moved[:, 0], moved[:, 1], triangles)
-        stress = np.full(len(moved), 0.3e9)
+        stress = np.full(len(moved), 0.3)
         plain = Normalize(0, 1)
         axes.tripcolor(
             mesh,
-            (stress if colours is None else fields.nodal["von_mises"]) / 1e9,
+            stress if colours is None else fields.nodal["von_mises"],
             cmap="Greys" if colours is None else _MAP,
             norm=plain if colours is None else colours,
             shading="gouraud",
@@ -195,12 +201,15 @@ def _enlarge(axes: Axes, overview: Axes, fields: Fields) -> None:
         color=_ARROW, zorder=5,
     )  # fmt: skip
     arrows.set_path_effects(_CASING)
+    factor, prefix = _prefixed(float(size.max()))
     axes.set_title(
         "(b) contact forces on the slave nodes; the largest is "
-        f"{size.max() / 1e6:.3g} MN/m",
+        f"{size.max() / factor:.3g} {prefix}N/m",
         loc="left",
     )
-    frame = Rectangle((low[0], low[1]), *(2 * half), fill=False, ec=_ARROW, lw=0.8)
+    corner = np.array([overview.get_xlim(), overview.get_ylim()]).T
+    low, high = np.maximum(low, corner[0]), np.minimum(high, corner[1])
+    frame = Rectangle((low[0], low[1]), *(high - low), fill=False, ec=_ARROW, lw=0.8)
     frame.set(zorder=4, path_effects=_CASING)
     overview.add_patch(frame)
     overview.annotate(
@@ -227,5 +236,7 @@ def _bar(
         pad=0.015,
         fraction=0.04,
     )
-    bar.set_label("von Mises stress in GPa")
+    factor, prefix = _prefixed(limits[0])
+    bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value / factor:.4g}")
+    bar.set_label(f"von Mises stress in {prefix}Pa")
     bar.outline.set_linewidth(0.5)
