@@ -116,8 +116,8 @@ def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
     assert len(limits) == 1
     low, high = limits.pop()
     assert low == 0
-        assert 1e9 < high <= 4e9  # Pa, though the singularity has 1000 GPa
-    assert meshes[0].get_array().max() == 1000  # GPa: clipped in colour, not in value
+    assert 1e9 < high <= 4e9  # Pa, though the singularity has 1000 GPa
+    assert meshes[0].get_array().max() == 1000e9  # clipped in colour, not in value
 
 
 def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
