@@ -18,6 +18,7 @@ from scipy.sparse import csc_array, issparse
 
 from harness.errors import InputError
 from harness.qp import QP, Matrix, Vector
+from harness.qpfile import explicit_matrices
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -34,9 +35,7 @@ def save_mat(
         When the file cannot be written.
 
     """
-    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
-    matrices = {"P": P, "G": qp.G, "A": qp.A}
-    dense = [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
+    matrices, dense = explicit_matrices(qp)
     arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
     arrays |= {name: getattr(qp, name) for name in _VECTORS}
     arrays |= {name: csc_array(M) for name, M in matrices.items()}

@@ -30,6 +30,13 @@ _MATRICES = ("P", "G", "A")
 _PARTS = ("data", "indices", "indptr", "shape")
 
 
+def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
+    """Return P, G and A, an operator P multiplied out, and the names of dense ones."""
+    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
+    matrices = {"P": P, "G": qp.G, "A": qp.A}
+    return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
+
+
 def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
 
@@ -41,9 +48,7 @@ def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         When the file cannot be written.
 
     """
-    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
-    matrices = {"P": P, "G": qp.G, "A": qp.A}
-    dense = [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
+    matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
     for name, M in matrices.items():
         M = csc_array(M)

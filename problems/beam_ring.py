@@ -27,6 +27,7 @@ from problems.emit import FORMS, contact_case
 from problems.inverse import GeneralisedInverse
 from problems.linearise import METHODS, linearisation
 from problems.mesh import dofs_of, half_ring, join, rectangle
+from problems.ranges import at_least, one_of
 from problems.results import quantities
 from problems.stepping import LoadPath
 
@@ -60,9 +61,7 @@ class BeamRing:
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         p: Any = params
-        for key in ("Nr", "Nh", "radial", "steps", "step", "relin"):
-            if p[key] < 1:
-                raise InputError(f"{self.name}: {key}={p[key]} must be at least 1")
+        at_least(1, self.name, p, ("Nr", "Nh", "radial", "steps", "step", "relin"))
         nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
         if nodes > MOST_NODES:
@@ -74,12 +73,7 @@ class BeamRing:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
-        for key, known in (METHODS | {"plane": ("strain", "stress")}).items():
-            if p[key] not in known:
-                raise InputError(
-                    f"{self.name}: {key}={p[key]!r} is unknown, expected "
-                    + " or ".join(map(repr, known))
-                )
+        one_of(self.name, p, METHODS | {"plane": ("strain", "stress")})
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
