@@ -2,7 +2,7 @@
 
 from harness.errors import InputError
 from harness.kkt import Residuals, kkt_residuals, verdict
-from harness.plugin import Case, Family, Fields, Reference, Solver, Value
+from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
 from harness.qp import QP, Matrix, Vector, no_rows
 from harness.record import Record, Verdict
 from harness.solution import Solution, Status
@@ -10,6 +10,7 @@ from harness.solution import Solution, Status
 __all__ = [
     "QP",
     "Case",
+    "Chained",
     "Family",
     "Fields",
     "InputError",

@@ -29,6 +29,18 @@ class Solver(Protocol):
         """
 
 
+class Chained(Solver, Protocol):
+    """A solver that can carry work from one QP to the next, as of load steps."""
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        """Begin a sequence: return the `prepare` for its QPs, called in their order.
+
+        Each call may use whatever the earlier ones left (points, multipliers, factors,
+        norms), on its own responsibility: the QPs of a sequence need not have a single
+        coefficient in common. Sequences are independent of each other.
+        """
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fields:
     """A deformed state of bodies, for pictures and files; SI units."""
