@@ -3,7 +3,7 @@
 from harness.errors import InputError
 from harness.kkt import Residuals, kkt_residuals, verdict
 from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
-from harness.qp import QP, Matrix, Vector, no_rows
+from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
 from harness.solution import Solution, Status
 
@@ -21,6 +21,7 @@ __all__ = [
     "Solution",
     "Solver",
     "Status",
+    "Structure",
     "Value",
     "Vector",
     "Verdict",

@@ -78,7 +78,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         When one is missing, of the wrong kind, or they make no QP.
 
     """
-    vectors = {name: vector(arrays, name) for name in _VECTORS}
+    vectors: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
     matrices = {name: matrix(arrays, name) for name in _MATRICES}
     try:
         meta = json.loads(str(np.asarray(arrays.get("meta", "{}")).item()))

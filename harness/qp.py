@@ -14,6 +14,15 @@ Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Structure:
+    """What P = B K⁺ Bᵀ, the matrix of a dual, came from; in the dual's units."""
+
+    K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
+    B: Matrix  #: (n, N) sparse constraint rows
+    fixed: NDArray[np.int64]  #: components that K⁺ leaves at zero
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class QP:
     """A convex quadratic program.
 
@@ -45,7 +54,7 @@ class QP:
     h: Vector  #: (p,)
     lb: Vector  #: (n,) may hold -inf
     ub: Vector  #: (n,) may hold +inf
-    structure: object | None = None  #: what a solver may use and none must need
+    structure: Structure | None = None  #: what a solver may use and none must need
 
     def __post_init__(self) -> None:
         n, m, p = self.q.size, self.b.size, self.h.size

@@ -7,7 +7,8 @@
 holds the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
 ``M_data, M_indices, M_indptr, M_shape`` of its compressed sparse columns (P whole, not
 a triangle); and ``meta``, a JSON object. Absent constraints have zero rows, absent
-bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense.
+bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense. The structure of
+a dual, where there is one, follows as matrices ``K, B`` and the vector ``fixed``.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from harness.errors import InputError
-from harness.qp import QP, Matrix, Vector
+from harness.qp import QP, Matrix, Structure, Vector
 from harness.store import read_arrays
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
+_STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
 
 
@@ -50,6 +52,9 @@ def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     """
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
+    if qp.structure is not None:
+        matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
+        arrays["fixed"] = qp.structure.fixed
     for name, M in matrices.items():
         M = csc_array(M)
         parts = (M.data, M.indices, M.indptr, np.array(M.shape))
@@ -79,11 +84,20 @@ def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
             raise ValueError("meta is no JSON object")
         vectors = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
+        structure = _structure(arrays) if "fixed" in arrays else None
         for name in set(_MATRICES).intersection(meta.get("dense", ())):
             matrices[name] = matrices[name].toarray()
-        return QP(**vectors, **matrices), meta
+        return QP(**vectors, **matrices, structure=structure), meta
     except (ValueError, TypeError) as e:
         raise InputError(f"{path}: {' '.join(str(e).split())}") from None
+
+
+def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
+    parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
+    if missing := [name for name in parts if name not in arrays]:
+        raise ValueError(f"{', '.join(missing)} missing beside fixed")
+    fixed = arrays["fixed"].astype(np.int64, casting="safe")
+    return Structure(K=_matrix(arrays, "K"), B=_matrix(arrays, "B"), fixed=fixed)
 
 
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:

@@ -82,7 +82,7 @@ def _measured_here(solver: Solver, qp: QP, tol: float) -> Measurement:
 def _warm_up(solver: Solver) -> None:
     """Solve a QP with bounds and one with rows; how that ends will show later."""
     eye, ones = np.eye(2), np.ones(2)
-    bounds = dict(q=-ones, lb=np.zeros(2), ub=np.full(2, np.inf))
+    bounds: dict[str, Any] = dict(q=-ones, lb=np.zeros(2), ub=np.full(2, np.inf))
     no_row = dict(A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0))
     one_row_each = dict(A=ones[None], b=ones[:1], G=eye[:1], h=ones[:1])
     for rows in (no_row, one_row_each):

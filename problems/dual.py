@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Matrix, Solution, Vector, no_rows
+from harness import QP, Solution, Structure, Vector, no_rows
 from problems.inverse import GeneralisedInverse
 
 
@@ -52,7 +52,9 @@ def dualise(
     B, c = csr_array(vstack([primal.A, primal.G])), np.append(primal.b, primal.h)
     R = inverse.kernel
     free = inverse(f) if free is None else free
-    qp = _dual(B, c, inverse, free, np.where(np.arange(c.size) < m_E, -np.inf, 0.0))
+    structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
+    lb = np.where(np.arange(c.size) < m_E, -np.inf, 0.0)
+    qp = _dual(structure, c, inverse, free, lb)
     if R.shape[1]:
         qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
 
@@ -86,7 +88,9 @@ def dual_bounds(
     """
     f, B = -primal.q, csr_array(primal.G)
     free = clamped(f) if free is None else free
-    qp = _dual(B, primal.h, clamped, free, np.zeros(primal.h.size))
+    held = np.unique(csr_array(primal.A).indices).astype(np.int64)
+    structure = Structure(K=primal.P, B=B, fixed=held)
+    qp = _dual(structure, primal.h, clamped, free, np.zeros(primal.h.size))
 
     def recover(s: Solution) -> Solution:
         u = clamped(f - B.T @ s.x)
@@ -97,12 +101,16 @@ def dual_bounds(
 
 
 def _dual(
-    B: Matrix, c: Vector, inverse: GeneralisedInverse, free: Vector, lb: Vector
+    structure: Structure,
+    c: Vector,
+    inverse: GeneralisedInverse,
+    free: Vector,
+    lb: Vector,
 ) -> QP:
     """Emit  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  λ ≥ lb."""
-    m = c.size
+    m, B = c.size, structure.B
     return QP(
         P=inverse.congruence(B), q=c - B @ free,
         A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=lb, ub=np.full(m, np.inf),
+        lb=lb, ub=np.full(m, np.inf), structure=structure,
     )  # fmt: skip

@@ -6,10 +6,9 @@ is off its bounds), the chopped gradient β (the part of g on the bounds that le
 inside) and the projected gradient g^P = φ + β, each step is one of
 
 * c, conjugate gradient: minimise along p on the face, if that stays feasible
-* e, expansion: x ← P(x − α_cg p), the CG step projected; one product more
-* f, fallback, if e raised the cost: the CG step as far as it is feasible, then a
-  gradient projection step of length ᾱ; two products more
-* p, proportioning: minimise along −β, as far as feasible, to free components
+* e, expansion of the active set, by one of the `EXPANSIONS`
+* f, fallback: an expansion that raised the cost, done anew in the safe way
+* p, proportioning: free components, by one of the `PROPORTIONINGS`
 
 Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
 length ᾱ takes beyond a bound.
@@ -17,27 +16,63 @@ length ᾱ takes beyond a bound.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from harness import Vector
+from solvers import kernels
+from solvers.kernels import Mask
+from solvers.model import Model
 
 Operator = Callable[[Vector], Vector]
+Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner
+
+#: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
+#: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
+#: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
+#: model: the CG step as far as it is feasible, then a `Model.step`, its length by
+#: an exact line search (ours; 2 products)
+Expansion = Literal["std", "projcg", "mixed", "model"]
+#: cg: minimise along −β, as far as feasible (the book's; 1 product)
+#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product)
+Proportioning = Literal["cg", "model"]
+EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How MPRGP moves between faces."""
+
+    Gamma: float = 1.0  #: proportioning constant Γ > 0
+    expansion: Expansion = "model"
+    proportioning: Proportioning = "model"
+    reduced: bool = True  #: compare β with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
+
+
+class Point(NamedTuple):
+    """A feasible x with its gradient."""
+
+    x: Vector
+    g: Vector  #: Hx − b
 
 
 class Face(NamedTuple):
     """The gradient split by the face on which x lies."""
 
+    free: Mask  #: components off their bounds
     phi: Vector  #: free gradient
     beta: Vector  #: chopped gradient
-    phi_reduced: Vector  #: free gradient cut so that x − ᾱφ̃ is feasible
+    phi_square: float  #: ‖φ‖²
+    beta_square: float  #: ‖β‖²
 
     @property
     def projected_norm(self) -> float:
         """‖g^P‖₂, zero exactly at the minimiser."""
-        return float(np.sqrt(self.phi @ self.phi + self.beta @ self.beta))
+        return math.sqrt(self.phi_square + self.beta_square)
 
 
 class Minimum(NamedTuple):
@@ -50,15 +85,29 @@ class Minimum(NamedTuple):
     trace: str  #: one letter per step: c, e, f, p
 
 
+Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, where
+#: letter, where, model; None where the cost falls without end
+Step = tuple[str, Point, Model] | None
+
+
+class _Task(NamedTuple):
+    H: Operator
+    b: Vector
+    bounds: tuple[Vector, Vector]
+    rules: Rules
+
+
 def mprgp(
     H: Operator,
     b: Vector,
     bounds: tuple[Vector, Vector],
     start: tuple[Vector, Vector],
     *,
-    alpha: float,
+    B: Model,
     stop: Callable[[Vector, float], bool],
-    Gamma: float = 1.0,
+    rules: Rules,
+    precondition: Precondition | None = None,
+    watch: Watch | None = None,
     max_steps: int = 10_000,
 ) -> Minimum:
     """Minimise ½xᵀHx − bᵀx over l ≤ x ≤ u.
@@ -68,85 +117,117 @@ def mprgp(
     H : symmetric positive semidefinite (n, n) as a function v → Hv
     bounds : l and u (n,), possibly infinite
     start : a feasible x (n,) and its gradient Hx − b
-    alpha : length ᾱ of a gradient projection step, in (0, 2/‖H‖)
+    B : a model of H; ᾱ = 1/τ is the length of plain gradient projection steps
     stop : says from x and ‖g^P‖₂ whether to stop; asked before every step
-    Gamma : proportioning constant Γ > 0
+    precondition : makes the preconditioner of the CG steps in a face
+    watch : told the letter of each step, the new point and its face
 
     """
-    lower, upper = bounds
-    x, g = start
-    face = split(x, g, lower, upper, alpha)
-    p, trace = face.phi, ""
-    while not stop(x, face.projected_norm):
-        if len(trace) >= max_steps:
-            return Minimum(x, g, face.projected_norm, False, trace)
-        if face.beta @ face.beta > Gamma**2 * (face.phi_reduced @ face.phi):
-            p = face.beta
+    task = _Task(H, b, bounds, rules)
+    precondition = precondition or _none
+    at, trace = Point(*start), ""
+    face = split(at, bounds)
+    z_of = precondition(face.free)
+    p = z_of(face.phi)
+    while not (done := stop(at.x, face.projected_norm)) and len(trace) < max_steps:
+        if _disproportional(task, at, face, B):
+            step = _proportion(task, at, face, B)
+        else:
             Hp = H(p)
-            step = min(_cauchy(g, p, Hp), _feasible(x, p, lower, upper))
-            if np.isinf(step):
-                return Minimum(x, g, face.projected_norm, False, trace)
-            x = np.clip(x - step * p, lower, upper)
-            g = g - step * Hp
-            face = split(x, g, lower, upper, alpha)
-            p, trace = face.phi, trace + "p"
-            continue
-        Hp = H(p)
-        cg, feasible = _cauchy(g, p, Hp), _feasible(x, p, lower, upper)
-        if np.isinf(min(cg, feasible)):
-            return Minimum(x, g, face.projected_norm, False, trace)
-        if cg <= feasible:
-            x = np.clip(x - cg * p, lower, upper)
-            g = g - cg * Hp
-            face = split(x, g, lower, upper, alpha)
-            p = face.phi - (face.phi @ Hp) / (p @ Hp) * p
-            trace += "c"
-            continue
-        x, g, letter = _expand(H, b, bounds, (x, g, p, Hp), (cg, feasible, alpha))
-        face = split(x, g, lower, upper, alpha)
-        p, trace = face.phi, trace + letter
-    return Minimum(x, g, face.projected_norm, True, trace)
+            step = _minimise_or_expand(task, at, p, Hp, B)
+        if step is None:
+            break
+        letter, at, B = step
+        face = split(at, bounds)
+        if letter == "c":
+            p = kernels.conjugate(z_of(face.phi), p, Hp)
+        else:
+            z_of = precondition(face.free)
+            p = z_of(face.phi)
+        trace += letter
+        if watch is not None:
+            watch(letter, at, face)
+    return Minimum(at.x, at.g, face.projected_norm, done, trace)
 
 
-def _expand(
-    H: Operator,
-    b: Vector,
-    bounds: tuple[Vector, Vector],
-    state: tuple[Vector, Vector, Vector, Vector],
-    lengths: tuple[float, float, float],
-) -> tuple[Vector, Vector, str]:
-    """Leave the face: the projected CG step, or where the cost grows the safe one."""
-    x, g, p, Hp = state
-    cg, feasible, alpha = lengths
-    if np.isfinite(cg):
-        trial = np.clip(x - cg * p, *bounds)
-        g_trial = H(trial) - b
-        if trial @ (g_trial - b) <= x @ (g - b):  # twice the costs
-            return trial, g_trial, "e"
-    x = np.clip(x - feasible * p, *bounds)
-    g = g - feasible * Hp
-    x = np.clip(x - alpha * split(x, g, *bounds, alpha).phi, *bounds)
-    return x, H(x) - b, "f"
+def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
+    """Split the gradient into its free and its chopped part."""
+    return Face(*kernels.split(*at, *bounds))
 
 
-def split(x: Vector, g: Vector, lower: Vector, upper: Vector, alpha: float) -> Face:
-    """Split the gradient at x into free, chopped and reduced free parts."""
-    at_lower, at_upper = x <= lower, x >= upper
-    phi = np.where(at_lower | at_upper, 0.0, g)
-    beta = np.where(at_lower & ~at_upper, np.minimum(g, 0), 0.0)
-    beta += np.where(at_upper & ~at_lower, np.maximum(g, 0), 0.0)
-    reduced = np.clip(phi, (x - upper) / alpha, (x - lower) / alpha)
-    return Face(phi, beta, reduced)
+def _disproportional(task: _Task, at: Point, face: Face, B: Model) -> bool:
+    """Whether more is to be gained on the bounds than in the face."""
+    if face.beta_square == 0:
+        return False
+    free_square = face.phi_square
+    if task.rules.reduced:
+        cut = kernels.reduced(at.x, face.phi, 1 / B.tau, *task.bounds)
+        free_square = float(cut @ face.phi)
+    return face.beta_square > task.rules.Gamma**2 * free_square
 
 
-def _cauchy(g: Vector, p: Vector, Hp: Vector) -> float:
-    """Length of the minimising step x − αp; inf along a direction without curvature."""
-    curvature = float(p @ Hp)
-    return float(g @ p) / curvature if curvature > 0 else np.inf
+def _proportion(task: _Task, at: Point, face: Face, B: Model) -> Step:
+    """Take a step that frees components; never beyond an opposite bound."""
+    if task.rules.proportioning == "model":
+        return _model_step(task, at, B, "p")
+    p = face.beta
+    Hp = task.H(p)
+    length = min(kernels.lengths(*at, p, Hp, *task.bounds))
+    return None if math.isinf(length) else ("p", _moved(task, at, length, p, Hp), B)
 
 
-def _feasible(x: Vector, p: Vector, lower: Vector, upper: Vector) -> float:
-    """Largest α for which x − αp stays within the bounds."""
-    down, up = p > 0, p < 0
-    to_lower = np.min((x[down] - lower[down]) / p[down], initial=np.inf)
-    return float(np.min((x[up] - upper[up]) / p[up], initial=to_lower))
+def _minimise_or_expand(
+    task: _Task, at: Point, p: Vector, Hp: Vector, B: Model
+) -> Step:
+    """Take the CG step where it is feasible, else expand the active set."""
+    H, b, bounds, rules = task
+    cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
+    if math.isinf(min(cg, feasible)):
+        return None
+    if cg <= feasible:
+        return "c", _moved(task, at, cg, p, Hp), B
+    if rules.expansion in ("projcg", "mixed") and math.isfinite(cg):
+        x = np.clip(at.x - cg * p, *bounds)
+        new = Point(x, H(x) - b)
+        if rules.expansion == "projcg" or _cost(new, b) <= _cost(at, b):
+            return "e", new, B
+    half = _moved(task, at, feasible, p, Hp)
+    if rules.expansion == "model":
+        return _model_step(task, half, B, "e")
+    phi = split(half, bounds).phi
+    cut = kernels.reduced(half.x, phi, 1 / B.tau, *bounds)
+    x = np.clip(half.x - cut / B.tau, *bounds)
+    letter = "f" if rules.expansion == "mixed" else "e"
+    return letter, Point(x, H(x) - b), B
+
+
+def _model_step(task: _Task, at: Point, B: Model, letter: str) -> Step:
+    """Minimise the model over the box, then the cost along that step.
+
+    Above H, the model makes the minimising length at least 1. Where the product shows
+    that it is not above, it is raised; the line search lessens the cost anyway.
+    """
+    s = B.step(at.x, at.g, task.bounds)
+    if not s.any():  # in rounding, nothing is left to gain
+        return None
+    Hs = task.H(s)
+    cost, feasible = kernels.lengths(*at, -s, -Hs, *task.bounds)
+    length = min(cost, max(1.0, feasible))
+    if math.isinf(length):
+        return None
+    B = B if cost >= 1 else B.raised(s, float(s @ Hs))
+    return letter, _moved(task, at, -length, s, Hs), B
+
+
+def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:
+    """Go to x − αp; the gradient follows without a product."""
+    return Point(*kernels.moved(*at, alpha, p, Hp, *task.bounds))
+
+
+def _cost(at: Point, b: Vector) -> float:
+    """Return xᵀHx − 2bᵀx, twice the cost, from the gradient."""
+    return float(at.x @ (at.g - b))
+
+
+def _none(free: Mask) -> Operator:
+    return lambda v: v

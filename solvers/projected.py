@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
 from harness import QP, Matrix, Vector
-from solvers.spectrum import norm_estimate
+from solvers.model import Model
+from solvers.products import product
+from solvers.spectrum import Ritz, lanczos, power_method, random_start
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+TAIL = 1e-4  #: least τ of a model, relative to the norm
 
 
 class Rows(NamedTuple):
@@ -25,6 +28,25 @@ class Rows(NamedTuple):
     consistent: bool  #: whether there is one
     multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
 
+    def project(self, v: Vector) -> Vector:
+        """Apply 𝒫 = I − CᵀC."""
+        return np.asarray(v - self.C.T @ (self.C @ v))
+
+
+class Spectrum(NamedTuple):
+    """What is known of 𝒫F𝒫."""
+
+    norm: float  #: ‖𝒫F𝒫‖, positive
+    ritz: Ritz | None  #: None after the power method, which finds nothing else
+
+    def orthogonal_to(self, rows: Rows) -> Spectrum:
+        """Take it over to a problem with slightly other rows."""
+        if self.ritz is None:
+            return self
+        V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
+        vectors = (V * np.sign(np.diag(R))).T
+        return self._replace(ritz=self.ritz._replace(vectors=vectors))
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -33,20 +55,38 @@ class Projected:
     F: Callable[[Vector], Vector]  #: counts its calls
     counts: Counter[str]
     rows: Rows
-    norm: float  #: ‖𝒫F𝒫‖
+    spectrum: Spectrum
     b: Vector
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
-
-    def step(self, rho: float) -> float:
-        """Length ᾱ < 2/‖H‖ of a gradient projection step, ‖H‖ = max(1, ρ)."""
-        return 1.9 / max(1.0, rho if len(self.rows.C) else 0.0)
 
     def H(self, v: Vector, rho: float) -> Vector:
         """Apply H; one product with F."""
         C = self.rows.C
-        Qv = C.T @ (C @ v)
-        Fv = self.F(v - Qv)
-        return (Fv - C.T @ (C @ Fv)) / self.norm + rho * Qv
+        Cv = C @ v
+        Fv = self.F(v - C.T @ Cv)
+        shift = rho * Cv - (C @ Fv) / self.spectrum.norm
+        return np.asarray(Fv / self.spectrum.norm + C.T @ shift)
+
+    def model(self, rho: float) -> Model:
+        """Model H by the Ritz pairs and the rows C.
+
+        The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
+        what the Ritz vectors before it leave; ρQ is taken as it is. Where that is too
+        little, as in flat spectra, MPRGP raises τ by what its products show.
+        """
+        C, ritz = self.rows.C, self.spectrum.ritz
+        if ritz is None:
+            raise ValueError("the power method found no Ritz pairs")
+        above = (ritz.values + ritz.residuals) / self.spectrum.norm
+        kept = max(len(above) - 2, 0)
+        U = np.vstack([ritz.vectors[:kept], C])
+        w = np.append(above[:kept], np.full(len(C), rho))
+        return Model(0.0, U, w).with_tail(max(float(above[kept]), TAIL))
+
+    def plain_model(self, rho: float, *, alpha: float) -> Model:
+        """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
+        norm = max(1.0, rho if len(self.rows.C) else 0.0)
+        return Model.of_norm(norm / alpha, self.b.size)
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
@@ -70,24 +110,36 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     return Rows(np.ascontiguousarray(C), x_tilde, consistent, multipliers)
 
 
-def projected_problem(qp: QP, lanczos_steps: int) -> Projected:
-    """Homogenise, project and normalise; 1 + `lanczos_steps` products with F."""
+def projected_problem(
+    qp: QP, find: Callable[[Callable[[Vector], Vector], Rows], Spectrum]
+) -> Projected:
+    """Homogenise, project and normalise; one product with F and those of `find`.
+
+    find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
+    """
     counts: Counter[str] = Counter()
+    P = product(qp.P)
 
     def F(v: Vector) -> Vector:
         counts["P_products"] += 1
-        return np.asarray(qp.P @ v)
+        return P(v)
 
     rows = orthonormal_rows(qp.A, qp.b)
-
-    def project(v: Vector) -> Vector:
-        return v - rows.C.T @ (rows.C @ v)
-
-    norm = norm_estimate(lambda v: project(F(project(v))), qp.q.size, lanczos_steps)
-    norm = norm or 1.0
+    spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
-    b = project(d) / norm
-    if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / norm:
+    b = rows.project(d) / spectrum.norm
+    if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
-    return Projected(F, counts, rows, norm, b, bounds)
+    return Projected(F, counts, rows, spectrum, b, bounds)
+
+
+def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
+    """Find the norm and the upper Ritz pairs; `steps` products."""
+    ritz = lanczos(PFP, rows.project(random_start(rows.x_tilde.size)), steps)
+    return Spectrum(ritz.norm or 1.0, ritz)
+
+
+def by_power(PFP: Callable[[Vector], Vector], rows: Rows) -> Spectrum:
+    """Find the norm as PERMON does; up to 50 products."""
+    return Spectrum(power_method(PFP, rows.x_tilde.size) or 1.0, None)

@@ -1,29 +1,46 @@
-"""Norm of a symmetric operator from a short Lanczos process."""
+"""The upper end of the spectrum of a symmetric positive semidefinite operator."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 
 from harness import Vector
 
 
-def norm_estimate(H: Callable[[Vector], Vector], n: int, steps: int) -> float:
-    """Estimate ‖H‖ of a symmetric positive semidefinite H (n, n), from above.
+class Ritz(NamedTuple):
+    """Ritz pairs, in descending order of their values."""
 
-    The largest Ritz value θ after `steps` products bounds ‖H‖ from below; θ plus the
-    residual norm of its Ritz vector is an upper bound for the eigenvalue it converges
-    to, and with a random start, all but surely, for ‖H‖. Full reorthogonalisation:
-    there are few vectors.
+    values: Vector  #: (k,)
+    residuals: Vector  #: (k,) ‖Hv − θv‖: an eigenvalue lies that near to θ
+    vectors: NDArray[np.float64]  #: (k, n) orthonormal rows
+
+    @property
+    def norm(self) -> float:
+        """θ₁ and its residual: an upper bound for the eigenvalue that θ₁ approaches."""
+        return float(self.values[0] + self.residuals[0])
+
+
+def random_start(n: int) -> Vector:
+    """Draw the same vector (n,) every time: no answer may depend on luck."""
+    return np.random.default_rng(19640229).standard_normal(n)
+
+
+def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
+    """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
+
+    The residual of the pair (θ, Vᵀs) is |β s_k| with the last off-diagonal entry β. A
+    start vector from an invariant subspace keeps the process there.
     """
-    v = np.random.default_rng(19640229).standard_normal(n)
-    basis = np.zeros((min(steps, n), n))
+    basis = np.zeros((min(steps, start.size), start.size))
     diagonal: list[float] = []
     off: list[float] = []
-    beta = float(np.linalg.norm(v))
-    for k in range(len(basis)):
+    v, beta = start, float(np.linalg.norm(start))
+    for k in range(len(basis) if beta else 0):
         basis[k] = v / beta
         v = H(basis[k])
         diagonal.append(float(basis[k] @ v))
@@ -33,5 +50,25 @@ def norm_estimate(H: Callable[[Vector], Vector], n: int, steps: int) -> float:
         off.append(beta)
         if beta <= 1e-12 * max(map(abs, diagonal)):
             break
+    if not diagonal:
+        return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)))
     theta, S = eigh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
-    return float(theta[-1] + off[-1] * abs(S[-1, -1]))
+    vectors = S.T @ basis[: len(theta)]
+    return Ritz(theta[::-1], off[-1] * np.abs(S[-1, ::-1]), vectors[::-1])
+
+
+def power_method(H: Callable[[Vector], Vector], n: int) -> float:
+    """Estimate ‖H‖ as PERMON does: from ones, to 1e-4, at most 50 products.
+
+    The Rayleigh quotient stays below ‖H‖; there is no safety factor.
+    """
+    v = np.full(n, 1 / np.sqrt(n))
+    estimate = 0.0
+    for _ in range(50):
+        Hv = H(v)
+        before, estimate = estimate, float(v @ Hv)
+        size = float(np.linalg.norm(Hv))
+        if size == 0 or abs(estimate - before) < 1e-4 * abs(estimate):
+            break
+        v = Hv / size
+    return estimate

@@ -3,10 +3,27 @@
 import numpy as np
 import pytest
 
-from solvers.mprgp import mprgp, split
+from solvers import kernels
+from solvers.model import Model
+from solvers.mprgp import EXPANSIONS, Point, Rules, mprgp, split
+from solvers.spectrum import power_method
+
+MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 
 
-def minimise(A, b, lower, upper=None, x=None, *, alpha=None, tol=1e-10, **options):
+def minimise(
+    A,
+    b,
+    lower,
+    upper=None,
+    x=None,
+    *,
+    alpha=None,
+    tol=1e-10,
+    rules=MIXED,
+    B=None,
+    **options,
+):
     A, b, lower = (np.asarray(v, dtype=float) for v in (A, b, lower))
     upper = np.full(b.size, np.inf) if upper is None else np.asarray(upper, dtype=float)
     x = (
@@ -22,8 +39,8 @@ def minimise(A, b, lower, upper=None, x=None, *, alpha=None, tol=1e-10, **option
 
     run = mprgp(
         H, b, (lower, upper), (x, A @ x - b),
-        alpha=alpha or 1.9 / np.linalg.norm(A, 2),
-        stop=lambda x, size: size <= tol, **options,
+        B=B or Model.of_norm(1 / (alpha or 1.9 / np.linalg.norm(A, 2)), b.size),
+        stop=lambda x, size: size <= tol, rules=rules, **options,
     )  # fmt: skip
     return run, len(products)
 
@@ -41,16 +58,24 @@ def test_without_active_bounds_it_is_conjugate_gradients():
 @pytest.mark.parametrize(("Gamma", "first"), [(1.9, "p"), (2.1, "c")])
 def test_proportioning_when_beta_exceeds_gamma_times_phi(Gamma, first):
     """‖β‖ = 2, ‖φ̃‖ = ‖φ‖ = 1: Γ = 2 decides; Γ² = 4, not 2, multiplies ‖φ‖² = 1."""
-    run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], Gamma=Gamma)
+    rules = Rules(Gamma, "mixed", "cg")
+    run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], rules=rules)
 
     assert run.trace[0] == first
 
 
 def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning():
-    """φ = 1 but φ̃ = 10⁻⁹ at the first component: the reduced gradient decides."""
-    run, _ = minimise(np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0)
+    """φ = 1 but φ̃ = 10⁻⁹ at the first component: the reduced gradient decides, where
+    it is asked."""
+    first = [
+        minimise(
+            np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0,
+            rules=Rules(1.0, "mixed", "cg", reduced=r),
+        )[0].trace[0]
+        for r in (True, False)
+    ]  # fmt: skip
 
-    assert run.trace[0] == "p"
+    assert first == ["p", "e"]
 
 
 def test_proportioning_stops_at_the_opposite_bound():
@@ -115,12 +140,16 @@ def test_an_unbounded_cost_is_not_called_a_minimum():
     assert not run.stopped
 
 
+@pytest.mark.parametrize("expansion", sorted({*EXPANSIONS} - {"projcg"}))
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_every_iterate_is_feasible_and_the_cost_never_rises(planted, seed):
+def test_every_iterate_is_feasible_and_the_cost_never_rises(planted, seed, expansion):
     qp, _ = planted("box", seed=seed, dense=True, n=24)
+    rules = Rules(expansion=expansion, proportioning="cg")
     costs = []
     for steps in range(30):
-        run, _ = minimise(qp.P, -qp.q, qp.lb, qp.ub, max_steps=steps, tol=0.0)
+        run, _ = minimise(
+            qp.P, -qp.q, qp.lb, qp.ub, max_steps=steps, tol=0.0, rules=rules
+        )
         costs.append(qp.objective(run.x))
 
         assert (run.x >= qp.lb).all()
@@ -132,9 +161,151 @@ def test_every_iterate_is_feasible_and_the_cost_never_rises(planted, seed):
 def test_the_split_gradient_adds_up_and_its_parts_are_admissible():
     x = np.array([0.0, 0.0, 0.5, 1.0, 1.0, 0.3])
     g = np.array([2.0, -2.0, 3.0, 2.0, -2.0, -4.0])
-    face = split(x, g, np.zeros(6), np.ones(6), 0.5)
+    at, bounds = Point(x, g), (np.zeros(6), np.ones(6))
+    face = split(at, bounds)
 
     assert face.phi.tolist() == [0, 0, 3, 0, 0, -4]
     assert face.beta.tolist() == [0, -2, 0, 2, 0, 0]  # only what leads inside
-    assert face.phi_reduced == pytest.approx([0, 0, 1, 0, 0, -1.4])
+    assert kernels.reduced(x, face.phi, 0.5, *bounds) == pytest.approx(
+        [0, 0, 1, 0, 0, -1.4]
+    )
+    assert face.free.tolist() == [False, False, True, False, False, True]
     assert face.projected_norm == pytest.approx(np.sqrt(9 + 16 + 4 + 4))
+
+
+def string():
+    """PERMON's first tutorial: a string of 100 points above a sine-shaped obstacle."""
+    n, h = 100, 1 / 99
+    A = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    A[[0, -1]], A[:, [0, -1]] = 0, 0
+    A[[0, -1], [0, -1]] = 1
+    inside = np.r_[0, np.ones(n - 2), 0]
+    obstacle = np.sin(4 * np.pi * h * np.arange(n) - np.pi / 6) / 2 - 2
+    return A, -30 * h**2 * inside, obstacle * inside
+
+
+@pytest.mark.parametrize(
+    ("expansion", "iterations", "products", "cg", "expansions", "proportionings"),
+    [("std", 181, 200, 156, 18, 7), ("projcg", 160, 175, 134, 14, 12)],
+)
+def test_permons_rules_take_permons_steps(
+    expansion, iterations, products, cg, expansions, proportionings
+):
+    """Counters that PERMON 3.25 prints for this problem at rtol = 1e-5."""
+    A, b, lower = string()
+    norm = power_method(lambda v: A @ v, b.size)
+    run, counted = minimise(
+        A, b, lower, alpha=2 / norm, tol=1e-5 * np.linalg.norm(b),
+        rules=Rules(1.0, expansion, "cg", reduced=False),
+    )  # fmt: skip
+
+    steps = [run.trace.count(letter) for letter in "cep"]
+    assert len(run.trace) == iterations
+    assert 1 + counted == products  # one for the gradient at the start
+    assert steps == [cg, expansions, proportionings]
+
+
+def test_a_model_step_minimises_the_model_over_the_box():
+    """KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u: exact after Newton's method."""
+    rng = np.random.default_rng(271828)
+    U = np.linalg.qr(rng.standard_normal((40, 5)))[0].T
+    for scale in (1.0, 1e4):
+        B = Model(0.1, U, scale * rng.random(5))
+        x, g = rng.random(40), rng.standard_normal(40)
+        s = B.step(x, g, (np.zeros(40), np.ones(40)))
+        slope = g + 0.1 * s + B.U.T @ (B.w * (B.U @ s))
+        down, up = x + s <= 1e-12, x + s >= 1 - 1e-12
+
+        assert slope[~(down | up)] == pytest.approx(0, abs=1e-9)
+        assert (slope[down] > -1e-9).all()
+        assert (slope[up] < 1e-9).all()
+        assert down.sum() + up.sum() > 5
+
+
+def test_without_directions_a_model_step_is_a_gradient_projection():
+    B = Model.of_norm(4.0, 3)
+    x, g = np.array([0.5, 0.5, 0.5]), np.array([1.0, 4.0, -1.0])
+
+    s = B.step(x, g, (np.zeros(3), np.full(3, np.inf)))
+    assert x + s == pytest.approx([0.25, 0.0, 0.75])
+
+
+def test_the_inverse_in_a_face_inverts_the_block_of_the_model():
+    rng = np.random.default_rng(271828)
+    U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
+    B = Model(0.5, U, np.array([3.0, 2.0, 1.0]))
+    dense = 0.5 * np.eye(12) + U.T @ np.diag(B.w) @ U
+    free = np.arange(12) % 3 > 0
+    v = rng.standard_normal(12)
+
+    z = B.inverse_in(free)(v)
+    assert z[free] == pytest.approx(np.linalg.solve(dense[np.ix_(free, free)], v[free]))
+    assert (z[~free] == 0).all()
+
+
+def test_a_model_is_raised_to_what_a_product_shows():
+    """sᵀBs = sᵀHs afterwards; in the directions of U it stays what it was."""
+    rng = np.random.default_rng(271828)
+    U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
+    B = Model(0.5, U, np.array([30.0, 20.0, 10.0]))
+    s = rng.standard_normal(12)
+
+    def quotient(B, v):
+        return B.tau * v @ v + (B.w * (B.U @ v)) @ (B.U @ v)
+
+    higher = B.raised(s, quotient(B, s) + 0.2 * s @ s)
+    assert quotient(higher, s) == pytest.approx(quotient(B, s) + 0.2 * s @ s)
+    assert [quotient(higher, u) for u in U] == pytest.approx([30.5, 20.5, 10.5])
+    assert B.raised(s, 1e9).tau == 5.0  # not more than tenfold at once
+
+
+def test_a_step_of_a_model_below_the_operator_is_shortened():
+    """H = 4I, B = I: the step ends four times too far, the line search at x = b/4."""
+    run, products = minimise(
+        4 * np.eye(2), [4.0, 40.0], [0.0, 0.0], B=Model.of_norm(1.0, 2), rules=Rules()
+    )
+
+    assert (run.trace, products) == ("p", 1)
+    assert run.x == pytest.approx([1.0, 10.0])
+
+
+def test_an_exact_model_finds_the_minimum_at_once():
+    """B = H: the first step ends at the solution."""
+    U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
+    B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
+    H = np.eye(20) + U.T @ np.diag(B.w) @ U
+    b = np.random.default_rng(314159).standard_normal(20)
+    run, products = minimise(H, b, np.zeros(20), B=B, rules=Rules())
+
+    assert (run.trace, products) == ("p", 1)
+
+
+def test_a_preconditioner_in_the_face_is_used_with_conjugation():
+    """M = A⁻¹ solves in one step; M = D⁻¹ makes D¹ᐟ²(I + rank 2)D¹ᐟ² take three."""
+    rng = np.random.default_rng(271828)
+    D, W = np.diag(rng.uniform(1, 100, 30)), rng.standard_normal((30, 2))
+    half = np.sqrt(D)
+    A, b, lower = (
+        half @ (np.eye(30) + W @ W.T) @ half,
+        rng.random(30),
+        np.full(30, -np.inf),
+    )
+
+    def with_(M):
+        return minimise(
+            A, b, lower, precondition=lambda free: lambda v: M @ v, tol=1e-8
+        )
+
+    assert with_(np.linalg.inv(A))[0].trace == "c"
+    assert with_(np.linalg.inv(D))[0].trace == "ccc"
+    assert len(minimise(A, b, lower, tol=1e-8)[0].trace) > 10
+
+
+def test_the_observer_sees_every_step():
+    seen = []
+    A, b, lower = string()
+    run, _ = minimise(A, b, lower, watch=lambda *step: seen.append(step), tol=1e-6)
+
+    assert "".join(letter for letter, _, _ in seen) == run.trace
+    assert (seen[-1][1].x == run.x).all()
+    assert (seen[-1][2].phi == np.where(run.x > lower, run.g, 0)).all()

@@ -1,15 +1,37 @@
 """SMALBE: its path, its invariants and the problems that break such solvers."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from harness import QP, Status, kkt_residuals, no_rows
-from solvers.projected import orthonormal_rows, projected_problem
-from solvers.smalbe import SMALBE, first_iterate, smalbe
-from solvers.spectrum import norm_estimate
+from solvers import SOLVERS
+from solvers.mprgp import Rules
+from solvers.outer import Constants, Inner, first_iterate, smalbe
+from solvers.projected import by_lanczos, orthonormal_rows, projected_problem
+from solvers.smalbe import SMALBE
+from solvers.spectrum import lanczos, power_method
+
+INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
+
+
+def projected(qp, steps=10):
+    return projected_problem(qp, partial(by_lanczos, steps=steps))
+
+
+def outer_loop(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
+    inner = Inner(
+        Rules(1.0, "mixed", "cg"),
+        partial(problem.plain_model, alpha=1.9),
+        precondition=lambda rho: None,
+    )
+    start = first_iterate(
+        problem, np.zeros(problem.b.size), np.zeros(len(problem.rows.C)), M=M, rho=rho
+    )
+    return smalbe(problem, Constants(M, 0.5, eta, growth, 20_000), inner, tol, start)
 
 
 def bounded(P, q, A=None, b=(), lb=-np.inf, ub=np.inf):
@@ -40,9 +62,10 @@ def dual():
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
-def test_what_is_claimed_is_true(dual, seed, tol):
+@pytest.mark.parametrize("name", INHOUSE)
+def test_what_is_claimed_is_true(dual, name, seed, tol):
     qp = dual(seed)
-    s = SMALBE().prepare(qp, tol)()
+    s = SOLVERS[name].prepare(qp, tol)()
 
     assert s.status is Status.SOLVED
     assert kkt_residuals(qp, s).worst <= 10 * tol
@@ -140,16 +163,40 @@ def test_a_stalled_multiplier_is_helped_by_a_larger_penalty():
 
 @pytest.mark.parametrize("rho", [0.1, 3.0, 100.0])
 def test_the_gradient_projection_step_is_shorter_than_two_over_the_norm(dual, rho):
-    problem = projected_problem(dual(271828), 30)
+    problem = projected(dual(271828), 30)
     H = np.column_stack([problem.H(v, rho) for v in np.eye(30)])
+    alpha = 1 / problem.plain_model(rho, alpha=1.9).tau
 
-    assert 1.8 <= problem.step(rho) * np.linalg.norm(H, 2) < 2
+    assert 1.8 <= alpha * np.linalg.norm(H, 2) < 2
+
+
+def test_the_model_knows_what_the_lanczos_process_and_the_rows_tell(dual):
+    """On C it is ρ; on a Ritz vector the value and its residual; and it is far below
+    the norm elsewhere, where the spectrum decays like 1/k²."""
+    rng = np.random.default_rng(271828)
+    V = np.linalg.qr(rng.standard_normal((60, 60)))[0]
+    F = V / np.arange(1, 61) ** 2 @ V.T
+    G, x = rng.standard_normal((3, 60)), rng.random(60)
+    qp = bounded((F + F.T) / 2, rng.standard_normal(60), G, G @ x, lb=0.0)
+    problem = projected(qp, 12)
+    B, ritz, C = problem.model(1e4), problem.spectrum.ritz, problem.rows.C
+    dense = B.tau * np.eye(60) + B.U.T @ np.diag(B.w) @ B.U
+    known = (ritz.values + ritz.residuals)[:10] / problem.spectrum.norm
+
+    assert dense @ C.T == pytest.approx(1e4 * C.T, abs=1e-8)
+    assert dense @ ritz.vectors[:10].T == pytest.approx(
+        known * ritz.vectors[:10].T, abs=1e-9
+    )
+    assert B.tau < 1 / 100
+    assert B.U @ B.U.T == pytest.approx(np.eye(len(B.U)), abs=1e-12)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [dict(rho=0.0), dict(rho=-1.0), dict(M=0.0), dict(beta=1.0), dict(beta=2.0),
-     dict(Gamma=-1.0), dict(lanczos_steps=0), dict(max_steps=-1)],
+     dict(Gamma=-1.0), dict(lanczos_steps=0), dict(max_steps=-1), dict(alpha=2.1),
+     dict(rho_growth=0.5), dict(expansion="gp"), dict(preconditioner="ilu"),
+     dict(norm="power"), dict(eliminate="yes")],
     ids=str,
 )  # fmt: skip
 def test_options_that_cannot_work_are_refused(wrong):
@@ -174,14 +221,14 @@ def test_every_product_with_F_is_counted(dual):
 
 
 def test_products_are_explained_by_the_steps(dual):
-    """10 Lanczos, homogenisation, start gradient; 1 per c or p, 2 per e, 3 per f; the
+    """12 Lanczos, homogenisation, start gradient; 1 per c or p, 2 per e, 3 per f; the
     residual on the original problem and its check."""
-    s = SMALBE().prepare(dual(271828), 1e-8)()
+    s = SMALBE().prepare(dual(271828), 1e-6)()
     c = s.counts
 
     steps = c.get("cg", 0) + c.get("proportioning", 0)
     steps += 2 * c.get("expansion", 0) + 3 * c.get("fallback", 0)
-    assert c["P_products"] == 10 + 1 + 1 + steps + 2
+    assert c["P_products"] == 12 + 1 + 1 + steps + 2
 
 
 def test_with_equalities_only_it_agrees_with_the_saddle_point_system():
@@ -234,30 +281,43 @@ def test_too_few_steps_are_not_called_solved(dual):
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_M_shrinks_while_the_lagrangian_grows_too_little(dual, seed):
     """And at no other time; checked from the recorded L, ‖Cν‖ and M."""
-    problem, options = projected_problem(dual(seed), 10), SMALBE(M=1e3, eta=1e9)
-    outer = smalbe(problem, options, 1e-8, first_iterate(problem, options)).outer
+    rho = 3.0
+    outer = outer_loop(projected(dual(seed)), M=1e3, eta=1e9, rho=rho).outer
 
-    needed = [options.rho / 2 * o.infeasibility**2 for o in outer[1:]]
+    needed = [rho / 2 * o.infeasibility**2 for o in outer[1:]]
     grown = np.diff([o.lagrangian for o in outer])
-    cut = [later.M < o.M for o, later in pairwise(outer[1:])]
+    cut = [later.M == o.M / 2 for o, later in pairwise(outer[1:])]
+    kept = [later.M == o.M for o, later in pairwise(outer[1:])]
     assert cut == (grown < needed)[:-1].tolist()
+    assert kept == [not c for c in cut]
     assert True in cut
     assert False in cut
 
 
-def test_the_carried_gradient_is_the_gradient(dual):
-    problem = projected_problem(dual(271828), 10)
-    options = SMALBE()
-    end = smalbe(problem, options, 1e-6, first_iterate(problem, options))
+def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(dual):
+    """By the growth where M is cut, and by 10 where it stalls."""
+    outer = outer_loop(projected(dual(271828)), M=1e3, eta=1e9, growth=4.0).outer
+    factors = [later.rho / o.rho for o, later in pairwise(outer[1:])]
+    cut = [later.M < o.M for o, later in pairwise(outer[1:])]
+
+    assert [f in (4, 40) for f in factors] == cut
+    assert {f for f, c in zip(factors, cut, strict=True) if not c} <= {1, 10}
+    assert True in cut
+
+
+@pytest.mark.parametrize("growth", [1.0, 4.0])
+def test_the_carried_gradient_is_the_gradient(dual, growth):
+    problem = projected(dual(271828))
+    end = outer_loop(problem, M=10.0, growth=growth, tol=1e-6)
     C = problem.rows.C
 
-    fresh = problem.H(end.nu, options.rho) - problem.b + C.T @ end.mu
-    assert end.g == pytest.approx(fresh, abs=1e-13)
+    fresh = problem.H(end.nu, end.rho) - problem.b + C.T @ end.mu
+    assert end.g == pytest.approx(fresh, abs=1e-12)
 
 
 def test_the_projected_problem_is_normalised_and_projected(dual):
     qp = dual(271828)
-    problem = projected_problem(qp, 30)
+    problem = projected(qp, 30)
     C = problem.rows.C
     H = np.column_stack([problem.H(v, 0.0) for v in np.eye(30)])
 
@@ -284,13 +344,30 @@ def test_a_short_lanczos_process_bounds_the_norm_closely_from_above(seed):
     H = W @ W.T
     norm = np.linalg.norm(H, 2)
 
-    assert norm * (1 - 1e-12) <= norm_estimate(lambda v: H @ v, 60, 12) <= 1.25 * norm
+    ritz = lanczos(lambda v: H @ v, rng.standard_normal(60), 12)
+    distances = abs(np.linalg.eigvalsh(H)[:, None] - ritz.values).min(axis=0)
+
+    assert norm * (1 - 1e-12) <= ritz.norm <= 1.25 * norm
+    assert (distances <= ritz.residuals * (1 + 1e-9)).all()
+    assert ritz.vectors @ ritz.vectors.T == pytest.approx(np.eye(12), abs=1e-12)
 
 
 def test_the_norm_of_a_low_rank_operator_ends_early():
     u = np.arange(1.0, 6.0)
 
-    assert norm_estimate(lambda v: u * (u @ v), 5, 10) == pytest.approx(u @ u)
+    assert lanczos(lambda v: u * (u @ v), u + 1, 5).norm == pytest.approx(u @ u)
+
+
+def test_the_power_method_stops_at_its_tolerance():
+    """Eigenvalues 1 and 1/2: the error falls by 4 each product, to 10⁻⁴ in a few."""
+    products = []
+
+    def H(v):
+        products.append(v)
+        return v * [1.0, 0.5]
+
+    assert power_method(H, 2) == pytest.approx(1.0, abs=1e-4)
+    assert 5 <= len(products) <= 10
 
 
 def test_inequality_rows_are_declined_with_a_way_out(planted):

@@ -1,0 +1,94 @@
+"""A quadratic model of the operator, minimised over a box without products with it.
+
+    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
+
+U holds the directions in which H is large, with w + τ their eigenvalues, and τ stands
+for H on all others. Where B is above H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimum
+of the right side over the box is a gradient projection step in the metric of B. Without
+U it is the ordinary one, x ← P(x − g/τ), whose length is dictated by ‖H‖; with a few
+directions taken out, by the rest of the spectrum. That B is above H is tested by the
+product that each step needs anyway: where it is not, τ is raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Vector
+from solvers import kernels
+from solvers.kernels import Mask
+
+NEWTON_STEPS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """B = τI + Uᵀdiag(w)U."""
+
+    tau: float
+    U: NDArray[np.float64]  #: (k, n) orthonormal rows
+    w: Vector  #: (k,) positive
+
+    @classmethod
+    def of_norm(cls, norm: float, n: int) -> Model:
+        """B = norm·I: what is known of an H (n, n) of which only the norm is known."""
+        return cls(norm, np.zeros((0, n)), np.zeros(0))
+
+    def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
+        """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
+
+        With y = WUs as multiplier, s(y) = P(x − (g + Uᵀy)/τ) − x, and y maximises a
+        concave, piecewise quadratic function of k variables whose gradient is
+        Us(y) − W⁻¹y: Newton's method with bisection ends on the right piece.
+        """
+        U, tau, w = self.U, self.tau, self.w
+
+        def at(y: Vector) -> tuple[float, Vector, Mask]:
+            s, free, value = kernels.tilted_step(x, g + y @ U, tau, *bounds)
+            return value - 0.5 * float((y / w) @ y), s, free
+
+        y = np.zeros(w.size)
+        value, s, free = at(y)
+        for _ in range(NEWTON_STEPS if w.size else 0):
+            U_f = U[:, free]
+            r = U @ s - y / w
+            dy = np.linalg.solve(np.diag(1 / w) + U_f @ U_f.T / tau, r)
+            ascent = float(r @ dy)
+            length = 1.0
+            new = at(y + dy)
+            while new[0] < value + 1e-4 * length * ascent and length > 1e-9:
+                length /= 2
+                new = at(y + length * dy)
+            same_piece = length == 1.0 and bool((new[2] == free).all())
+            y, (value, s, free) = y + length * dy, new
+            if same_piece:
+                break
+        return s
+
+    def raised(self, s: Vector, sHs: float) -> Model:
+        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
+        Us = self.U @ s
+        rest = float(s @ s - Us @ Us)
+        missing = sHs - self.tau * float(s @ s) - float((self.w * Us) @ Us)
+        tau = min(self.tau + missing / rest if rest > 0 else np.inf, 10 * self.tau)
+        return self.with_tail(tau)
+
+    def with_tail(self, tau: float) -> Model:
+        """Change τ and leave w + τ as it is, where that is above τ."""
+        w = self.w + self.tau - tau
+        return Model(tau, self.U[w > 0], w[w > 0])
+
+    def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
+        """Return v → B_FF⁻¹v_F, zero off the face F (Sherman, Morrison, Woodbury)."""
+        U_f = self.U * free
+        core = np.linalg.inv(np.diag(self.tau / self.w) + U_f @ U_f.T)
+
+        def apply(v: Vector) -> Vector:
+            v = np.where(free, v, 0.0)
+            return np.asarray(v - U_f.T @ (core @ (U_f @ v))) / self.tau
+
+        return apply

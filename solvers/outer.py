@@ -1,0 +1,185 @@
+"""The outer loop of SMALBE: multipliers of the equality rows, and how precise to be.
+
+Minimises ½νᵀHν − bᵀν subject to Cν = 0 and bounds, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
+Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
+Algorithm 6.1; `solvers.projected` makes that problem). For k = 0, 1, …:
+
+1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
+2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖² since the
+   last k: M ← βM, and ρ ← ρ·growth.
+3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed.
+
+until ‖g^P‖ ≤ tol‖b‖ and ‖Cν‖ ≤ tol‖x̃‖.
+
+Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ; and if
+then no feasible step lessens ½‖Cν‖² although Cν ≠ 0, there is no feasible point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from harness import Status, Vector
+from solvers.model import Model
+from solvers.mprgp import Minimum, Point, Precondition, Rules, Watch, mprgp, split
+from solvers.projected import Projected
+
+REACH = 1e6  #: how far to look for feasible points, in units of ‖x̃‖ + ‖ν‖
+NOISE = 1e-9  #: ‖Cν‖ in these units that rounding may leave
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The constants of the outer loop, relative to ‖𝒫F𝒫‖."""
+
+    M: float
+    beta: float
+    eta: float
+    rho_growth: float
+    max_steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Inner:
+    """How the inner problems are solved, for each ρ."""
+
+    rules: Rules
+    model: Callable[[float], Model]
+    precondition: Callable[[float], Precondition | None]
+    watch: Callable[[int, Vector], Watch] | None = None
+    """Makes the observer of outer iteration k with that right-hand side."""
+
+
+class Outer(NamedTuple):
+    """One outer iteration, as it ended."""
+
+    trace: str  #: the steps of its inner run
+    M: float  #: with which that ran
+    rho: float  #: with which that ran
+    infeasibility: float  #: ‖Cν‖
+    lagrangian: float  #: L(ν, μ), μ as in the inner run
+
+
+class Iterate(NamedTuple):
+    """The state of the outer loop."""
+
+    nu: Vector  #: (n,)
+    g: Vector  #: Hν − b + Cᵀμ
+    mu: Vector  #: (r,) multipliers of Cν = 0, relative to ‖𝒫F𝒫‖
+    M: float
+    rho: float
+    outer: tuple[Outer, ...] = ()
+    status: Status = Status.ITERATION_LIMIT
+
+    @property
+    def steps(self) -> str:
+        """All inner steps so far, one letter each."""
+        return "".join(o.trace for o in self.outer)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether neither of the last two outer iterations halved ‖Cν‖."""
+        errors = [o.infeasibility for o in self.outer[-3:]]
+        return len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
+
+
+def first_iterate(
+    problem: Projected, x: Vector, mu: Vector, *, M: float, rho: float
+) -> Iterate:
+    """Start from x, moved into the bounds, and μ; one product."""
+    nu = np.clip(x - problem.rows.x_tilde, *problem.bounds)
+    g = problem.H(nu, rho) - problem.b + problem.rows.C.T @ mu
+    return Iterate(nu, g, mu, M, rho)
+
+
+def smalbe(
+    problem: Projected, constants: Constants, inner: Inner, tol: float, at: Iterate
+) -> Iterate:
+    """Run the outer loop on from `at`."""
+    C, b = problem.rows.C, problem.b
+    b_size, x_size = _norm(b) or _norm(at.g), _norm(problem.rows.x_tilde)
+    left = constants.max_steps - len(at.steps) - len(at.outer)
+    lagrangian = -np.inf
+
+    def small(nu: Vector, projected: float) -> bool:
+        if projected > tol * b_size:
+            return False
+        return _norm(C @ nu) <= tol * (x_size or _norm(nu))
+
+    def precise(nu: Vector, projected: float) -> bool:
+        bound = constants.eta * b_size
+        if len(C) and projected < bound and projected < at.M * _norm(C @ nu):
+            return True
+        return small(nu, projected)
+
+    while True:
+        rhs = b - C.T @ at.mu
+        run = mprgp(
+            partial(problem.H, rho=at.rho), rhs, problem.bounds, (at.nu, at.g),
+            B=inner.model(at.rho), stop=precise, rules=inner.rules,
+            precondition=inner.precondition(at.rho),
+            watch=inner.watch and inner.watch(len(at.outer), rhs),
+            max_steps=max(left, 0),
+        )  # fmt: skip
+        left -= len(run.trace) + 1
+        at = _updated(problem, constants, at, run, lagrangian)
+        lagrangian = at.outer[-1].lagrangian
+        if small(at.nu, run.projected_norm):
+            return at._replace(status=Status.SOLVED)
+        if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
+            return at._replace(status=Status.INFEASIBLE)
+        if not run.stopped or left < 0:
+            return at
+        if at.stalled:
+            at = _with_penalty(problem, at, 10 * at.rho)
+
+
+def _updated(
+    problem: Projected, constants: Constants, at: Iterate, run: Minimum, before: float
+) -> Iterate:
+    """Do steps 2 and 3 after an inner run; `before` is the Lagrangian of the last."""
+    C, rho = problem.rows.C, at.rho
+    Cnu = C @ run.x
+    lagrangian = float(0.5 * run.x @ (run.g - problem.b + C.T @ at.mu))
+    enough = lagrangian >= before + rho / 2 * (Cnu @ Cnu)
+    done = Outer(run.trace, at.M, rho, _norm(Cnu), lagrangian)
+    new = at._replace(
+        nu=run.x,
+        g=run.g + rho * (C.T @ Cnu),
+        mu=at.mu + rho * Cnu,
+        M=at.M if enough else constants.beta * at.M,
+        outer=(*at.outer, done),
+    )
+    if enough or constants.rho_growth == 1:
+        return new
+    return _with_penalty(problem, new, constants.rho_growth * rho)
+
+
+def _infeasible(problem: Projected, nu: Vector) -> bool:
+    """Whether the bounds hold no point with Cν = 0 within REACH times the present size.
+
+    For a feasible ν*, convexity of ½‖Cν‖² gives ½‖Cν‖² ≤ ‖g^P‖ ‖ν − ν*‖ with its
+    projected gradient g^P.
+    """
+    Cnu = problem.rows.C @ nu
+    downhill = split(Point(nu, problem.rows.C.T @ Cnu), problem.bounds)
+    size = _norm(problem.rows.x_tilde) + _norm(nu)
+    error = _norm(Cnu)
+    return (
+        error > NOISE * size and error**2 > 2 * REACH * size * downhill.projected_norm
+    )
+
+
+def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:
+    """Change ρ; the gradient follows without a product."""
+    Qnu = problem.rows.C.T @ (problem.rows.C @ at.nu)
+    return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu)
+
+
+def _norm(v: Vector) -> float:
+    return float(np.linalg.norm(v))
