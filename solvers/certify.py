@@ -61,7 +61,12 @@ def prepared(
 ) -> Solve:
     """Eliminate the free variables where asked and possible; project; look at F."""
     history = History() if options.history else None
-    eliminated = eliminate_free(qp, carry and carry.block) if eliminate else None
+    eliminated = None
+    if eliminate and options.preconditioner in (
+        "model",
+        "none",
+    ):  # others need all of P
+        eliminated = eliminate_free(qp, carry and carry.block)
     inner = qp if eliminated is None else eliminated.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
@@ -71,7 +76,7 @@ def prepared(
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
         return lambda: (nowhere, None)
     start = _start(problem, options, carry)
-    if carry is not None and not 0.5 < _quotient(problem, start) / carry.quotient < 2:
+    if carry is not None and not _still_like(carry, problem, start):
         return prepared(qp, tol, options, None, eliminate=eliminate)
     if eliminated is not None and eliminated.columns:
         problem.counts["P_products"] += eliminated.columns
@@ -105,6 +110,11 @@ def _start(problem: Projected, options: Options, carry: Carry | None) -> Iterate
     if carry is not None:
         x, mu = carry.x, C @ carry.force / problem.spectrum.norm
     return first_iterate(problem, x, mu, M=options.M, rho=options.rho)
+
+
+def _still_like(carry: Carry, problem: Projected, at: Iterate) -> bool:
+    """Whether F is near enough to the one before for its spectrum to serve again."""
+    return 0.5 * carry.quotient < _quotient(problem, at) < 2 * carry.quotient
 
 
 def _quotient(problem: Projected, at: Iterate) -> float:

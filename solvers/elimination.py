@@ -55,7 +55,7 @@ class _Saddle:
 
     def __call__(self, top: Vector, bottom: Vector) -> tuple[Vector, Vector]:
         w = cho_solve(self.factor, top, check_finite=False)
-        if not bottom.size:
+        if not len(bottom):
             return w, bottom
         y = cho_solve(self.schur, self.G_E @ w - bottom, check_finite=False)
         return w - self.PG @ y, y
@@ -76,7 +76,7 @@ class _Reduced:
 
     def __matmul__(self, v: Vector) -> Vector:
         x_E, y = self.solve(-(self.P_EI @ v), -(self.G_I @ v))
-        return np.asarray(self.P_II @ v + x_E @ self.P_EI + y @ self.G_I)
+        return np.asarray(self.P_II @ v + self.P_EI.T @ x_E + self.G_I.T @ y)
 
 
 def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
@@ -103,7 +103,7 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
     reduced = QP(
         P=_Reduced(solve, P_EI, _block(qp.P, ~free, ~free), G_I),
-        q=qp.q[~free] + x_0 @ P_EI + y_0 @ G_I,
+        q=qp.q[~free] + P_EI.T @ x_0 + G_I.T @ y_0,
         A=N[:, ~free], b=others.T @ Cx, G=no_rows(int((~free).sum())), h=np.zeros(0),
         lb=qp.lb[~free], ub=qp.ub[~free],
     )  # fmt: skip

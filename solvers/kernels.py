@@ -91,12 +91,17 @@ def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
 @njit(cache=True)
 def tilted_step(
     x: Vector, g: Vector, tau: float, lower: Vector, upper: Vector
-) -> tuple[Vector, Mask, float]:
-    """Minimise gᵀs + τ/2‖s‖² over the box: s, what it leaves free, and the minimum."""
-    s, free, value = np.empty_like(x), np.empty(x.size, np.bool_), 0.0
+) -> tuple[Vector, NDArray[np.int8]]:
+    """Minimise gᵀs + τ/2‖s‖² over the box: s, and its piece.
+
+    The piece is −1 where s ends at the lower bound, 1 at the upper, 0 between.
+    """
+    s, piece = np.empty_like(x), np.zeros(x.size, np.int8)
     for i in range(x.size):
         target = x[i] - g[i] / tau
-        free[i] = lower[i] < target < upper[i]
-        s[i] = min(max(target, lower[i]), upper[i]) - x[i]
-        value += s[i] * (g[i] + 0.5 * tau * s[i])
-    return s, free, value
+        if target <= lower[i]:
+            target, piece[i] = lower[i], -1
+        elif target >= upper[i]:
+            target, piece[i] = upper[i], 1
+        s[i] = target - x[i]
+    return s, piece

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,15 @@ from harness import Vector
 from solvers import kernels
 from solvers.kernels import Mask
 
-NEWTON_STEPS = 50
+NEWTON_STEPS = 100
+
+
+class _Tilted(NamedTuple):
+    """What s(y) is at some y."""
+
+    s: Vector
+    piece: NDArray[np.int8]  #: at which bounds x + s is
+    slope: Vector  #: of the function of y
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,31 +52,28 @@ class Model:
 
         With y = WUs as multiplier, s(y) = P(x − (g + Uᵀy)/τ) − x, and y maximises a
         concave, piecewise quadratic function of k variables whose gradient is
-        Us(y) − W⁻¹y: Newton's method with bisection ends on the right piece.
+        Us(y) − W⁻¹y: Newton's method with a line search ends on the right piece.
         """
         U, tau, w = self.U, self.tau, self.w
 
-        def at(y: Vector) -> tuple[float, Vector, Mask]:
-            s, free, value = kernels.tilted_step(x, g + y @ U, tau, *bounds)
-            return value - 0.5 * float((y / w) @ y), s, free
+        def at(y: Vector) -> _Tilted:
+            s, piece = kernels.tilted_step(x, g + y @ U, tau, *bounds)
+            return _Tilted(s, piece, U @ s - y / w)
 
-        y = np.zeros(w.size)
-        value, s, free = at(y)
+        y: Vector = np.zeros(w.size)
+        here = at(y)
         for _ in range(NEWTON_STEPS if w.size else 0):
-            U_f = U[:, free]
-            r = U @ s - y / w
-            dy = np.linalg.solve(np.diag(1 / w) + U_f @ U_f.T / tau, r)
-            ascent = float(r @ dy)
-            length = 1.0
-            new = at(y + dy)
-            while new[0] < value + 1e-4 * length * ascent and length > 1e-9:
-                length /= 2
-                new = at(y + length * dy)
-            same_piece = length == 1.0 and bool((new[2] == free).all())
-            y, (value, s, free) = y + length * dy, new
-            if same_piece:
-                break
-        return s
+            U_f = U[:, here.piece == 0]
+            J = np.diag(1 / w) + U_f @ U_f.T / tau
+            dy: Vector = np.linalg.solve(J, here.slope)
+            there = at(y + dy)
+            if (there.piece == here.piece).all():  # where Newton's method is exact
+                return there.s
+            t, here = _searched(at, y, dy, (here, there))
+            y = y + t * dy
+        if not w.size:
+            return here.s
+        return Model.of_norm(tau + float(w.max()), x.size).step(x, g, bounds)
 
     def raised(self, s: Vector, sHs: float) -> Model:
         """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
@@ -92,3 +98,27 @@ class Model:
             return np.asarray(v - U_f.T @ (core @ (U_f @ v))) / self.tau
 
         return apply
+
+
+def _searched(
+    at: Callable[[Vector], _Tilted],
+    y: Vector,
+    dy: Vector,
+    ends: tuple[_Tilted, _Tilted],
+) -> tuple[float, _Tilted]:
+    """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0."""
+    there = ends[1]
+    first, slope = float(ends[0].slope @ dy), float(there.slope @ dy)
+    low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
+    while slope < -0.1 * first or (slope > 0.1 * first and t < 1):
+        share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+        t = low + (high - low) * min(max(share, 0.05), 0.95)
+        if not low < t < high:
+            break
+        there = at(y + t * dy)
+        slope = float(there.slope @ dy)
+        if slope > 0:
+            low, at_low = t, slope
+        else:
+            high, at_high = t, slope
+    return t, there

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 from sksparse.cholmod import cholesky
 
-from harness import QP, Matrix, Vector
+from harness import QP, Structure, Vector
 from solvers.kernels import Mask
 from solvers.mprgp import Operator, Precondition
 from solvers.projected import Projected
@@ -66,31 +66,39 @@ def face_preconditioner(
 
 def _whole(qp: QP, kind: Preconditioner) -> Operator:
     """Return M as a function."""
-    if kind == "diagonal" or qp.structure is None:
+    if kind == "diagonal":
         diagonal = qp.P.diagonal()
         inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
         return lambda v: inverse * v
-    acting = np.ones(qp.structure.K.shape[0], dtype=bool)
-    acting[qp.structure.fixed] = False
-    K = csc_matrix(qp.structure.K)[acting][:, acting]
-    B = csc_matrix(csc_matrix(qp.structure.B)[:, acting])
+    if qp.structure is None:
+        raise ValueError(lacking(qp, kind))
+    return _structural(qp.structure, _lumped if kind == "lumped" else _schur)
+
+
+def _structural(
+    structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
+) -> Operator:
+    """Return B_D S B_Dᵀ with the stiffness S of the interface."""
+    acting = np.ones(structure.K.shape[0], dtype=bool)
+    acting[structure.fixed] = False
+    K = csc_matrix(structure.K)[acting][:, acting]
+    B = csc_matrix(csc_matrix(structure.B)[:, acting])
     touched = np.diff(B.indptr) > 0
-    stiffness = _lumped(K, touched) if kind == "lumped" else _schur(K, touched)
+    stiffness = of_interface(K, touched)
     B = B[:, touched]
-    weights = 1 / K.diagonal()[touched]
-    BW = B @ diags_array(weights)
+    BW = B @ diags_array(1 / K.diagonal()[touched])
     jump = csc_matrix(BW @ B.T)
     jump += csc_matrix(diags_array(DEPENDENT * jump.diagonal()))
     solve = cholesky(jump)
     return lambda v: solve(BW @ stiffness(BW.T @ solve(v)))
 
 
-def _lumped(K: Matrix, touched: Mask) -> Operator:
+def _lumped(K: csc_matrix, touched: Mask) -> Operator:
     K_bb = K[touched][:, touched]
     return lambda u: K_bb @ u
 
 
-def _schur(K: Matrix, touched: Mask) -> Operator:
+def _schur(K: csc_matrix, touched: Mask) -> Operator:
     """Apply S_bb: one solve with K_ii."""
     K_bb, K_ib = K[touched][:, touched], csc_matrix(K[~touched][:, touched])
     solve = cholesky(csc_matrix(K[~touched][:, ~touched]))

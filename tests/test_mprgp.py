@@ -208,17 +208,17 @@ def test_permons_rules_take_permons_steps(
 def test_a_model_step_minimises_the_model_over_the_box():
     """KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u: exact after Newton's method."""
     rng = np.random.default_rng(271828)
-    U = np.linalg.qr(rng.standard_normal((40, 5)))[0].T
-    for scale in (1.0, 1e4):
-        B = Model(0.1, U, scale * rng.random(5))
+    for k, tau in 100 * ((5, 0.1), (5, 1e-5), (20, 0.01)):
+        U = np.linalg.qr(rng.standard_normal((40, k)))[0].T
+        B = Model(tau, U, 10 ** rng.uniform(-3, 4, k))
         x, g = rng.random(40), rng.standard_normal(40)
         s = B.step(x, g, (np.zeros(40), np.ones(40)))
-        slope = g + 0.1 * s + B.U.T @ (B.w * (B.U @ s))
+        slope = g + tau * s + B.U.T @ (B.w * (B.U @ s))
         down, up = x + s <= 1e-12, x + s >= 1 - 1e-12
 
-        assert slope[~(down | up)] == pytest.approx(0, abs=1e-9)
-        assert (slope[down] > -1e-9).all()
-        assert (slope[up] < 1e-9).all()
+        assert slope[~(down | up)] == pytest.approx(0, abs=1e-7)
+        assert (slope[down] > -1e-7).all()
+        assert (slope[up] < 1e-7).all()
         assert down.sum() + up.sum() > 5
 
 

@@ -1,0 +1,110 @@
+"""Eliminating the free variables: the same solution, through a smaller QP."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness import QP, Status, kkt_residuals, no_rows
+from solvers.elimination import eliminate_free
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+EXACT = SMALBE(eliminate="never")
+
+
+@pytest.fixture
+def dual():
+    """F positive definite, the first half free, r equality rows of which `apart` do not
+    meet the free variables."""
+
+    def draw(seed, n=24, r=3, apart=0):
+        rng = np.random.default_rng(seed)
+        W = rng.standard_normal((n, n))
+        G, x = rng.standard_normal((r, n)), rng.random(n)
+        G[:apart, : n // 2] = 0
+        return QP(
+            P=W @ W.T / n + 0.1 * np.eye(n), q=rng.standard_normal(n),
+            A=G, b=G @ x, G=no_rows(n), h=np.zeros(0),
+            lb=np.where(np.arange(n) < n // 2, -np.inf, 0.0), ub=np.full(n, np.inf),
+        )  # fmt: skip
+
+    return draw
+
+
+@pytest.mark.parametrize("seed", [271828, 314159])
+@pytest.mark.parametrize(("r", "apart"), [(0, 0), (3, 0), (3, 1), (3, 3)])
+def test_the_way_back_leads_to_a_kkt_point(dual, seed, r, apart):
+    qp = dual(seed, r=r, apart=apart)
+    small = eliminate_free(qp)
+    solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
+
+    assert small.qp.sizes["variables"] == 12
+    assert small.qp.sizes["equalities"] == apart
+    assert solution.status is Status.SOLVED
+    assert kkt_residuals(qp, solution).worst <= 1e-9
+
+
+def test_the_reduced_matrix_is_the_hessian_along_optimal_free_variables(dual):
+    """½vᵀP̂v + q̂ᵀv differs from the minimum over x_E of the whole cost by a constant."""
+    qp = dual(271828)
+    small = eliminate_free(qp)
+    rng = np.random.default_rng(161803)
+    gaps = []
+    for _ in range(3):
+        v = rng.random(12)
+        K = np.block(
+            [[qp.P[:12, :12], qp.A[:, :12].T], [qp.A[:, :12], np.zeros((3, 3))]]
+        )
+        rhs = np.append(-qp.q[:12] - qp.P[:12, 12:] @ v, qp.b - qp.A[:, 12:] @ v)
+        x = np.append(np.linalg.solve(K, rhs)[:12], v)
+        gaps.append(qp.objective(x) - small.qp.objective(v))
+    dense = small.qp.P @ np.eye(12)
+
+    assert gaps == pytest.approx([gaps[0]] * 3)
+    assert dense == pytest.approx(dense.T)
+
+
+def test_the_factor_is_used_again_only_for_the_same_block(dual):
+    qp = dual(271828)
+    first = eliminate_free(qp)
+    other_q = eliminate_free(replace(qp, q=2 * qp.q), first.block)
+    other_P = eliminate_free(replace(qp, P=qp.P + 1e-9 * np.eye(24)), first.block)
+
+    assert (first.columns, other_q.columns, other_P.columns) == (12, 0, 12)
+    assert other_q.block is first.block
+
+
+@pytest.mark.parametrize("why", ["no free", "all free", "singular", "rows", "operator"])
+def test_what_cannot_be_eliminated_is_left(dual, why):
+    qp = dual(271828)
+    inf = np.full(24, np.inf)
+    changed = {
+        "no free": dict(lb=np.zeros(24)),
+        "all free": dict(lb=-inf),
+        "singular": dict(P=np.diag(np.r_[np.zeros(12), np.ones(12)])),
+        "rows": dict(A=np.ones((2, 24)), b=np.array([1.0, 2.0])),
+        "operator": dict(P=type("Operator", (), {"shape": (24, 24)})()),
+    }
+
+    assert eliminate_free(replace(qp, **changed[why])) is None
+
+
+def test_the_solver_takes_either_way_to_the_same_point(dual):
+    qp = dual(314159, apart=1)
+    plain, small = (
+        SMALBE(eliminate=e).prepare(qp, 1e-10)() for e in ("never", "always")
+    )
+
+    assert small.x == pytest.approx(plain.x, abs=1e-7)
+    assert small.y == pytest.approx(plain.y, abs=1e-6)
+    assert small.z_box == pytest.approx(plain.z_box, abs=1e-7)
+    assert small.counts["factorised_columns"] == 12
+
+
+def test_on_bounds_only_it_agrees_with_the_reference(dual):
+    qp = dual(271828, r=0)
+    qp = replace(qp, lb=np.zeros(24))
+
+    x = SMALBE(eliminate="always").prepare(qp, 1e-10)().x
+    assert x == pytest.approx(reference_solution(qp).x, abs=1e-8)

@@ -1,0 +1,53 @@
+"""The telemetry of the in-house solvers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from solvers import SOLVERS
+from solvers.certify import STEPS
+from solvers.history import COLUMNS
+
+PRESETS = [
+    "smalbe",
+    "smalbe-condensed",
+    "smalbe-permon",
+    "smalbe-espreso",
+    "smalbe-paper",
+]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("shape", ["box", "some bounds"])
+def test_a_history_tells_what_happened(planted, name, shape):
+    qp, _ = planted(shape, seed=271828)
+    solver = replace(SOLVERS[name], history=True)
+    s = solver.prepare(qp, 1e-8)()
+    h = s.history
+
+    assert tuple(h) == COLUMNS
+    assert {len(column) for column in h.values()} == {s.iterations}
+    for letter, step in STEPS.items():
+        assert (h["step"] == letter).sum() == s.counts.get(step, 0)
+    for growing in ("outer", "products", "seconds"):
+        assert (np.diff(h[growing]) >= 0).all()
+    assert h["outer"][-1] < s.counts["outer"]
+    assert h["products"][-1] <= s.counts["P_products"]
+    within = np.diff(h["outer"]) == 0  # the cost falls while the multipliers stand
+    if name != "smalbe-paper":
+        assert np.diff(h["cost"])[within].max() <= 1e-12 * abs(h["cost"]).max()
+    assert h["active"][-1] == (s.x <= qp.lb).sum() + (s.x >= qp.ub).sum()
+    size = np.hypot(h["free_gradient"], h["chopped_gradient"])
+    assert size[-1] < 1e-6 * size[0]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_history_changes_nothing_and_is_off_by_default(planted, name):
+    qp, _ = planted("some bounds", seed=314159)
+    plain = SOLVERS[name].prepare(qp, 1e-8)()
+    kept = replace(SOLVERS[name], history=True).prepare(qp, 1e-8)()
+
+    assert plain.history == {}
+    assert kept.counts == plain.counts
+    assert (kept.x == plain.x).all()

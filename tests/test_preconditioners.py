@@ -1,0 +1,141 @@
+"""Preconditioners in the face: exact where they can be, masked, counted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness import QP, Status, Structure, kkt_residuals, no_rows
+from harness.qpfile import load_qp, save_qp
+from problems import PROBLEMS
+from solvers.preconditioner import face_preconditioner
+from solvers.projected import by_lanczos, projected_problem
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
+
+
+def chain(n):
+    """Stiffness of n springs in a row, held at the left end."""
+    K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    K[-1, -1] = 1
+    return K
+
+
+@pytest.fixture
+def gap():
+    """A dual of one body: rows pick every third node, F = BK⁻¹Bᵀ."""
+    K, B = chain(30), np.eye(30)[::3]
+    structure = Structure(
+        K=csr_array(K), B=csr_array(B), fixed=np.zeros(0, dtype=np.int64)
+    )
+    n = len(B)
+    return QP(
+        P=B @ np.linalg.solve(K, B.T), q=np.linspace(-1, 2, n), A=no_rows(n),
+        b=np.zeros(0), G=no_rows(n), h=np.zeros(0), lb=np.zeros(n),
+        ub=np.full(n, np.inf), structure=structure,
+    )  # fmt: skip
+
+
+def whole(qp, kind):
+    """The preconditioner on the face of all components, as a matrix."""
+    problem = projected_problem(qp, lambda PFP, rows: by_lanczos(PFP, rows, steps=8))
+    n = qp.q.size
+    apply = face_preconditioner(problem, qp, kind)(1.0)(np.full(n, True))
+    return np.column_stack([apply(v) for v in np.eye(n)]) / problem.spectrum.norm
+
+
+def test_dirichlet_inverts_the_dual_of_one_body(gap):
+    """Where B picks components, B_D S B_Dᵀ = (BK⁻¹Bᵀ)⁻¹."""
+    assert whole(gap, "dirichlet") @ gap.P == pytest.approx(np.eye(10), abs=1e-7)
+
+
+def test_lumped_is_the_stiffness_at_the_interface(gap):
+    K_bb = gap.structure.K.toarray()[::3, ::3]
+
+    assert whole(gap, "lumped") == pytest.approx(K_bb, abs=1e-8)
+
+
+def test_diagonal_divides_by_the_diagonal(gap):
+    assert whole(gap, "diagonal") @ np.diag(gap.P) == pytest.approx(np.ones(10))
+
+
+@pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
+def test_held_components_stay_out(kind):
+    """A chain held in the middle is two chains."""
+    K, B = chain(9), np.eye(9)[[1, 3, 6, 8]]
+    free = np.arange(9) != 4
+    F = B[:, free] @ np.linalg.solve(K[np.ix_(free, free)], B[:, free].T)
+    structure = Structure(K=csr_array(K), B=csr_array(B), fixed=np.array([4]))
+    qp = QP(
+        P=F, q=-np.ones(4), A=no_rows(4), b=np.zeros(0), G=no_rows(4), h=np.zeros(0),
+        lb=np.zeros(4), ub=np.full(4, np.inf), structure=structure,
+    )  # fmt: skip
+    M = whole(qp, kind)
+
+    assert abs(M[:2, 2:]).max() < 1e-12
+    assert np.linalg.eigvalsh(M).min() > 0
+    if kind == "dirichlet":
+        assert pytest.approx(np.eye(4), abs=1e-7) == M @ F
+
+
+def test_a_masked_preconditioner_stays_in_the_face(gap):
+    problem = projected_problem(gap, lambda PFP, rows: by_lanczos(PFP, rows, steps=8))
+    free = np.arange(10) % 2 == 0
+    z = face_preconditioner(problem, gap, "dirichlet")(1.0)(free)(np.ones(10))
+
+    assert (z[~free] == 0).all()
+    assert (z[free] != 0).all()
+
+
+@pytest.mark.parametrize("kind", ["dirichlet", "lumped"])
+def test_structural_ones_are_declined_without_structure(gap, kind):
+    solver = SMALBE(preconditioner=kind)
+
+    assert "structure" in solver.declines(replace(gap, structure=None))
+    assert solver.declines(gap) is None
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+@pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
+def test_they_lead_to_the_solution_and_are_counted(form, kind):
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=4, Nh=3))
+    qp = family.build(form, params, reference_solution).qp
+    s = SMALBE(preconditioner=kind, **BETWEEN).prepare(qp, 1e-8)()
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 1e-7
+    assert s.counts["preconditioner_applies"] > 0
+
+
+def test_structure_survives_the_file(gap, tmp_path):
+    save_qp(tmp_path / "qp.npz", gap, {})
+    loaded, _ = load_qp(tmp_path / "qp.npz")
+
+    assert (loaded.structure.K != gap.structure.K).nnz == 0
+    assert (loaded.structure.B != gap.structure.B).nnz == 0
+    assert (loaded.structure.fixed == gap.structure.fixed).all()
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_the_matrix_of_a_dual_is_what_its_structure_says(form):
+    """P = BK⁺Bᵀ: on self-equilibrated λ, whatever the generalised inverse."""
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=4, Nh=3))
+    qp = family.build(form, params, reference_solution).qp
+    K, B = qp.structure.K.toarray(), qp.structure.B.toarray()
+    free = np.setdiff1d(np.arange(len(K)), qp.structure.fixed)
+    F = (
+        B[:, free]
+        @ np.linalg.pinv(K[np.ix_(free, free)], hermitian=True)
+        @ B[:, free].T
+    )
+    A = qp.A.toarray() if hasattr(qp.A, "toarray") else qp.A
+    rows = np.linalg.qr(A.T)[0] if len(A) else np.zeros((qp.q.size, 0))
+    project = np.eye(qp.q.size) - rows @ rows.T
+
+    difference = project @ (F - qp.P) @ project
+    assert abs(difference).max() <= 1e-9 * abs(qp.P).max()

@@ -1,0 +1,90 @@
+"""A warm solver on a sequence: fewer products, the same answers, no trust in luck."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness import Status, kkt_residuals
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+WARM = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
+
+
+@pytest.fixture(scope="module")
+def load_steps():
+    family = PROBLEMS["beam-ring"]
+
+    def build(form):
+        return [
+            family.build(
+                form, family.complete(dict(Nr=4, Nh=3, step=k)), reference_solution
+            ).qp
+            for k in range(1, 11)
+        ]
+
+    return {form: build(form) for form in ("dual", "dual-bounds")}
+
+
+@pytest.mark.parametrize("name", WARM)
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, name):
+    solver, tol = SOLVERS[name], 1e-8
+    prepare = solver.chain(tol)
+    warm = [prepare(qp)() for qp in load_steps[form]]
+    cold = [solver.prepare(qp, tol)() for qp in load_steps[form]]
+
+    def products(solutions):
+        return sum(s.counts["P_products"] for s in solutions[1:])
+
+    for qp, s in zip(load_steps[form], warm, strict=True):
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 10 * tol
+    assert products(warm) < 0.9 * products(cold)
+
+
+def test_half_the_products_again_and_the_support_block_factorised_once(load_steps):
+    """Everything counted, the 36 columns of F_EE too."""
+    prepare = SMALBE().chain(1e-8)
+    warm = [prepare(qp)().counts for qp in load_steps["dual"]]
+    cold = [SMALBE().prepare(qp, 1e-8)().counts for qp in load_steps["dual"]]
+
+    def total(counts):
+        return sum(c["P_products"] for c in counts)
+
+    columns = [c.get("factorised_columns", 0) for c in warm]
+    assert columns == [38] + 9 * [0]
+    assert total(warm) <= total(cold) / 2
+
+
+@pytest.mark.parametrize("name", WARM)
+def test_steps_that_share_nothing_are_solved_as_well(load_steps, planted, name):
+    """Other sizes, other scales, other signs, an infeasible one in between."""
+    qp, other = load_steps["dual"][9], load_steps["dual"][0]
+    box, _ = planted("box", seed=271828)
+    impossible = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))
+    sequence = [qp, box, qp, replace(qp, P=1e6 * qp.P, q=1e6 * qp.q), other, impossible]
+    sequence += [replace(qp, P=1e-6 * qp.P), replace(qp, q=-qp.q), qp]
+    prepare = SOLVERS[name].chain(1e-6)
+    found = [prepare(qp)() for qp in sequence]
+
+    for qp, s in zip(sequence, found, strict=True):
+        if qp is impossible:
+            assert s.status is Status.INFEASIBLE
+        else:
+            assert s.status is Status.SOLVED
+            assert kkt_residuals(qp, s).worst <= 1e-5
+
+
+def test_sequences_are_independent_of_each_other(load_steps):
+    qps = load_steps["dual-bounds"][:3]
+    solver = SMALBE()
+    one, two = solver.chain(1e-8), solver.chain(1e-8)
+    alternating = [(one(qp)().counts, two(qp)().counts) for qp in qps]
+    alone = solver.chain(1e-8)
+
+    assert [a for a, _ in alternating] == [alone(qp)().counts for qp in qps]
+    assert all(a == b for a, b in alternating)
