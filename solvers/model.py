@@ -65,7 +65,7 @@ class Model:
         for _ in range(NEWTON_STEPS if w.size else 0):
             U_f = U[:, here.piece == 0]
             J = np.diag(1 / w) + U_f @ U_f.T / tau
-            dy: Vector = np.linalg.solve(J, here.slope)
+            dy = np.asarray(np.linalg.solve(J, here.slope), dtype=np.float64)
             there = at(y + dy)
             if (there.piece == here.piece).all():  # where Newton's method is exact
                 return there.s

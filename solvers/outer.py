@@ -9,7 +9,7 @@ Algorithm 6.1; `solvers.projected` makes that problem). For k = 0, 1, …:
    last k: M ← βM, and ρ ← ρ·growth.
 3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed.
 
-until ‖g^P‖ ≤ tol‖b‖ and ‖Cν‖ ≤ tol‖x̃‖.
+until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ; and if
 then no feasible step lessens ½‖Cν‖² although Cν ≠ 0, there is no feasible point.
@@ -102,14 +102,12 @@ def smalbe(
 ) -> Iterate:
     """Run the outer loop on from `at`."""
     C, b = problem.rows.C, problem.b
-    b_size, x_size = _norm(b) or _norm(at.g), _norm(problem.rows.x_tilde)
+    b_size = _norm(b) or _norm(at.g)
     left = constants.max_steps - len(at.steps) - len(at.outer)
     lagrangian = -np.inf
 
     def small(nu: Vector, projected: float) -> bool:
-        if projected > tol * b_size:
-            return False
-        return _norm(C @ nu) <= tol * (x_size or _norm(nu))
+        return projected <= tol * b_size and problem.rows.met(nu, tol)
 
     def precise(nu: Vector, projected: float) -> bool:
         bound = constants.eta * b_size

@@ -24,9 +24,22 @@ class Rows(NamedTuple):
     """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
 
     C: NDArray[np.float64]  #: (r, n)
+    GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
+    e_size: float  #: ‖e‖
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
     consistent: bool  #: whether there is one
     multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
+
+    def met(self, nu: Vector, tol: float) -> bool:
+        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖; for e = 0, ‖Cν‖ ≤ tol‖ν‖."""
+        Cnu = self.C @ nu
+        if self.e_size == 0:
+            return bool(np.linalg.norm(Cnu) <= tol * np.linalg.norm(nu))
+        size = np.linalg.norm(self.x_tilde)
+        return bool(
+            np.linalg.norm(Cnu) <= tol * size
+            and np.linalg.norm(self.GC @ Cnu) <= tol * self.e_size
+        )
 
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
@@ -107,7 +120,8 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
         return y
 
     consistent = bool((mismatch <= 1e-8 * scale).all())
-    return Rows(np.ascontiguousarray(C), x_tilde, consistent, multipliers)
+    C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
+    return Rows(C, dense @ C.T, e_size, x_tilde, consistent, multipliers)
 
 
 def projected_problem(

@@ -31,7 +31,7 @@ from solvers.preconditioner import lacking
 class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equalities; needs only products with P.
 
-    `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖x̃‖ of the projected problem. A point is claimed
+    `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. A point is claimed
     solved only if its KKT residuals on the original problem are within 5·tol as well.
     """
 

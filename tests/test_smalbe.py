@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from harness import QP, Status, kkt_residuals, no_rows
+from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.mprgp import Rules
 from solvers.outer import Constants, Inner, first_iterate, smalbe
 from solvers.projected import by_lanczos, orthonormal_rows, projected_problem
+from solvers.reference import reference_solution
 from solvers.smalbe import SMALBE
 from solvers.spectrum import lanczos, power_method
 
@@ -412,3 +414,43 @@ def test_every_combination_of_rules_solves(
 
         assert s.status is Status.SOLVED
         assert kkt_residuals(qp, s).worst <= 1e-7
+
+
+@pytest.mark.parametrize(
+    ("Nr", "Nh", "step", "half_of_permons_best"),
+    [
+        (4, 3, 1, (46, 56)), (4, 3, 10, (54, 73)),
+        (12, 6, 5, (59, 84)), (12, 6, 10, (72, 103)),
+        pytest.param(30, 15, 1, (66, 102), marks=pytest.mark.slow),
+        pytest.param(30, 15, 5, (64, 107), marks=pytest.mark.slow),
+        pytest.param(30, 15, 10, (88, 127), marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
+    """PERMON's are measured on these QPs, at its best setting, to 1e-6 and 1e-8; the
+    stopping test is recomputed here from the QP."""
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=Nr, Nh=Nh, step=step))
+    qp = family.build("dual", params, reference_solution).qp
+    x_tilde = np.linalg.lstsq(qp.A, qp.b)[0]
+    project = np.eye(qp.q.size) - np.linalg.pinv(qp.A) @ qp.A
+    size = np.linalg.norm(project @ (qp.q + qp.P @ x_tilde))
+    for tol, most in zip((1e-6, 1e-8), half_of_permons_best, strict=True):
+        s = SMALBE().prepare(qp, tol)()
+        slope = qp.P @ s.x + qp.q + qp.A.T @ s.y
+        projected_gradient = np.where(s.x > qp.lb, slope, np.minimum(slope, 0))
+
+        assert np.linalg.norm(projected_gradient) <= tol * size
+        assert np.linalg.norm(qp.A @ s.x - qp.b) <= tol * np.linalg.norm(qp.b)
+        assert s.counts["P_products"] <= most
+
+
+@pytest.mark.slow
+def test_few_products_with_bounds_alone():
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=30, Nh=15, step=5))
+    qp = family.build("dual-bounds", params, reference_solution).qp
+    s = SMALBE().prepare(qp, 1e-8)()
+
+    assert kkt_residuals(qp, s).worst <= 1e-7
+    assert s.counts["P_products"] <= 50

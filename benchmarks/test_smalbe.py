@@ -1,0 +1,158 @@
+"""SMALBE: products with F against PERMON's, time against every generic solver."""
+
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from harness import Status, kkt_residuals
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.outer import first_iterate
+from solvers.products import product
+from solvers.projected import by_lanczos, projected_problem
+from solvers.reference import reference_solution
+
+#: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8
+PERMON = {
+    (4, 3, 1): (92, 112), (4, 3, 10): (109, 146),
+    (12, 6, 5): (119, 169), (12, 6, 10): (144, 206),
+    (30, 15, 1): (132, 204), (30, 15, 5): (129, 214), (30, 15, 10): (176, 255),
+}  # fmt: skip
+TOLERANCES = (1e-6, 1e-8)
+OURS = ("smalbe", "smalbe-condensed", "pdas", "projected-gradient", "bvls")
+
+
+def dual(Nr, Nh, step, form="dual"):
+    family = PROBLEMS["beam-ring"]
+    params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
+    return family.build(form, params, reference_solution).qp
+
+
+def seconds(solver, qp, tol):
+    start = perf_counter()
+    solver.prepare(qp, tol)()
+    return perf_counter() - start
+
+
+def verifies(solver, qp, tol):
+    if solver.declines(qp) is not None:
+        return False
+    try:
+        return kkt_residuals(qp, solver.prepare(qp, tol)()).worst <= 10 * tol
+    except ImportError:
+        return False
+
+
+def products(s):
+    assert s.status is Status.SOLVED
+    return s.counts["P_products"]
+
+
+@pytest.mark.parametrize("name", [n for n in SOLVERS if n.startswith("smalbe")])
+def test_products_with_F(note, name):
+    """Everything counted: norm, homogenisation, start, checks, factorised columns."""
+    for (Nr, Nh, step), best in PERMON.items():
+        cells = []
+        for form in ("dual", "dual-bounds"):
+            qp = dual(Nr, Nh, step, form)
+            for tol in TOLERANCES:
+                s = SOLVERS[name].prepare(qp, tol)()
+                assert kkt_residuals(qp, s).worst <= 10 * tol
+                cells.append(f"{s.counts['outer']}/{products(s)}")
+        note(
+            f"{name:18} {Nr},{Nh},{step:<3} dual {cells[0]:>7} {cells[1]:>7}   bounds "
+            f"{cells[2]:>6} {cells[3]:>6}   PERMON's best {best[0]} {best[1]}"
+        )
+
+
+@pytest.mark.parametrize("preconditioner", ["diagonal", "lumped", "dirichlet"])
+def test_products_with_other_preconditioners(note, preconditioner):
+    """In place of the inverse of the model; applies are counted apart."""
+    solver = replace(SOLVERS["smalbe"], preconditioner=preconditioner)
+    for Nr, Nh, step in PERMON:
+        cells = []
+        for tol in TOLERANCES:
+            s = solver.prepare(dual(Nr, Nh, step), tol)()
+            cells.append(f"{products(s)} + {s.counts['preconditioner_applies']}")
+        note(
+            f"{preconditioner:10} {Nr},{Nh},{step:<3} dual {cells[0]:>10} {cells[1]:>10}"
+        )
+
+
+@pytest.mark.parametrize(("Nr", "Nh"), [(4, 3), (12, 6), (30, 15)])
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_products_of_a_load_path(note, form, Nr, Nh):
+    qps = [dual(Nr, Nh, step, form) for step in range(1, 11)]
+    for eliminate in ("sequences", "never"):
+        solver = replace(SOLVERS["smalbe"], eliminate=eliminate)
+        for tol in TOLERANCES:
+            prepare = solver.chain(tol)
+            warm = [products(prepare(qp)()) for qp in qps]
+            cold = [products(solver.prepare(qp, tol)()) for qp in qps]
+            note(
+                f"path {Nr},{Nh} {form:11} {tol:.0e} eliminate={eliminate:9}: "
+                f"warm {np.mean(warm):.1f} a step ({warm[0]} at the first), "
+                f"cold {np.mean(cold):.1f}"
+            )
+
+
+@pytest.mark.parametrize(
+    ("Nr", "Nh"), [(12, 6), (24, 12), (30, 15), (60, 30), (130, 65)]
+)
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
+    """Prepare and solve, tolerance 1e-6, all that verify; the slow ones only once."""
+    qp, tol = dual(Nr, Nh, 10, form), 1e-6
+    least = {
+        name: min(seconds(solver, qp, tol) for _ in range(3))
+        for name, solver in SOLVERS.items()
+        if not name.endswith("*") and verifies(solver, qp, tol)
+    }
+    ours = [name for name in OURS if name in least]
+    generic = [n for n in least if n not in ours and not n.startswith("smalbe")]
+    foreign = sorted(generic, key=least.get)[:3]
+    medians = race(
+        rounds=9,
+        **{
+            name: partial(seconds, SOLVERS[name], qp, tol) for name in (*ours, *foreign)
+        },
+    )
+    fastest = min(foreign, key=medians.__getitem__)
+    best = min(ours, key=medians.__getitem__)
+    ratio = {name: medians[name] / medians[fastest] for name in ("smalbe", best)}
+    note(
+        f"{form} m={qp.q.size}: fastest generic {fastest} "
+        f"{1e3 * medians[fastest]:.2f} ms; smalbe × {ratio['smalbe']:.2f}, "
+        f"our fastest {best} × {ratio[best]:.2f}"
+    )
+
+
+@pytest.mark.parametrize(("Nr", "Nh"), [(30, 15), (60, 30), (130, 65)])
+def test_a_step_costs_a_product_and_little_more(race, note, Nr, Nh):
+    """Time per step of a long run against one symmetric matrix-vector product."""
+    qp = dual(Nr, Nh, 10)
+    solver = replace(SOLVERS["smalbe"], eliminate="never")
+    short, long = (solver.prepare(qp, tol)().iterations for tol in (1e-3, 1e-10))
+    v, P = np.ones(qp.q.size), product(qp.P)
+    problem = projected_problem(qp, lambda F, rows: by_lanczos(F, rows, steps=12))
+    at = first_iterate(problem, v, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4)
+
+    def repeated(f):
+        return lambda: [f() for _ in range(50)]
+
+    medians = race(
+        rounds=15,
+        product=repeated(lambda: P(v)),
+        operator=repeated(lambda: problem.H(at.nu, 1e4)),
+        short=lambda: solver.prepare(qp, 1e-3)(),
+        long=lambda: solver.prepare(qp, 1e-10)(),
+    )
+    step = (medians["long"] - medians["short"]) / (long - short)
+    note(
+        f"m={qp.q.size}: a step {1e6 * step:.1f} µs, a product "
+        f"{1e6 * medians['product'] / 50:.1f} µs, "
+        f"with projector and penalty {1e6 * medians['operator'] / 50:.1f} µs"
+    )
