@@ -77,9 +77,7 @@ def test_products_with_other_preconditioners(note, preconditioner):
         for tol in TOLERANCES:
             s = solver.prepare(dual(Nr, Nh, step), tol)()
             cells.append(f"{products(s)} + {s.counts['preconditioner_applies']}")
-        note(
-            f"{preconditioner:10} {Nr},{Nh},{step:<3} dual {cells[0]:>10} {cells[1]:>10}"
-        )
+        note(f"{preconditioner} {Nr},{Nh},{step} dual {cells[0]:>10} {cells[1]:>10}")
 
 
 @pytest.mark.parametrize(("Nr", "Nh"), [(4, 3), (12, 6), (30, 15)])
