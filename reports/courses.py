@@ -45,7 +45,11 @@ def _pictures(c: Comparison, i: int) -> list[Picture]:
     pictures = []
     if figure := convergence_figure(c):
         kinds = marked(c)
-        marks = f" Marks: {', '.join(kinds)} steps." if kinds else ""
+        marks = (
+            f" Marks, where they do not overlap: {', '.join(kinds)} steps."
+            if kinds
+            else ""
+        )
         caption = (
             f"Convergence on {where}: {_quantities(c)}, over {over}. Zeros are "
             f"not drawn.{marks}{ticks} Runs {runs}."

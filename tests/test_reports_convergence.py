@@ -1,6 +1,6 @@
 """Figures of histories: what is drawn is what was told, of the cases that were chosen.
 
-The first course below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (1.5, 2),
+The first course below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
 (0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
 """
 
@@ -18,7 +18,7 @@ from reports.histories import MOST, chosen
 
 KNOWN = {
     "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],
-    "free_gradient": [3, 1.5, 0.3, 0], "chopped_gradient": [4, 2, 0.4, 0],
+    "free_gradient": [3, 2.4, 0.3, 0], "chopped_gradient": [4, 0.7, 0.4, 0],
     "infeasibility": [1, 0.0, 1e-3, 1e-7], "active": [9, 4, 6, 6],
 }  # fmt: skip
 MARKERS = {"e": "^", "f": "x", "p": "o"}
