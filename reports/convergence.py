@@ -24,6 +24,7 @@ KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning",
 WIDE = 10.0  #: ratio of the longest course to the shortest that makes their axis log
 CLOSEST = 5.0  #: distance of marks of one kind on a curve, in points
 COLUMNS = 4  #: of a legend
+FLOOR = 1e-5  #: times the tolerance: less is rounding, and not shown
 
 
 def convergence_figure(c: Comparison) -> Figure | None:
@@ -113,6 +114,9 @@ def _curves(axes: Axes, c: Comparison, drawn: Sequence[tuple[Course, Vector]]) -
         seen = _positive(values)
         axes.plot(c.work(course)[seen], values[seen], **_style(c, course))
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    floor = FLOOR * drawn[0][0].outcome.tol
+    axes.set_ylim(bottom=max(low, min(floor, high / 10)))
     axes.yaxis.set_major_locator(LogLocator(numticks=8))
     axes.yaxis.set_minor_locator(NullLocator())
 

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from reports.convergence import active_set_figure, convergence_figure, marked
+from reports.convergence import (
+    FLOOR,
+    active_set_figure,
+    convergence_figure,
+    marked,
+)
 from reports.data import Evidence
 from reports.histories import RULE, Comparison, chosen, unread
 from reports.layout import Picture, Section
@@ -51,8 +56,8 @@ def _pictures(c: Comparison, i: int) -> list[Picture]:
             else ""
         )
         caption = (
-            f"Convergence on {where}: {_quantities(c)}, over {over}. Zeros are "
-            f"not drawn.{marks}{ticks} Runs {runs}."
+            f"Convergence on {where}: {_quantities(c)}, over {over}. What is "
+            f"below {FLOOR:g} tol is not drawn.{marks}{ticks} Runs {runs}."
         )
         name = f"convergence-{i}"
         pictures.append(Picture(name=name, caption=caption, figure=figure))

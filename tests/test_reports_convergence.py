@@ -91,6 +91,16 @@ def test_the_projected_gradient_is_drawn_relative_to_its_first_value(folder):
     assert figure.axes[-1].get_xlabel() == "products with $P$"
 
 
+def test_rounding_far_below_the_tolerance_does_not_squeeze_the_curves(folder):
+    tiny = KNOWN | {"free_gradient": [3, 1, 1e-20, 0], "chopped_gradient": [4, 0, 0, 0]}
+    low, high = (
+        convergence_figure(comparison(folder(("a", tiny, {})))).axes[0].get_ylim()
+    )
+
+    assert low == pytest.approx(1e-11)  # the tolerance is 1e-6
+    assert high > 1
+
+
 def test_steps_are_marked_by_kind_on_the_upper_panel_and_cg_is_bare(folder):
     gradient, infeasibility, _ = convergence_figure(
         comparison(folder(("a", KNOWN, {})))
