@@ -16,6 +16,7 @@ from harness.build import build, unbuilt
 from harness.doctor import QUIET_LOAD, advice, noise_floor, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
+from harness.history import History
 from harness.journal import read_journal
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
@@ -23,7 +24,7 @@ from harness.names import CaseName, canonical, completed, parse
 from harness.plugin import Case, Fields
 from harness.progress import shown_on
 from harness.qpfile import save_qp
-from harness.record import Record, Verdict
+from harness.record import Record, Verdict, finite
 from harness.registry import SolverSpec, options_of, resolve
 from harness.remote import measured_once
 from harness.run import run as run_suite
@@ -123,6 +124,9 @@ def solve(workbench: Workbench, options: Namespace) -> int:
     name = parse(options.case, workbench.families)
     spec = SolverSpec(name=options.solver, label=options.solver)
     solver = resolve(spec, workbench.solvers)
+    if options_of(solver).get("history") is False:  # what it costs is not at stake here
+        spec = replace(spec, options={"history": True})
+        solver = resolve(spec, workbench.solvers)
     case = _built(workbench, name)
     record = blank(
         name,
@@ -141,7 +145,7 @@ def solve(workbench: Workbench, options: Namespace) -> int:
     command = workbench.worker_command(spec, options.plugin)
     with redirect_stdout(sys.stderr):  # whatever the family prints
         record, solution = measured_once(command, case, record)
-    _show(record, options.json)
+    _show(record, solution.history if solution else {}, options.json)
     if drawn and case.fields is not None:
         if solution is not None and has_point(solution):
             _draw(workbench, options, name, case.fields(solution))
@@ -266,11 +270,14 @@ def _built(workbench: Workbench, name: CaseName) -> Case:
         raise InputError(f"{origin}: {text}" if origin else text) from e
 
 
-def _show(record: Record, as_json: bool) -> None:
+def _show(record: Record, history: History, as_json: bool) -> None:
     if as_json:
-        print(record.to_json())
+        row = {**json.loads(record.to_json()), "history": finite(plain(history))}
+        print(json.dumps(row, allow_nan=False))
     elif record.status is not Verdict.DECLINED:
         print(show.outcome(record))
+        if table := show.convergence(history):
+            print(f"\n{table}")
     if record.status is Verdict.DECLINED:
         _say(f"{record.solver} declines {record.case}: {record.message}")
 

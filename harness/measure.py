@@ -11,6 +11,7 @@ from time import perf_counter
 
 import numpy as np
 
+from harness.history import usable
 from harness.plugin import Solver
 from harness.qp import QP
 from harness.solution import Solution, Status
@@ -104,6 +105,8 @@ def _checked(answer: object, qp: QP) -> Solution:
 
 def _plain(s: Solution) -> Solution:
     """Replace whatever compares or prints like the right type by the right type."""
+    history, objection = usable(s.history)
+    message = "; ".join(filter(None, [str(s.message), objection]))
     return replace(
         s,
         status=Status(s.status),
@@ -113,7 +116,8 @@ def _plain(s: Solution) -> Solution:
         z_box=np.asarray(s.z_box, dtype=float),
         iterations=None if s.iterations is None else int(s.iterations),
         counts={str(name): int(count) for name, count in s.counts.items()},
-        message=" ".join(str(s.message).split()),
+        message=" ".join(message.split()),
+        history=history,
     )
 
 

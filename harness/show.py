@@ -8,6 +8,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.history import History
 from harness.record import Record, Verdict
 from harness.solution import Status
 
@@ -19,6 +23,13 @@ UNITS = {
     "multiplier_sum": "N/m",
     "max_von_mises": "Pa",
 }
+
+
+_HEADS = {
+    "free_gradient": "‖φ‖", "chopped_gradient": "‖β‖", "infeasibility": "‖Ax−b‖",
+}  # fmt: skip
+_UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
+_ROWS = 15  #: of a table of convergence
 
 
 def first_sentence(thing: object) -> str:
@@ -107,6 +118,50 @@ def outcome(r: Record) -> str:
         ),
     ]
     return aligned([name, value] for name, value in rows if value)
+
+
+def convergence(history: History) -> str:
+    """Lay out how a solver got there, by its own account; empty without a history.
+
+    A row ends each outer iteration, or one in so many steps where there are none; what
+    happened since the row before is counted by kinds of steps: "c12 e3".
+    """
+    columns = {k: v for k, v in history.items() if v.size and k not in _UNTOLD}
+    if not columns:
+        return ""
+    ends = _milestones(history)
+    starts = [0, *(end + 1 for end in ends[:-1])]
+    cells = [["iteration", *(str(end + 1) for end in ends)]]
+    for name, values in columns.items():
+        texts = (
+            [_tally(values[a : b + 1]) for a, b in zip(starts, ends, strict=True)]
+            if values.dtype.kind == "U"
+            else [_entry(name, values[end].item()) for end in ends]
+        )
+        cells.append([_HEADS.get(name, name.replace("_", " ")), *texts])
+    return aligned(zip(*cells, strict=True), right=range(len(cells)))
+
+
+def _milestones(history: History) -> list[int]:
+    """Choose the rows to show: the last of each outer iteration, or of equal parts."""
+    length = next(iter(history.values())).size
+    outer = history.get("outer", np.zeros(length))
+    ends = [*np.flatnonzero(outer[1:] != outer[:-1]).tolist(), length - 1]
+    if len(ends) == 1:
+        ends = list(range(length))
+    if len(ends) <= _ROWS:
+        return ends
+    return [ends[i] for i in np.linspace(0, len(ends) - 1, _ROWS).round().astype(int)]
+
+
+def _tally(letters: NDArray[np.str_]) -> str:
+    kinds, numbers = np.unique(letters, return_counts=True)
+    return " ".join(f"{k}{n}" for k, n in zip(kinds, numbers, strict=True))
+
+
+def _entry(name: str, value: float) -> str:
+    digits = ".8g" if name == "cost" or value == 0 else ".2e"
+    return str(value) if isinstance(value, int) else f"{value:{digits}}"
 
 
 def aligned(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:

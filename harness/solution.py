@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from harness.history import History
 from harness.qp import QP, Vector
 
 
@@ -39,9 +38,9 @@ class Solution:
     iterations: int | None = None  #: None where the solver does not tell
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: the solver's own words, for the record
-    history: Mapping[str, NDArray[Any]] = field(
+    history: History = field(
         default_factory=dict
-    )  #: columns of one length, a row per iteration, where the solver keeps them
+    )  #: columns of one length, a row per iteration; see `harness.history`
 
     @classmethod
     def without_point(cls, qp: QP, status: Status, message: str = "") -> Solution:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness.errors import InputError
+from harness.history import History, checked
 from harness.plugin import Fields
 from harness.solution import Solution, Status
 
@@ -23,10 +24,11 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces")
 _NODAL = "nodal_"
+_HISTORY = "history_"
 
 
 def save_solution(folder: Path, solution: Solution) -> str:
-    """Store a primal-dual point and return its digest."""
+    """Store a primal-dual point and its history; return the digest of both."""
     return _save(folder, _point(solution))
 
 
@@ -40,6 +42,19 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
 
     """
     return read_point(_path(folder, digest), status)
+
+
+def load_history(folder: Path, digest: str) -> History:
+    """Load the history of a stored point, without the point; empty if it has none.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged.
+
+    """
+    path = _path(folder, digest)
+    return _history(path, read_arrays(path, (), only=_HISTORY))
 
 
 def save_fields(folder: Path, fields: Fields) -> str:
@@ -59,17 +74,13 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
     """
     arrays = read_arrays(_path(folder, digest), _ALWAYS)
-    nodal = {
-        name.removeprefix(_NODAL): values
-        for name, values in arrays.items()
-        if name.startswith(_NODAL)
-    }
+    nodal = _with_prefix(_NODAL, arrays)
     known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
     return Fields(nodal=nodal, **known)
 
 
 def write_point(path: Path, solution: Solution) -> None:
-    """Write the point of a solution to a file of its own."""
+    """Write the point of a solution, and its history, to a file of its own."""
     with path.open("wb") as file:  # given a name, savez would append .npz to it
         np.savez(file, **_point(solution))  # type: ignore[arg-type]
 
@@ -78,11 +89,16 @@ def read_point(path: Path, status: Status) -> Solution:
     """Read what `write_point` wrote, as a `Solution` that claims `status`."""
     arrays = read_arrays(path, _POINT)
     x, y, z, z_box = (arrays[name] for name in _POINT)
-    return Solution(status=status, x=x, y=y, z=z, z_box=z_box)
+    history = _history(path, arrays)
+    return Solution(status=status, x=x, y=y, z=z, z_box=z_box, history=history)
 
 
-def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def read_arrays(
+    path: Path, expected: tuple[str, ...], *, only: str = ""
+) -> dict[str, NDArray[Any]]:
     """Read an npz file, never unpickling.
+
+    only : how the names begin of the arrays to read
 
     Raises
     ------
@@ -92,7 +108,8 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+            names = [name for name in stored.files if name.startswith(only)]
+            arrays = {name: stored[name] for name in names}
     except OSError as e:
         raise InputError(f"{path}: {e.strerror or e}; expected an npz file") from None
     except (ValueError, TypeError, AttributeError, EOFError, BadZipFile):
@@ -104,7 +121,25 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
 
 
 def _point(solution: Solution) -> Arrays:
-    return {name: getattr(solution, name) for name in _POINT}
+    point = {name: getattr(solution, name) for name in _POINT}
+    return point | {_HISTORY + name: v for name, v in solution.history.items()}
+
+
+def _history(path: Path, arrays: Arrays) -> History:
+    """Find the history among the arrays of a point; none in files of old."""
+    try:
+        return checked(_with_prefix(_HISTORY, arrays))
+    except ValueError as e:
+        raise InputError(f"{path}: malformed history: {e}") from None
+
+
+def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
+    """Select by the start of a name, and cut it off."""
+    return {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }
 
 
 def _path(folder: Path, digest: str) -> Path:

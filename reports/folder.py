@@ -11,6 +11,7 @@ from harness import Fields, InputError
 from harness.errors import unknown
 from harness.store import load_fields
 from reports.cases import cases
+from reports.courses import convergence
 from reports.data import Evidence, Outcome, read_evidence
 from reports.figures import accuracy_figure, save, scaling_figure
 from reports.latex import latex
@@ -77,6 +78,7 @@ def compose(evidence: Evidence) -> Page:
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
         iterations(evidence),
+        convergence(evidence),
         errors(evidence),
         agreement(evidence),
         _grown(found, evidence),

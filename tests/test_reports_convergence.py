@@ -1,0 +1,301 @@
+"""Figures of histories: what is drawn is what was told, of the cases that were chosen.
+
+The first course below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
+(0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
+"""
+
+import numpy as np
+import pytest
+
+from harness import Record, Solution, Status, Verdict
+from harness.journal import Journal
+from harness.store import save_solution
+from reports import write_report
+from reports.convergence import active_set_figure, convergence_figure
+from reports.data import read_evidence
+from reports.folder import compose
+from reports.histories import MOST, chosen
+
+KNOWN = {
+    "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],
+    "free_gradient": [3, 2.4, 0.3, 0], "chopped_gradient": [4, 0.7, 0.4, 0],
+    "infeasibility": [1, 0.0, 1e-3, 1e-7], "active": [9, 4, 6, 6],
+}  # fmt: skip
+MARKERS = {"e": "^", "f": "x", "p": "o"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Factory: a result folder of (solver, history, changes to the record)."""
+
+    def make(*measured):
+        out = tmp_path / "out"
+        out.mkdir(exist_ok=True)
+        with Journal(out, "test") as journal:
+            for i, (solver, history, changes) in enumerate(measured):
+                journal.append(_record(out, i, solver, history, changes))
+        return out
+
+    return make
+
+
+def _record(out, i, solver, history, changes):
+    one = np.array([float(i)])
+    columns = {name: np.array(column) for name, column in history.items()}
+    point = Solution(
+        status=Status.SOLVED, x=one, y=one, z=one, z_box=one, history=columns
+    )
+    size = changes.get("size", 10)
+    defaults = dict(
+        run_id=f"run-{i}", case=f"beam-ring/size={size}/dual", family="beam-ring",
+        params={"size": size}, form="dual", sizes={"variables": size}, solver=solver,
+        options={"history": True}, tol=1e-6, repeat=0, block=0,
+        status=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.003,
+        prepare_seconds=0.001, solve_seconds=0.002, environment="abc",
+        primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
+        vectors=save_solution(out, point), started="2026-11-21T10:00:00+00:00",
+    )  # fmt: skip
+    given = {name: value for name, value in changes.items() if name != "size"}
+    return Record(**(defaults | given))
+
+
+def comparison(folder):
+    (only,) = chosen(read_evidence(folder))
+    return only
+
+
+def section(folder):
+    sections = compose(read_evidence(folder)).sections
+    return next((s for s in sections if s.name == "convergence"), None)
+
+
+def curves(axes, marker="None"):
+    """Points of the lines with that marker; marks of steps are lines of their own."""
+    return [
+        line.get_xydata().tolist()
+        for line in axes.lines
+        if line.get_marker().capitalize() == marker.capitalize()
+        and line.get_transform() == axes.transData
+    ]
+
+
+def test_the_projected_gradient_is_drawn_relative_to_its_first_value(folder):
+    figure = convergence_figure(comparison(folder(("a", KNOWN, {}))))
+    gradient, infeasibility, _ = figure.axes
+
+    (curve,) = curves(gradient)
+    assert curve == pytest.approx(np.array([[2, 1], [4, 0.5], [6, 0.1]]))
+    (curve,) = curves(infeasibility)
+    assert curve == [[2, 1], [6, 1e-3], [7, 1e-7]]  # a zero has no logarithm
+    assert gradient.get_yscale() == infeasibility.get_yscale() == "log"
+    assert figure.axes[-1].get_xlabel() == "products with $P$"
+
+
+def test_rounding_far_below_the_tolerance_does_not_squeeze_the_curves(folder):
+    tiny = KNOWN | {"free_gradient": [3, 1, 1e-20, 0], "chopped_gradient": [4, 0, 0, 0]}
+    low, high = (
+        convergence_figure(comparison(folder(("a", tiny, {})))).axes[0].get_ylim()
+    )
+
+    assert low == pytest.approx(1e-11)  # the tolerance is 1e-6
+    assert high > 1
+
+
+def test_steps_are_marked_by_kind_on_the_upper_panel_and_cg_is_bare(folder):
+    gradient, infeasibility, _ = convergence_figure(
+        comparison(folder(("a", KNOWN, {})))
+    ).axes
+
+    assert curves(gradient, "^") == [[[6, pytest.approx(0.1)]]]
+    assert curves(gradient, "o") == [[[4, pytest.approx(0.5)]]]
+    assert sum(len(points) for points in curves(gradient, "x")) == 0
+    assert all(not curves(infeasibility, m) for m in MARKERS.values())
+
+
+def test_marks_that_would_overlap_are_left_out_and_the_curve_is_whole(folder):
+    n = 5000
+    many = {
+        "step": ["e"] * n, "free_gradient": np.geomspace(1, 1e-6, n),
+        "chopped_gradient": np.zeros(n), "products": np.arange(1, n + 1),
+    }  # fmt: skip
+    axes = convergence_figure(comparison(folder(("a", many, {})))).axes[0]
+
+    (curve,), (marks,) = curves(axes), curves(axes, "^")
+    assert len(curve) == n
+    assert 20 < len(marks) < 200
+    assert marks[0] == curve[0]
+
+
+def test_ticks_show_where_outer_iterations_end(folder):
+    *_, strip = convergence_figure(comparison(folder(("a", KNOWN, {})))).axes
+    (ticks,) = strip.collections
+
+    assert [segment[0][0] for segment in ticks.get_segments()] == [4, 7]
+
+
+def test_one_outer_iteration_makes_no_ticks(folder):
+    figure = convergence_figure(
+        comparison(folder(("a", KNOWN | {"outer": [1, 1, 1, 1]}, {})))
+    )
+
+    assert len(figure.axes) == 2
+
+
+def test_the_active_set_is_drawn_as_steps_over_products(folder):
+    figure = active_set_figure(comparison(folder(("a", KNOWN, {}))))
+    (line,) = figure.axes[0].lines
+
+    assert line.get_xydata().tolist() == [[2, 9], [4, 4], [6, 6], [7, 6]]
+    assert line.get_drawstyle() == "steps-post"
+
+
+def test_one_solver_that_does_not_count_products_puts_all_on_iterations(folder):
+    bare = {name: KNOWN[name] for name in ("free_gradient", "chopped_gradient")}
+    out = folder(("a", KNOWN, {}), ("b", bare, {}))
+    gradient, *_, last = convergence_figure(comparison(out)).axes
+
+    assert [[x for x, _ in curve] for curve in curves(gradient)] == [[1, 2, 3]] * 2
+    assert last.get_xlabel() == "iterations"
+    assert "over iterations" in section(out).pictures[0].caption
+
+
+def test_each_solver_has_its_colour_and_an_unverified_one_its_verdict(folder):
+    out = folder(
+        ("a", KNOWN, {}), ("silent", {}, {}),
+        ("stuck", KNOWN, {"status": Verdict.ITERATION_LIMIT}),
+    )  # fmt: skip
+    figure = convergence_figure(comparison(out))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    colours = {line.get_color() for line in figure.axes[0].lines[:2]}
+
+    assert labels[:2] == ["a", "stuck (iteration limit)"]
+    assert labels[2:] == ["expansion", "proportioning"]
+    assert len(colours) == 2
+
+
+def test_courses_of_very_different_length_share_a_logarithmic_axis(folder):
+    def scale(longest):
+        longer = KNOWN | {"products": [2, 40, 60, longest]}
+        out = folder(("a", KNOWN, {}), ("b", longer, {}))
+        return convergence_figure(comparison(out)).axes[0].get_xscale()
+
+    assert scale(70) == "linear"  # ten times 7
+    assert scale(71) == "log"
+
+
+def test_what_cannot_be_drawn_is_left_out(folder):
+    strange = {
+        "step": [1, 2, 3, 4], "products": ["a"] * 4, "outer": ["x", "y", "z", "z"],
+        "free_gradient": [np.nan, np.inf, 2, 1], "chopped_gradient": [0, 0, 0, 0],
+        "infeasibility": [0, 0, 0, 0], "active": [np.nan, 1, 2, 3],
+    }  # fmt: skip
+    out = folder(("a", strange, {}))
+    (gradient,) = convergence_figure(comparison(out)).axes
+
+    assert curves(gradient) == [[[3, 1], [4, 0.5]]]
+    write_report(out, ["html", "md"])
+
+
+@pytest.mark.parametrize(
+    ("history", "names"),
+    [
+        ({"active": [3, 2]}, ["active-set-1"]),
+        ({"infeasibility": [1, 0.1]}, ["convergence-1"]),
+        ({"free_gradient": [1.0], "chopped_gradient": [0.0]}, ["convergence-1"]),
+        ({"free_gradient": [1.0, 0.1]}, []),
+        ({"cost": [1.0, 0.1]}, []),
+        ({"free_gradient": [0.0], "chopped_gradient": [0.0]}, []),
+        ({"active": []}, []),
+        ({"active": [np.nan]}, []),
+    ],
+)
+def test_any_subset_of_columns_gives_the_figures_it_suffices_for(
+    folder, history, names
+):
+    found = section(folder(("a", history, {})))
+
+    assert [p.name for p in found.pictures if found] == names if names else not found
+
+
+def test_of_each_form_the_largest_case_at_its_last_step_and_finest_tol_is_drawn(folder):
+    def case(form, size, step, tol):
+        return {
+            "case": f"beam-ring/size={size}/step={step}/{form}", "form": form,
+            "sizes": {"variables": size}, "params": {"size": size, "step": step},
+            "tol": tol,
+        }  # fmt: skip
+
+    out = folder(
+        ("a", KNOWN, case("dual", 10, 9, 1e-8)),
+        ("a", KNOWN, case("dual", 20, 1, 1e-8)),
+        ("a", KNOWN, case("dual", 20, 5, 1e-6)),
+        ("a", KNOWN, case("dual", 20, 5, 1e-8)),
+        ("a", {}, case("dual", 30, 5, 1e-8)),
+        ("a", KNOWN, case("primal", 5, 5, 1e-8)),
+    )
+    drawn = [
+        (c.courses[0].outcome.case, c.courses[0].outcome.tol)
+        for c in chosen(read_evidence(out))
+    ]
+    assert drawn == [
+        ("beam-ring/size=20/step=5/dual", 1e-8),
+        ("beam-ring/size=5/step=5/primal", 1e-8),
+    ]
+
+
+def test_no_more_cases_are_drawn_than_the_text_says(folder):
+    out = folder(
+        *(
+            ("a", KNOWN, {"form": f"f{i}", "case": f"beam-ring/f{i}", "size": i})
+            for i in range(1, MOST + 3)
+        )
+    )
+    found = section(out)
+
+    assert len(found.pictures) == 2 * MOST
+    assert f"the {MOST} largest" in found.prose[0]
+    assert "f1 " not in " ".join(p.caption for p in found.pictures)
+
+
+def test_the_first_repeat_that_kept_a_history_speaks_for_all(folder):
+    later = KNOWN | {"active": [9, 9, 9, 9]}
+    out = folder(
+        ("a", {}, {"repeat": 0, "run_id": "r0"}),
+        ("a", KNOWN, {"repeat": 1, "run_id": "r1"}),
+        ("a", later, {"repeat": 2, "run_id": "r2"}),
+    )
+    (course,) = comparison(out).courses
+
+    assert course.record.run_id == "r1"
+    assert "r1." in section(out).pictures[0].caption
+
+
+def test_a_report_without_histories_has_no_such_section(folder):
+    out = folder(("a", {}, {}), ("b", {}, {"vectors": None}))
+
+    assert section(out) is None
+    names = {f.name for f in write_report(out, ["html", "md", "tex"])}
+    assert not any("convergence" in name or "active" in name for name in names)
+
+
+def test_a_history_that_is_gone_is_said_and_costs_nothing_else(folder):
+    out = folder(("a", KNOWN, {}), ("b", KNOWN, {}))
+    first, *_ = sorted((out / "vectors").iterdir())
+    first.unlink()
+    found = section(out)
+
+    assert [len(c.courses) for c in chosen(read_evidence(out))] == [1]
+    assert f"vectors/{first.name}" in found.prose[1]
+    assert len(found.pictures) == 2
+
+
+def test_figures_are_in_the_page_and_in_files_the_same_bytes_every_time(folder):
+    out = folder(("a", KNOWN, {}), ("_b$x^2", KNOWN, {}))
+    files = {f.name: f.read_bytes() for f in write_report(out, ["html", "md"])}
+    again = {f.name: f.read_bytes() for f in write_report(out, ["html", "md"])}
+
+    assert files == again
+    for ending in ("pdf", "svg", "png"):
+        assert {f"convergence-1.{ending}", f"active-set-1.{ending}"} <= files.keys()
+    assert b'id="convergence-1-' in files["index.html"]
+    assert b"figures/active-set-1.png" in files["report.md"]
