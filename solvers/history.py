@@ -19,7 +19,7 @@ COLUMNS = (
     "products",  # with F, so far
     "free_gradient",  # ‖φ‖
     "chopped_gradient",  # ‖β‖
-    "infeasibility",  # ‖Cν‖
+    "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
     "active",  # components on their bounds
     "cost",  # the augmented Lagrangian
     "seconds",  # since prepare began
@@ -28,19 +28,22 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Rows in the order of `COLUMNS`; norms as in the normalised problem."""
+    """Rows in the order of `COLUMNS`; gradients and costs of the normalised problem."""
 
     began: float = field(default_factory=perf_counter)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
     def watch(self, problem: Projected, outer: int, rhs: Vector) -> Watch:
         """Make the observer of one inner run, whose right-hand side is `rhs`."""
+        C, x_tilde = problem.rows.C, problem.rows.x_tilde
+        size = float(np.linalg.norm(x_tilde))
 
         def note(letter: str, at: Point, face: Face) -> None:
+            error = np.linalg.norm(C @ at.x) if len(C) else 0.0
             self.rows.append((
                 letter, outer, problem.counts["P_products"],
                 np.linalg.norm(face.phi), np.linalg.norm(face.beta),
-                np.linalg.norm(problem.rows.C @ at.x),
+                error / (size or np.linalg.norm(at.x) or 1.0),
                 face.free.size - np.count_nonzero(face.free),
                 0.5 * at.x @ (at.g - rhs), perf_counter() - self.began,
             ))  # fmt: skip
