@@ -4,12 +4,14 @@ from harness import Solver
 from solvers.clarabel_ import Clarabel
 from solvers.cvxpy_ import CVXPY
 from solvers.osqp_ import OSQP
+from solvers.pdas import PDAS
 from solvers.proxqp_ import ProxQP
 from solvers.qpsolvers_ import QPSolvers
 from solvers.smalbe import SMALBE
 
 SOLVERS: dict[str, Solver] = {
     "smalbe": SMALBE(),
+    "pdas": PDAS(),
     "osqp": OSQP(),
     "clarabel": Clarabel(),
     "proxqp": ProxQP(),
