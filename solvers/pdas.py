@@ -44,6 +44,7 @@ from solvers.face import Faces, Solve, faces
 
 DELTA = 1e-9  #: δᵢ/Pᵢᵢ
 KAPPA = 1e4  #: ρ·aD⁻¹aᵀ
+MOST_KAPPA = 1e10
 PATIENCE = 10  #: changes of the active set that need not lessen what is wrong
 NO_PROGRESS = 10  #: moves of the centre that need not lessen the residuals
 LEAST_SLACK = 1e-13  #: errors of signs and bounds below this are rounding
@@ -138,7 +139,7 @@ class PDAS:
         message = "P is not positive semidefinite"
         indefinite = Solution.without_point(qp, Status.FAILED, message)
         try:
-            problem = _problem(qp)
+            problem = _problem(qp, Counter())
         except NOT_POSITIVE:
             return lambda: (indefinite, None)
 
@@ -151,16 +152,15 @@ class PDAS:
         return run
 
 
-def _problem(qp: QP) -> _Problem:
+def _problem(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> _Problem:
     store = dense if isinstance(qp.P, np.ndarray) else csc
     P, A, G = store(qp.P), store(qp.A), store(qp.G)
     D = np.array(P.diagonal())
     usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
     D = np.where(D > 1e-12 * usual, D, usual)
-    rho, sigma = KAPPA / _norms(A, D) ** 2, KAPPA / _norms(G, D) ** 2
+    rho, sigma = kappa / _norms(A, D) ** 2, kappa / _norms(G, D) ** 2
     M = P + (A.T * rho) @ A if store is dense else P + A.T @ diags_array(rho) @ A
     M += np.diag(DELTA * D) if store is dense else diags_array(DELTA * D)
-    counts: Counter[str] = Counter()
     unbounded = np.isinf(qp.lb) & np.isinf(qp.ub)
     if store is dense and unbounded.any() and not qp.h.size:
         counts["factorisations"] += 1
@@ -196,7 +196,7 @@ def _proximal(
     """Move the centre until the KKT residuals are small."""
     qp, counts = problem.qp, problem.counts
     active, centre, solve = start.active, start.centre, None
-    slack, best, waited = 0.01 * tol, np.inf, 0
+    slack, best, waited, kappa = 0.01 * tol, np.inf, 0, KAPPA
     while waited < NO_PROGRESS:
         run = _settled(problem, (active, solve), centre, slack, max_iter)
         active, solve = run.active, run.solve
@@ -211,6 +211,9 @@ def _proximal(
         if not run.settled:
             break
         waited = 0 if worst < best / 2 else waited + 1
+        if waited and waited % 2 == 0 and kappa < MOST_KAPPA:
+            kappa, solve = 100 * kappa, None
+            problem = _problem(qp, counts, kappa)
         centre, best, slack = run.at, min(best, worst), slack / 10
     if worst <= CLAIM * tol:
         return point, Carry(active, Point(point.x, point.y, point.z))
