@@ -1,10 +1,12 @@
 """Every solver of the comparison, one line each."""
 
 from harness import Solver
+from solvers.bvls_ import BVLS
 from solvers.clarabel_ import Clarabel
 from solvers.cvxpy_ import CVXPY
 from solvers.osqp_ import OSQP
 from solvers.pdas import PDAS
+from solvers.projected_gradient import ProjectedGradient
 from solvers.proxqp_ import ProxQP
 from solvers.qpsolvers_ import QPSolvers
 from solvers.smalbe import SMALBE
@@ -12,6 +14,8 @@ from solvers.smalbe import SMALBE
 SOLVERS: dict[str, Solver] = {
     "smalbe": SMALBE(),
     "pdas": PDAS(),
+    "projected-gradient": ProjectedGradient(),
+    "bvls": BVLS(),
     "osqp": OSQP(),
     "clarabel": Clarabel(),
     "proxqp": ProxQP(),
