@@ -27,7 +27,8 @@ class BVLS:
 
     Both end with the exact active set, whatever `tol`, which bvls gets for its test of
     optimality, and which bounds the KKT residuals that are claimed. Fixed variables are
-    taken out. scipy tells the iterations of bvls, not those of nnls.
+    taken out; the objective is scaled, since that test is absolute. scipy tells the
+    iterations of bvls, not those of nnls.
     """
 
     max_iter: int = 10_000
@@ -52,8 +53,10 @@ class BVLS:
         P = dense(qp.P)
         moving = qp.lb < qp.ub
         base = np.where(np.isfinite(qp.lb), qp.lb, 0.0)
-        L = cholesky(P[np.ix_(moving, moving)], lower=True, check_finite=False)
-        rhs = -solve_triangular(L, (P @ base + qp.q)[moving], lower=True)
+        slope = (P @ base + qp.q)[moving]
+        scale = 2.0 ** np.frexp(np.abs(slope).max(initial=0.0))[1]
+        L = cholesky(P[np.ix_(moving, moving)] / scale, lower=True)
+        rhs = -solve_triangular(L, slope / scale, lower=True)
         box = (qp.lb - base)[moving], (qp.ub - base)[moving]
 
         def solve() -> Solution:

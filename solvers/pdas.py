@@ -76,7 +76,7 @@ class PDAS:
 
     It starts from the point of the box nearest to zero: with no contact, in the primal
     and in the dual. (On the duals of contact problems the start with all variables free
-    took between four solves fewer and seven more.)
+    took between one solve fewer and seven more.)
     """
 
     max_iter: int = 5_000
