@@ -88,6 +88,24 @@ def test_contact_rows_join_where_they_are_violated():
     assert s.counts["factorisations"] == 2
 
 
+def test_a_fixed_variable_is_never_released():
+    s = solve(quadratic(np.eye(2), [-5.0, -1], lb=[2.0, -9], ub=[2.0, 9]))
+
+    assert s.x == pytest.approx([2, 1])
+    assert s.z_box == pytest.approx([3, 0], abs=1e-8)
+    assert "set_changes" not in s.counts
+
+
+def test_a_row_that_only_a_stiff_variable_is_left_to_meet_gets_a_larger_weight():
+    """x₁ is at its bound; with the weight for x₁'s softness x₂ would never arrive."""
+    qp = quadratic(np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf])
+    s = solve(qp)
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx([0, 1], abs=1e-9)
+    assert s.y == pytest.approx([-1e8])
+
+
 def test_a_cycle_is_left_by_single_exchanges(cycling):
     s = solve(cycling)
     exact = reference_solution(cycling)
@@ -223,6 +241,7 @@ def test_a_direction_of_descent_must_be_free_of_curvature_and_constraints():
 
     assert descends(qp, down)
     assert not descends(qp, -down)
+    assert not descends(replace(qp, q=np.array([-1.0, 1])), down)
     assert not descends(qp, np.array([1.0, 0]))
     assert not descends(replace(qp, ub=np.full(2, 5.0)), down)
     row = replace(qp, A=np.array([[0.0, 1]]), b=np.zeros(1))

@@ -58,19 +58,23 @@ def test_the_first_step_is_the_exact_one():
     assert s.iterations == 1
 
 
-def test_the_second_step_is_that_of_barzilai_and_borwein():
-    """min ½(x² + 4y²) from (1, 1) by shift: α₀ = 17/65, then sᵀs/sᵀPs of that step."""
-    P, g = np.diag([1.0, 4]), np.array([1.0, 4])
-    first = g @ g / (g @ P @ g)
-    g1 = g - first * P @ g
-    second = g @ g / (g @ P @ g)  # s is a multiple of g
-    expected = -first * g - second * g1
+def test_the_lengths_are_those_of_barzilai_and_borwein():
+    """Without bounds every length is the Cauchy one of the gradient before."""
+    P, g, x = np.diag([1.0, 4]), np.array([1.0, 4]), np.zeros(2)
+    qp = boxed(P, g)
+    length = g @ g / (g @ P @ g)
+    for _ in range(4):
+        previous = g
+        x = x - length * g
+        g = g - length * P @ g
+        length = previous @ previous / (previous @ P @ previous)
 
-    s = ProjectedGradient(max_iter=2).prepare(boxed(P, g), 1e-9)()
+    s = ProjectedGradient(max_iter=4).prepare(qp, 1e-12)()
 
     assert s.status is Status.ITERATION_LIMIT
     assert s.message == "step limit"
-    assert s.x == pytest.approx(expected, rel=1e-12)
+    assert s.counts["shortened"] == 0
+    assert s.x == pytest.approx(x, rel=1e-12)
 
 
 def test_the_cost_never_rises_above_the_last_ones():
