@@ -1,0 +1,110 @@
+"""Newton systems of the primal-dual active set method, one per face.
+
+In the face where the components F are free and the inequality rows R are active,
+
+    (M + G_RᵀρG_R)_FF dx_F = r_F
+
+is solved by a Cholesky factor; M is positive definite. Dense matrices are condensed
+beforehand onto the components E̅ that may leave the free set, which costs about one
+factorisation and leaves only the bounded components to the faces:
+
+    S = M_E̅E̅ − W ᵀW,   W = L⁻¹M_EE̅,   M_EE = LLᵀ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.sparse import csc_matrix, diags_array
+from sksparse.cholmod import cholesky as sparse_cholesky
+
+from harness import Matrix, Vector
+
+Mask = NDArray[np.bool_]
+Solve = Callable[[Vector], Vector]  #: r (n,) → dx (n,), zero off F; reads r_F only
+Faces = Callable[[Mask, Mask], Solve]  #: free components (n,), active rows (p,)
+
+
+def faces(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
+    """Set up; each call of the result factorises one face.
+
+    M : (n, n) dense or sparse, positive definite
+    G, rho : (p, n) inequality rows and their weights
+    always_free : (n,) components without bounds
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
+        When M is not positive definite; from the result, too.
+
+    """
+    if not isinstance(M, np.ndarray):
+        return _sparse(csc_matrix(M), csc_matrix(G), rho)
+    if len(rho) or not always_free.any():
+        return _dense(M, np.asarray(G), rho)
+    return _condensed(M, always_free)
+
+
+def _sparse(M: csc_matrix, G: csc_matrix, rho: Vector) -> Faces:
+    G_rho = csc_matrix(diags_array(rho) @ G)
+
+    def face(free: Mask, active: Mask) -> Solve:
+        F = M + G[active].T @ G_rho[active] if active.any() else M
+        solve = sparse_cholesky(csc_matrix(F if free.all() else F[free][:, free]))
+        return lambda r: _spread(free, solve(r[free]))
+
+    return face
+
+
+def _dense(M: Vector, G: Vector, rho: Vector) -> Faces:
+    def face(free: Mask, active: Mask) -> Solve:
+        F = M[np.ix_(free, free)]
+        if active.any():
+            rows = G[np.ix_(active, free)]
+            F += rows.T @ (rho[active, None] * rows)
+        factor = _factor(F)
+        return lambda r: _spread(free, _solve(factor, r[free]))
+
+    return face
+
+
+def _condensed(M: Vector, always_free: Mask) -> Faces:
+    E, rest = np.flatnonzero(always_free), np.flatnonzero(~always_free)
+    L = cholesky(M[np.ix_(E, E)], lower=True, overwrite_a=True, check_finite=False)
+    W = solve_triangular(L, M[np.ix_(E, rest)], lower=True, check_finite=False)
+    S = M[np.ix_(rest, rest)] - W.T @ W
+
+    def face(free: Mask, active: Mask) -> Solve:
+        del active
+        kept = np.flatnonzero(free[rest])
+        factor, W_F = _factor(S[np.ix_(kept, kept)]), W[:, kept]
+
+        def solve(r: Vector) -> Vector:
+            w = solve_triangular(L, r[E], lower=True, check_finite=False)
+            dx = np.zeros(r.size)
+            dx[rest[kept]] = _solve(factor, r[rest[kept]] - w @ W_F)
+            w -= W_F @ dx[rest[kept]]
+            dx[E] = solve_triangular(L, w, lower=True, trans="T", check_finite=False)
+            return dx
+
+        return solve
+
+    return face
+
+
+def _factor(F: Vector) -> Any:
+    return cho_factor(F, lower=True, overwrite_a=True, check_finite=False)
+
+
+def _solve(factor: Any, r: Vector) -> Vector:
+    return np.asarray(cho_solve(factor, r, check_finite=False))
+
+
+def _spread(free: Mask, some: Vector) -> Vector:
+    dx = np.zeros(free.size)
+    dx[free] = some
+    return dx

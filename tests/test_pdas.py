@@ -1,0 +1,286 @@
+"""Primal-dual active sets: the path, the safeguards and the certificates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import aslinearoperator
+
+from harness import QP, Status, kkt_residuals, no_rows
+from harness.names import parse
+from problems import PROBLEMS
+from solvers.certificate import contradicts, descends
+from solvers.pdas import PDAS
+from solvers.reference import reference_solution
+
+
+def quadratic(
+    P, q, *, A=None, b=(), G=None, h=(), lb=-np.inf, ub=np.inf, store=np.asarray
+):
+    q = np.asarray(q, dtype=float)
+    n = q.size
+    lb, ub = (np.broadcast_to(v, n).astype(float) for v in (lb, ub))
+    A, G = (
+        no_rows(n) if M is None else store(np.asarray(M, dtype=float)) for M in (A, G)
+    )
+    b, h = np.asarray(b, dtype=float), np.asarray(h, dtype=float)
+    P = store(np.asarray(P, dtype=float))
+    return QP(P=P, q=q, A=A, b=b, G=G, h=h, lb=lb, ub=ub)
+
+
+def solve(qp, tol=1e-9):
+    return PDAS().prepare(qp, tol)()
+
+
+#: the plain method visits three active sets in turn, for ever
+CYCLES = {
+    "n = 3": ([[13, 11, -9], [11, 11, -6], [-9, -6, 10]], [4, 1, -5]),
+    "n = 4": (
+        [[9, 13, -8, -3], [13, 26, -20, -4], [-8, -20, 18, 3], [-3, -4, 3, 11]],
+        [1, 4, -4, -3],
+    ),
+}
+
+
+@pytest.fixture(params=CYCLES.values(), ids=CYCLES)
+def cycling(request):
+    return quadratic(*request.param, lb=0.0)
+
+
+def dual(seed, n=30, r=3):
+    """The dual of a floating body: F of rank n − 2, λ ≥ 0 on a half, Gλ = e."""
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((n, n - 2))
+    G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
+    lb = np.where(np.arange(n) < n // 2, -np.inf, 0.0)
+    return quadratic(W @ W.T / n, rng.standard_normal(n), A=G, b=G @ x, lb=lb)
+
+
+def test_the_two_sided_box_is_crossed_in_three_solves():
+    """From 0 at the lower bound, free at 10, to the upper one."""
+    s = solve(quadratic([[1.0]], [-10.0], lb=0.0, ub=1.0))
+
+    assert s.x == 1
+    assert s.z_box == pytest.approx([9])
+    assert s.iterations == s.counts["factorisations"] == 3
+    assert s.counts["set_changes"] == 2
+
+
+def test_separate_variables_settle_after_one_change_each():
+    qp = quadratic(np.diag([1.0, 2, 4, 1]), [-1.0, -4, 8, 3], lb=0.0)
+    s = solve(qp)
+
+    assert s.x == pytest.approx([1, 2, 0, 0], abs=1e-8)
+    assert s.z_box == pytest.approx([0, 0, -8, -3], abs=1e-8)
+    assert s.counts["set_changes"] == 2
+    assert s.counts["factorisations"] == 2
+
+
+def test_contact_rows_join_where_they_are_violated():
+    """min ½‖x‖² − x₁ − 2x₂, x₁ ≤ 0.5, x₂ ≤ 3: no contact, then the first row."""
+    qp = quadratic(np.eye(2), [-1.0, -2], G=np.eye(2), h=[0.5, 3.0])
+    s = solve(qp)
+
+    assert s.x == pytest.approx([0.5, 2])
+    assert s.z == pytest.approx([0.5, 0])
+    assert s.counts["set_changes"] == 1
+    assert s.counts["factorisations"] == 2
+
+
+def test_a_fixed_variable_is_never_released():
+    s = solve(quadratic(np.eye(2), [-5.0, -1], lb=[2.0, -9], ub=[2.0, 9]))
+
+    assert s.x == pytest.approx([2, 1])
+    assert s.z_box == pytest.approx([3, 0], abs=1e-8)
+    assert "set_changes" not in s.counts
+
+
+def test_a_row_that_only_a_stiff_variable_is_left_to_meet_gets_a_larger_weight():
+    """x₁ is at its bound; with the weight for x₁'s softness x₂ would never arrive."""
+    qp = quadratic(np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf])
+    s = solve(qp)
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx([0, 1], abs=1e-9)
+    assert s.y == pytest.approx([-1e8])
+
+
+def test_a_cycle_is_left_by_single_exchanges(cycling):
+    s = solve(cycling)
+    exact = reference_solution(cycling)
+
+    assert s.status is Status.SOLVED
+    assert s.counts["exchanges"] > 0
+    assert s.x == pytest.approx(exact.x, abs=1e-7)
+
+
+def test_the_step_limit_is_reported_with_what_was_reached(cycling):
+    s = PDAS(max_iter=5).prepare(cycling, 1e-9)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.iterations == 5
+    assert s.message == "step limit"
+
+
+@pytest.mark.parametrize("exponent", [-30, 30])
+@pytest.mark.parametrize("seed", [271828, 314159])
+def test_scaling_objective_or_rows_changes_no_counter(seed, exponent):
+    """By a power of two, hence in exact arithmetic."""
+    qp, factor = dual(seed), 2.0**exponent
+    plain = solve(qp)
+    for scaled in (
+        replace(qp, P=qp.P * factor, q=qp.q * factor),
+        replace(qp, A=qp.A * factor, b=qp.b * factor),
+    ):
+        s = solve(scaled)
+        assert s.counts == plain.counts
+        assert s.iterations == plain.iterations
+        assert (s.x == plain.x).all()
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
+def test_duals_of_floating_bodies_are_solved(seed, tol):
+    qp = dual(seed)
+    s = solve(qp, tol)
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 5 * tol
+
+
+def test_scaled_repeated_and_zero_rows_change_no_answer():
+    qp = dual(271828)
+    A, b = qp.A, qp.b
+    rows = np.vstack([1e6 * A[0], A[1], 1e-6 * A[2], A.sum(axis=0), 0 * A[0]])
+    e = np.array([1e6 * b[0], b[1], 1e-6 * b[2], b.sum(), 0.0])
+    plain, mixed = solve(qp), solve(replace(qp, A=rows, b=e))
+
+    assert mixed.status is Status.SOLVED
+    assert mixed.x == pytest.approx(plain.x, abs=1e-6)
+    assert rows.T @ mixed.y == pytest.approx(A.T @ plain.y, abs=1e-6)
+
+
+@pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("given", "x"),
+    [
+        (dict(P=np.eye(3), q=np.zeros(3), lb=0.0), [0, 0, 0]),
+        (dict(P=np.eye(3), q=np.ones(3), lb=0.0), [0, 0, 0]),
+        (dict(P=np.eye(3), q=-np.ones(3), lb=0.0), [1, 1, 1]),
+        (dict(P=np.eye(3), q=np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
+        (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
+        (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, 3], ub=[2.0, 3]), [2, 3]),
+        # more active bounds than the row leaves room for, on the way
+        (dict(P=np.eye(2), q=[1.0, 1], A=[[1, 1]], b=[4.0], lb=0.0), [2, 2]),
+        # singular P: the row and the bound decide on x₂
+        (dict(P=[[1, 0], [0, 0]], q=[-1.0, 1], lb=[-np.inf, -3]), [1, -3]),
+        (dict(P=np.zeros((2, 2)), q=[1.0, 2], A=[[1, 1]], b=[1.0], lb=0.0), [1, 0]),
+    ],
+    ids=["q = 0", "all active", "none active", "shifted bound", "fixed", "all fixed",
+         "row", "singular", "linear"],
+)  # fmt: skip
+def test_degenerate_problems_have_their_solutions(given, x, store):
+    qp = quadratic(**given, store=store)
+    s = solve(qp)
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx(x, abs=1e-7)
+    assert kkt_residuals(qp, s).worst <= 5e-9
+
+
+@pytest.mark.parametrize(
+    "qp",
+    [
+        quadratic(np.eye(3), np.ones(3), A=[[1, 1, 0], [2, 2, 0]], b=[1, 3]),
+        quadratic(np.eye(2), [1.0, 1], A=[[1, 1]], b=[5.0], lb=0.0, ub=1.0),
+        quadratic(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0),
+        quadratic(np.eye(2), [0.0, 0], G=[[1, -1], [-1, 1]], h=[-1, -1]),
+        quadratic(np.eye(3), np.ones(3), A=[[1, 2, 3]], b=[7.0], lb=1.0, ub=1.0),
+    ],
+    ids=["rows", "box", "half space", "inequalities", "all fixed"],
+)
+def test_problems_without_a_feasible_point_are_reported(qp):
+    s = solve(qp)
+
+    assert s.status is Status.INFEASIBLE
+    assert "no point" in s.message
+    assert np.isnan(s.x).all()
+
+
+@pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
+def test_a_cost_that_falls_without_end_is_reported(store):
+    qp = quadratic([[1, 0], [0, 0]], [1.0, -1], lb=[0, 0], store=store)
+    s = solve(qp)
+
+    assert s.status is Status.INFEASIBLE
+    assert "without end" in s.message
+
+
+def test_an_indefinite_P_is_a_failure():
+    s = solve(quadratic([[1, 2], [2, 1]], [1.0, 1]))
+
+    assert s.status is Status.FAILED
+    assert "not positive semidefinite" in s.message
+
+
+def test_a_certificate_must_hold():
+    qp = quadratic(np.eye(2), [0.0, 0], A=[[1, 1]], b=[-1.0], lb=0.0)
+    feasible = replace(qp, b=np.array([1.0]))
+    y, none = np.array([1.0]), np.zeros(0)
+
+    assert contradicts(qp, y, none)
+    assert not contradicts(qp, -y, none)
+    assert not contradicts(feasible, y, none)
+    assert not contradicts(replace(qp, lb=np.array([0, -np.inf])), y, none)
+
+
+def test_a_direction_of_descent_must_be_free_of_curvature_and_constraints():
+    qp = quadratic(np.diag([1.0, 0]), [-1.0, -1], lb=0.0)
+    down = np.array([0.0, 1])
+
+    assert descends(qp, down)
+    assert not descends(qp, -down)
+    assert not descends(replace(qp, q=np.array([-1.0, 1])), down)
+    assert not descends(qp, np.array([1.0, 0]))
+    assert not descends(replace(qp, ub=np.full(2, 5.0)), down)
+    row = replace(qp, A=np.array([[0.0, 1]]), b=np.zeros(1))
+    assert not descends(row, down)
+
+
+def test_a_sequence_starts_from_the_last_active_set():
+    qp = dual(271828)
+    prepare = PDAS().chain(1e-9)
+    cold, warm = prepare(qp)(), prepare(replace(qp, q=1.0001 * qp.q))()
+
+    assert cold.counts["set_changes"] > 0
+    assert "set_changes" not in warm.counts
+    assert kkt_residuals(replace(qp, q=1.0001 * qp.q), warm).worst <= 5e-9
+
+
+def test_a_sequence_goes_on_after_a_problem_of_another_size():
+    prepare = PDAS().chain(1e-9)
+    for n in (30, 20, 30):
+        assert prepare(dual(271828, n))().status is Status.SOLVED
+
+
+def test_an_operator_is_declined():
+    qp = dual(271828)
+    operator = replace(qp, P=aslinearoperator(qp.P))
+    assert PDAS().declines(operator) == "needs explicit matrices"
+
+
+def test_the_forms_of_a_contact_problem_agree():
+    """The contact rows' multipliers, and the displacement, are the reference's."""
+    family, forms = PROBLEMS["beam-ring"], ("dual-bounds", "dual", "primal")
+    names = [parse(f"beam-ring/Nr=4/Nh=3/step=7/{form}", PROBLEMS) for form in forms]
+    cases = [family.build(n.form, n.params, reference_solution) for n in names]
+    exact = reference_solution(cases[0].qp)
+    u = cases[0].recover(exact)
+    contact = exact.x.size
+    for case in cases:
+        s = PDAS().prepare(case.qp, 1e-10)()
+        multipliers = s.z if s.z.size else s.x[-contact:]
+        assert s.status is Status.SOLVED
+        assert multipliers == pytest.approx(exact.x, abs=1e-7 * exact.x.max())
+        assert case.recover(s) == pytest.approx(u, abs=1e-7 * np.abs(u).max())

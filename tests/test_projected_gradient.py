@@ -1,0 +1,133 @@
+"""Spectral projected gradients: path, counters, invariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import aslinearoperator
+
+from harness import QP, Status, kkt_residuals, no_rows
+from solvers.projected_gradient import ProjectedGradient
+
+
+def boxed(P, q, lb=-np.inf, ub=np.inf):
+    P, q = np.asarray(P, dtype=float), np.asarray(q, dtype=float)
+    lb, ub = (np.broadcast_to(v, q.size).astype(float) for v in (lb, ub))
+    none = no_rows(q.size), np.zeros(0)
+    return QP(P=P, q=q, A=none[0], b=none[1], G=none[0], h=none[1], lb=lb, ub=ub)
+
+
+def solve(qp, tol=1e-9):
+    return ProjectedGradient().prepare(qp, tol)()
+
+
+def random(seed, n=30):
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((n, n))
+    return boxed(W @ W.T / n, rng.standard_normal(n), lb=0.0, ub=1.0)
+
+
+@pytest.mark.parametrize(
+    ("qp", "x"),
+    [
+        (boxed([[1.0]], [-10.0], lb=0.0, ub=1.0), [1]),
+        (boxed(np.eye(3), np.zeros(3), lb=0.0), [0, 0, 0]),
+        (boxed(np.eye(3), np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
+        (boxed(np.eye(3), np.ones(3), lb=0.0), [0, 0, 0]),
+        (boxed(np.eye(3), -np.ones(3), lb=0.0), [1, 1, 1]),
+        (boxed(np.eye(2), [5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
+        (boxed([[1, 0], [0, 0]], [-1.0, 1], lb=-3.0), [1, -3]),
+    ],
+    ids=["two-sided", "q = 0", "q = 0, shifted bound", "all active", "none active",
+         "fixed", "singular"],
+)  # fmt: skip
+def test_degenerate_problems_have_their_solutions(qp, x):
+    s = solve(qp)
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx(x, abs=1e-8)
+    assert kkt_residuals(qp, s).worst <= 5e-9
+
+
+def test_the_first_step_is_the_exact_one():
+    """With P = cI one step of length 1/c ends at the minimiser."""
+    s = solve(boxed(7 * np.eye(3), [1.0, -2, 3]))
+
+    assert s.x == pytest.approx([-1 / 7, 2 / 7, -3 / 7], rel=1e-12)
+    assert s.iterations == 1
+
+
+def test_the_lengths_are_those_of_barzilai_and_borwein():
+    """Without bounds every length is the Cauchy one of the gradient before."""
+    P, g, x = np.diag([1.0, 4]), np.array([1.0, 4]), np.zeros(2)
+    qp = boxed(P, g)
+    length = g @ g / (g @ P @ g)
+    for _ in range(4):
+        previous = g
+        x = x - length * g
+        g = g - length * P @ g
+        length = previous @ previous / (previous @ P @ previous)
+
+    s = ProjectedGradient(max_iter=4).prepare(qp, 1e-12)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.message == "step limit"
+    assert s.counts["shortened"] == 0
+    assert s.x == pytest.approx(x, rel=1e-12)
+
+
+def test_the_cost_never_rises_above_the_last_ones():
+    """With a memory of one the cost falls from step to step."""
+    qp = random(271828)
+    costs = [
+        qp.objective(ProjectedGradient(memory=1, max_iter=k).prepare(qp, 1e-12)().x)
+        for k in range(1, 40)
+    ]
+    assert (np.diff(costs) < 1e-12).all()
+
+
+@pytest.mark.parametrize("exponent", [-30, 30])
+def test_scaling_the_objective_changes_no_counter(exponent):
+    qp, factor = random(314159), 2.0**exponent
+    plain, scaled = solve(qp), solve(replace(qp, P=qp.P * factor, q=qp.q * factor))
+
+    assert scaled.counts == plain.counts
+    assert (scaled.x == plain.x).all()
+
+
+def test_every_product_is_counted_and_one_per_step():
+    qp = random(271828)
+    products = []
+
+    class Counting:
+        shape, dtype = qp.P.shape, qp.P.dtype
+
+        def __matmul__(self, v):
+            products.append(v)
+            return qp.P @ v
+
+    s = solve(replace(qp, P=Counting()), 1e-6)
+
+    assert s.status is Status.SOLVED
+    assert s.counts["P_products"] == len(products)
+    # two for the start, two for the residuals
+    assert s.counts["P_products"] == s.iterations + 4
+
+
+def test_operators_are_taken_and_rows_are_not(planted):
+    qp = random(161803)
+    as_operator = solve(replace(qp, P=aslinearoperator(csr_array(qp.P))))
+
+    assert as_operator.x == pytest.approx(solve(qp).x, abs=1e-8)
+    assert ProjectedGradient().declines(planted("equalities")[0]) == "takes bounds only"
+    assert (
+        ProjectedGradient().declines(planted("inequalities")[0]) == "takes bounds only"
+    )
+
+
+def test_a_cost_that_falls_without_end_is_reported():
+    s = solve(boxed([[1, 0], [0, 0]], [1.0, -1], lb=0.0))
+
+    assert s.status is Status.INFEASIBLE
+    assert "without end" in s.message
