@@ -28,6 +28,7 @@ from solvers.projected import (
 
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+EPS = float(np.finfo(float).eps)
 TIGHTEST = 1e-3  #: factor of the tolerance at which they have had their chance
 
 
@@ -75,7 +76,7 @@ def prepared(
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
         return lambda: (nowhere, None)
-    start = _start(problem, options, carry)
+    start = _start(problem, options, carry, tol)
     if carry is not None and not _still_like(carry, problem, start):
         return prepared(qp, tol, options, None, eliminate=eliminate)
     if eliminated is not None and eliminated.columns:
@@ -103,13 +104,20 @@ def _find(
     return by_lanczos(PFP, rows, steps=options.lanczos_steps)
 
 
-def _start(problem: Projected, options: Options, carry: Carry | None) -> Iterate:
+def _start(
+    problem: Projected, options: Options, carry: Carry | None, tol: float
+) -> Iterate:
     """Start from zero, or from where the problem before ended."""
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), np.zeros(len(C))
     if carry is not None:
         x, mu = carry.x, C @ carry.force / problem.spectrum.norm
-    return first_iterate(problem, x, mu, M=options.M, rho=options.rho)
+    return first_iterate(problem, x, mu, M=options.M, rho=_penalty(options, tol))
+
+
+def _penalty(options: Options, tol: float) -> float:
+    """Keep ρ, but below where the rounding of ρQν is seen in the gradient."""
+    return min(options.rho, max(1.0, tol / (10 * EPS)))
 
 
 def _still_like(carry: Carry, problem: Projected, at: Iterate) -> bool:
@@ -159,8 +167,16 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
         tighter *= min(0.5, CLAIM * tol / worst)
         if at.status is not Status.SOLVED or tighter < TIGHTEST:
             break
+        at = _refreshed(problem, at, _penalty(options, tighter * tol))
     message = "step limit, unbounded cost, or no further progress in rounding"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
+
+
+def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
+    """Compute the gradient anew, which the steps only carried along; one product."""
+    x = problem.rows.x_tilde + at.nu
+    fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
+    return fresh._replace(outer=at.outer)
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:
