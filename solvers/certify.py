@@ -25,11 +25,13 @@ from solvers.projected import (
     by_power,
     projected_problem,
 )
+from solvers.spectrum import random_start
 
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
-TIGHTEST = 1e-3  #: factor of the tolerance at which they have had their chance
+PATIENCE = 3  #: tightenings in a row that need not halve the residuals
+WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
 
 class Carry(NamedTuple):
@@ -38,7 +40,6 @@ class Carry(NamedTuple):
     x: Vector  #: (n,)
     force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
     spectrum: Spectrum
-    quotient: float  #: νᵀ𝒫F𝒫ν/‖ν‖² at the end
     block: FreeBlock | None
 
 
@@ -63,10 +64,7 @@ def prepared(
     """Eliminate the free variables where asked and possible; project; look at F."""
     history = History() if options.history else None
     eliminated = None
-    if eliminate and options.preconditioner in (
-        "model",
-        "none",
-    ):  # others need all of P
+    if eliminate and options.preconditioner in WITHOUT_P:
         eliminated = eliminate_free(qp, carry and carry.block)
     inner = qp if eliminated is None else eliminated.qp
     if carry is not None and carry.x.size != inner.q.size:
@@ -76,16 +74,13 @@ def prepared(
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
         return lambda: (nowhere, None)
-    start = _start(problem, options, carry, tol)
-    if carry is not None and not _still_like(carry, problem, start):
-        return prepared(qp, tol, options, None, eliminate=eliminate)
     if eliminated is not None and eliminated.columns:
         problem.counts["P_products"] += eliminated.columns
         problem.counts["factorised_columns"] += eliminated.columns
-    means = _means(problem, inner, options, history)
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
-        means=means, history=history, start=start,
+        means=_means(problem, inner, options, history), history=history,
+        start=_start(problem, options, carry, tol),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -96,11 +91,20 @@ def _find(
     PFP: Callable[[Vector], Vector],
     rows: Rows,
 ) -> Spectrum:
-    """Look at the spectrum, or take over that of the problem before."""
+    """Look at the spectrum, or take over that of the problem before.
+
+    That serves where a product with the start vector of the Lanczos process, which is
+    always the same, shows about the same quotient; and only for steps by the model,
+    which notice where it is wrong.
+    """
     if options.norm == "power":
         return by_power(PFP, rows)
-    if carry is not None and carry.spectrum.ritz is not None:
-        return carry.spectrum.orthogonal_to(rows)
+    if carry is not None and options.expansion == "model":
+        known = carry.spectrum.ritz
+        v = rows.project(random_start(rows.x_tilde.size))
+        now = float(v @ PFP(v)) / float(v @ v or 1.0)
+        if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
+            return carry.spectrum.orthogonal_to(rows)
     return by_lanczos(PFP, rows, steps=options.lanczos_steps)
 
 
@@ -118,19 +122,6 @@ def _start(
 def _penalty(options: Options, tol: float) -> float:
     """Keep ρ, but below where the rounding of ρQν is seen in the gradient."""
     return min(options.rho, max(1.0, tol / (10 * EPS)))
-
-
-def _still_like(carry: Carry, problem: Projected, at: Iterate) -> bool:
-    """Whether F is near enough to the one before for its spectrum to serve again."""
-    return 0.5 * carry.quotient < _quotient(problem, at) < 2 * carry.quotient
-
-
-def _quotient(problem: Projected, at: Iterate) -> float:
-    """Return νᵀ𝒫F𝒫ν/‖ν‖² from the gradient."""
-    C = problem.rows.C
-    Hnu = at.g + problem.b - C.T @ (at.mu + at.rho * (C @ at.nu))
-    size = float(at.nu @ at.nu)
-    return problem.spectrum.norm * float(at.nu @ Hnu) / size if size else 0.0
 
 
 def _means(
@@ -154,21 +145,28 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
     constants = Constants(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps
     )
-    tighter = 1.0
+    tighter, best, waited = 1.0, np.inf, 0
     while True:
         at = smalbe(problem, constants, task.means, tighter * tol, at)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
             return Solution.without_point(task.qp, at.status, message), None
+        if not np.isfinite(at.nu).all():
+            message = "the iterates diverged"
+            return Solution.without_point(task.qp, Status.FAILED, message), None
         point = _point(task, at)
         worst = kkt_residuals(task.qp, point).worst
         if worst <= CLAIM * tol:
             return point, _carry(task, at)
-        tighter *= min(0.5, CLAIM * tol / worst)
-        if at.status is not Status.SOLVED or tighter < TIGHTEST:
+        waited = 0 if worst < best / 2 else waited + 1
+        best = min(best, worst)
+        if at.status is not Status.SOLVED or waited == PATIENCE:
             break
+        tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
         at = _refreshed(problem, at, _penalty(options, tighter * tol))
-    message = "step limit, unbounded cost, or no further progress in rounding"
+    message = "no further progress: rounding, or the cost is unbounded"
+    if len(at.steps) + len(at.outer) >= options.max_steps:
+        message = "step limit"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
 
 
@@ -185,7 +183,6 @@ def _carry(task: _Task, at: Iterate) -> Carry:
         x=problem.rows.x_tilde + at.nu,
         force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
         spectrum=problem.spectrum,
-        quotient=_quotient(problem, at),
         block=eliminated and eliminated.block,
     )
 

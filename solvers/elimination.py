@@ -19,11 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from harness import QP, Matrix, Solution, Vector, no_rows
 from solvers.projected import orthonormal_rows
 
-RANK = 1e-8  #: singular values of orthonormal rows, cut to E, below this are zero
+#: singular values of orthonormal rows, cut to E, are zero below and good above these;
+#: rows that hardly meet E would make the reduced matrix as large as they are small
+ZERO, GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
 
@@ -82,8 +85,8 @@ class _Reduced:
 def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     """Eliminate the variables without bounds; None where that cannot be done.
 
-    It needs an explicit P with a positive definite P_EE, consistent equality rows, no
-    inequality rows, and variables of both kinds.
+    It needs an explicit P with a positive definite P_EE, consistent equality rows that
+    meet E clearly or not at all, no inequality rows, and variables of both kinds.
 
     known : from an earlier problem; used if its P_EE is this one's
     """
@@ -95,7 +98,9 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     if block is None or not rows.consistent:
         return None
     left, size, _ = np.linalg.svd(rows.C[:, free])
-    rank = int((size > RANK).sum())
+    if ((size > ZERO) & (size < GOOD)).any():
+        return None
+    rank = int((size >= GOOD).sum())
     meets, others = left[:, :rank], left[:, rank:]
     G, N, Cx = meets.T @ rows.C, others.T @ rows.C, rows.C @ rows.x_tilde
     solve = _saddle(block, G[:, free])
@@ -136,5 +141,5 @@ def _saddle(block: FreeBlock, G_E: Array) -> _Saddle:
 
 def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
     if isinstance(P, np.ndarray):
-        return P[np.ix_(rows, columns)]
-    return np.asarray(P[np.flatnonzero(rows)][:, np.flatnonzero(columns)].toarray())
+        return P[np.ix_(rows, columns)].astype(float)
+    return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)

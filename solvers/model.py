@@ -24,6 +24,7 @@ from solvers import kernels
 from solvers.kernels import Mask
 
 NEWTON_STEPS = 100
+SEARCH_STEPS = 60
 
 
 class _Tilted(NamedTuple):
@@ -55,6 +56,7 @@ class Model:
         Us(y) − W⁻¹y: Newton's method with a line search ends on the right piece.
         """
         U, tau, w = self.U, self.tau, self.w
+        root = np.sqrt(w)
 
         def at(y: Vector) -> _Tilted:
             s, piece = kernels.tilted_step(x, g + y @ U, tau, *bounds)
@@ -64,8 +66,7 @@ class Model:
         here = at(y)
         for _ in range(NEWTON_STEPS if w.size else 0):
             U_f = U[:, here.piece == 0]
-            J = np.diag(1 / w) + U_f @ U_f.T / tau
-            dy = np.asarray(np.linalg.solve(J, here.slope), dtype=np.float64)
+            dy = root * np.linalg.solve(_core(U_f, root, tau), root * here.slope) * tau
             there = at(y + dy)
             if (there.piece == here.piece).all():  # where Newton's method is exact
                 return there.s
@@ -80,8 +81,8 @@ class Model:
         Us = self.U @ s
         rest = float(s @ s - Us @ Us)
         missing = sHs - self.tau * float(s @ s) - float((self.w * Us) @ Us)
-        tau = min(self.tau + missing / rest if rest > 0 else np.inf, 10 * self.tau)
-        return self.with_tail(tau)
+        tau = self.tau + missing / rest if rest > 0 else np.inf
+        return self.with_tail(min(max(tau, self.tau), 10 * self.tau))
 
     def with_tail(self, tau: float) -> Model:
         """Change τ and leave w + τ as it is, where that is above τ."""
@@ -91,13 +92,20 @@ class Model:
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
         """Return v → B_FF⁻¹v_F, zero off the face F (Sherman, Morrison, Woodbury)."""
         U_f = self.U * free
-        core = np.linalg.inv(np.diag(self.tau / self.w) + U_f @ U_f.T)
+        root = np.sqrt(self.w)
+        core = root[:, None] * np.linalg.inv(_core(U_f, root, self.tau)) * root
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
             return np.asarray(v - U_f.T @ (core @ (U_f @ v))) / self.tau
 
         return apply
+
+
+def _core(U_f: NDArray[np.float64], root: Vector, tau: float) -> NDArray[np.float64]:
+    """Return τI + W¹ᐟ²U_F U_FᵀW¹ᐟ²: not below τI, however large W is."""
+    S = root[:, None] * U_f
+    return np.asarray(S @ S.T + tau * np.eye(root.size))
 
 
 def _searched(
@@ -110,11 +118,11 @@ def _searched(
     there = ends[1]
     first, slope = float(ends[0].slope @ dy), float(there.slope @ dy)
     low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
-    while slope < -0.1 * first or (slope > 0.1 * first and t < 1):
+    for _ in range(SEARCH_STEPS):
+        if abs(slope) <= 0.1 * first or (slope > 0 and t == 1) or at_low <= at_high:
+            break
         share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
         t = low + (high - low) * min(max(share, 0.05), 0.95)
-        if not low < t < high:
-            break
         there = at(y + t * dy)
         slope = float(there.slope @ dy)
         if slope > 0:

@@ -35,7 +35,7 @@ Precondition = Callable[[Mask], Operator]  #: free components → their precondi
 #: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
 #: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
 #: model: the CG step as far as it is feasible, then a `Model.step`, its length by
-#: an exact line search (ours; 2 products)
+#: an exact line search (ours; 2 products, 1 where the first step was all)
 Expansion = Literal["std", "projcg", "mixed", "model"]
 #: cg: minimise along −β, as far as feasible (the book's; 1 product)
 #: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product)
@@ -81,7 +81,7 @@ class Minimum(NamedTuple):
     x: Vector
     g: Vector  #: Hx − b
     projected_norm: float  #: ‖g^P‖₂
-    stopped: bool  #: by `stop`; False at the step limit, or if the cost is unbounded
+    stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
     trace: str  #: one letter per step: c, e, f, p
 
 
@@ -193,10 +193,9 @@ def _minimise_or_expand(
             return "e", new, B
     half = _moved(task, at, feasible, p, Hp)
     if rules.expansion == "model":
-        return _model_step(task, half, B, "e")
-    phi = split(half, bounds).phi
-    cut = kernels.reduced(half.x, phi, 1 / B.tau, *bounds)
-    x = np.clip(half.x - cut / B.tau, *bounds)
+        stay = ("e", half, B) if feasible > 0 else None
+        return _model_step(task, half, B, "e") or stay
+    x = np.clip(half.x - split(half, bounds).phi / B.tau, *bounds)  # cuts φ to φ̃
     letter = "f" if rules.expansion == "mixed" else "e"
     return letter, Point(x, H(x) - b), B
 

@@ -9,10 +9,11 @@ Algorithm 6.1; `solvers.projected` makes that problem). For k = 0, 1, …:
    last k: M ← βM, and ρ ← ρ·growth.
 3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed.
 
-until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖.
+until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
+is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
 
-Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ; and if
-then no feasible step lessens ½‖Cν‖² although Cν ≠ 0, there is no feasible point.
+Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
+MOST_RHO; and CᵀCν is tried as proof that there is no feasible point.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ import numpy as np
 
 from harness import Status, Vector
 from solvers.model import Model
-from solvers.mprgp import Minimum, Point, Precondition, Rules, Watch, mprgp, split
+from solvers.mprgp import Minimum, Precondition, Rules, Watch, mprgp
 from solvers.projected import Projected
 
-REACH = 1e6  #: how far to look for feasible points, in units of ‖x̃‖ + ‖ν‖
-NOISE = 1e-9  #: ‖Cν‖ in these units that rounding may leave
+REACH = 1e6  #: how far to look for feasible points where there is no bound
+NOISE = 1e-12  #: what rounding may leave in sums of products
+MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def smalbe(
     lagrangian = -np.inf
 
     def small(nu: Vector, projected: float) -> bool:
-        return projected <= tol * b_size and problem.rows.met(nu, tol)
+        return projected <= tol * b_size and problem.rows.met(nu, tol, b_size)
 
     def precise(nu: Vector, projected: float) -> bool:
         bound = constants.eta * b_size
@@ -131,10 +133,10 @@ def smalbe(
             return at._replace(status=Status.SOLVED)
         if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
             return at._replace(status=Status.INFEASIBLE)
-        if not run.stopped or left < 0:
+        if not run.stopped or left < 0 or (at.stalled and at.rho >= MOST_RHO):
             return at
         if at.stalled:
-            at = _with_penalty(problem, at, 10 * at.rho)
+            at = _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
 
 
 def _updated(
@@ -159,18 +161,20 @@ def _updated(
 
 
 def _infeasible(problem: Projected, nu: Vector) -> bool:
-    """Whether the bounds hold no point with Cν = 0 within REACH times the present size.
+    """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
 
-    For a feasible ν*, convexity of ½‖Cν‖² gives ½‖Cν‖² ≤ ‖g^P‖ ‖ν − ν*‖ with its
-    projected gradient g^P.
+    By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum
+    of rᵀν' over the box is positive.
     """
-    Cnu = problem.rows.C @ nu
-    downhill = split(Point(nu, problem.rows.C.T @ Cnu), problem.bounds)
-    size = _norm(problem.rows.x_tilde) + _norm(nu)
-    error = _norm(Cnu)
-    return (
-        error > NOISE * size and error**2 > 2 * REACH * size * downhill.projected_norm
-    )
+    rows, (lower, upper) = problem.rows, problem.bounds
+    Cnu = rows.C @ nu
+    r = rows.C.T @ Cnu
+    size = _norm(rows.x_tilde) + _norm(nu)
+    far = REACH * size
+    ends = np.where(r > 0, lower, upper)
+    box = np.where(np.isinf(ends), np.copysign(far, ends), ends)
+    noise = NOISE / rows.least_pivot * (_norm(Cnu) * size + float(np.abs(r * nu).sum()))
+    return float(r @ box) > noise
 
 
 def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:

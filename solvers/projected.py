@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
+from scipy.sparse import issparse
 
 from harness import QP, Matrix, Vector
 from solvers.model import Model
@@ -17,6 +18,7 @@ from solvers.products import product
 from solvers.spectrum import Ritz, lanczos, power_method, random_start
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
 TAIL = 1e-4  #: least τ of a model, relative to the norm
 
 
@@ -26,16 +28,21 @@ class Rows(NamedTuple):
     C: NDArray[np.float64]  #: (r, n)
     GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
     e_size: float  #: ‖e‖
+    least_pivot: float  #: of the QR factorisation, 1 for orthogonal rows
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
     consistent: bool  #: whether there is one
     multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
 
-    def met(self, nu: Vector, tol: float) -> bool:
-        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖; for e = 0, ‖Cν‖ ≤ tol‖ν‖."""
+    def met(self, nu: Vector, tol: float, least: float) -> bool:
+        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
+
+        For e = 0, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
+        """
         Cnu = self.C @ nu
         if self.e_size == 0:
-            return bool(np.linalg.norm(Cnu) <= tol * np.linalg.norm(nu))
-        size = np.linalg.norm(self.x_tilde)
+            size = max(float(np.linalg.norm(nu)), least)
+            return bool(np.linalg.norm(Cnu) <= tol * size)
+        size = float(np.linalg.norm(self.x_tilde))
         return bool(
             np.linalg.norm(Cnu) <= tol * size
             and np.linalg.norm(self.GC @ Cnu) <= tol * self.e_size
@@ -84,14 +91,16 @@ class Projected:
         """Model H by the Ritz pairs and the rows C.
 
         The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
-        what the Ritz vectors before it leave; ρQ is taken as it is. Where that is too
+        what the Ritz vectors before it leave (the last, where the process came to its
+        end); ρQ is taken as it is. Where that is too
         little, as in flat spectra, MPRGP raises τ by what its products show.
         """
         C, ritz = self.rows.C, self.spectrum.ritz
         if ritz is None:
             raise ValueError("the power method found no Ritz pairs")
         above = (ritz.values + ritz.residuals) / self.spectrum.norm
-        kept = max(len(above) - 2, 0)
+        ended = ritz.residuals[-1] <= 1e-10 * ritz.values[0]
+        kept = max(len(above) - (1 if ended else 2), 0)
         U = np.vstack([ritz.vectors[:kept], C])
         w = np.append(above[:kept], np.full(len(C), rho))
         return Model(0.0, U, w).with_tail(max(float(above[kept]), TAIL))
@@ -121,17 +130,21 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
 
     consistent = bool((mismatch <= 1e-8 * scale).all())
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
-    return Rows(C, dense @ C.T, e_size, x_tilde, consistent, multipliers)
+    pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
+    return Rows(C, dense @ C.T, e_size, pivot_size, x_tilde, consistent, multipliers)
 
 
 def projected_problem(
-    qp: QP, find: Callable[[Callable[[Vector], Vector], Rows], Spectrum]
+    qp: QP,
+    find: Callable[[Callable[[Vector], Vector], Rows], Spectrum],
+    counts: Counter[str] | None = None,
 ) -> Projected:
     """Homogenise, project and normalise; one product with F and those of `find`.
 
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
+    counts : to go on with
     """
-    counts: Counter[str] = Counter()
+    counts = Counter() if counts is None else counts
     P = product(qp.P)
 
     def F(v: Vector) -> Vector:
@@ -140,12 +153,20 @@ def projected_problem(
 
     rows = orthonormal_rows(qp.A, qp.b)
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
+    if spectrum.norm <= NOTHING * (size := _mean_eigenvalue(qp.P)):
+        spectrum = spectrum._replace(norm=size or 1.0)  # 𝒫F𝒫 is zero, or rounding
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
     return Projected(F, counts, rows, spectrum, b, bounds)
+
+
+def _mean_eigenvalue(P: Matrix) -> float:
+    """Return the trace of an explicit P by its size, 0 for an operator."""
+    explicit = isinstance(P, np.ndarray) or issparse(P)
+    return float(P.diagonal().mean()) if explicit and P.shape[0] else 0.0
 
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:

@@ -18,6 +18,7 @@ class Ritz(NamedTuple):
     values: Vector  #: (k,)
     residuals: Vector  #: (k,) ‖Hv − θv‖: an eigenvalue lies that near to θ
     vectors: NDArray[np.float64]  #: (k, n) orthonormal rows
+    at_start: float  #: vᵀHv/‖v‖² of the start vector
 
     @property
     def norm(self) -> float:
@@ -51,10 +52,11 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
         if beta <= 1e-12 * max(map(abs, diagonal)):
             break
     if not diagonal:
-        return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)))
+        return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)), 0.0)
     theta, S = eigh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
     vectors = S.T @ basis[: len(theta)]
-    return Ritz(theta[::-1], off[-1] * np.abs(S[-1, ::-1]), vectors[::-1])
+    residuals = off[-1] * np.abs(S[-1, ::-1])
+    return Ritz(theta[::-1], residuals, vectors[::-1], diagonal[0])
 
 
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:
