@@ -144,6 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=commands.paper, parser=command)
 
     command = add("doctor", help="is this machine fit to measure", allow_abbrev=False)
+    _add_json(command)
     command.set_defaults(run=commands.doctor, parser=command)
     return parser
 

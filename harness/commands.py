@@ -11,15 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+
 from harness import show
 from harness.build import build, unbuilt
-from harness.doctor import QUIET_LOAD, advice, noise_floor, render
+from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
 from harness.journal import read_journal
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
 from harness.names import CaseName, canonical, completed, parse
+from harness.noise import noise_floor
 from harness.plugin import Case, Fields
 from harness.progress import shown_on
 from harness.qpfile import save_qp
@@ -85,7 +88,7 @@ def run(workbench: Workbench, options: Namespace) -> int:
     )
     out = options.out or Path("out") / suite.name
     environment = capture(options.plugin)
-    if (load := environment["now"]["load"]) > QUIET_LOAD:
+    if load_advice(load := environment["now"]["load"]):
         _say(f"other programs keep {load:.1f} cores busy; times will be less certain")
     with shown_on(sys.stderr) as progress:
         unbuilt_cases = run_suite(
@@ -225,10 +228,15 @@ def paper(workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
-def doctor(_workbench: Workbench, _options: Namespace) -> int:
+def doctor(_workbench: Workbench, options: Namespace) -> int:
     """Describe this machine and say what to change before measuring."""
-    environment = capture()
-    print(render(environment, advice(environment), noise_floor()))
+    environment, noise = capture(), noise_floor()
+    checks = examine(environment, noise)
+    if options.json:
+        print(json.dumps(as_json(environment, noise, checks)))
+    else:
+        text = render(checks, digest(environment))
+        Console(highlight=False, soft_wrap=True).print(text)
     return 0
 
 

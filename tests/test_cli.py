@@ -197,6 +197,18 @@ def test_doctor_describes_the_machine(cli):
 
     assert code == 0
     assert "numpy" in out
+    assert "→" not in out or "warn" in out
+
+
+def test_doctor_tells_machines_the_same(cli):
+    code, out, _ = cli("doctor", "--json")
+    told = json.loads(out)
+
+    assert code == 0
+    assert told["environment"]["versions"]["numpy"]
+    assert {check["level"] for check in told["checks"]} <= {"ok", "warn", "unknown"}
+    assert told["fit"] == all(c["level"] != "warn" for c in told["checks"])
+    assert told["noise"]["low"] <= told["noise"]["ratio"] <= told["noise"]["high"]
 
 
 def test_an_interrupt_exits_with_130_and_one_line(cli):
