@@ -136,6 +136,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.set_defaults(run=commands.report, parser=command)
 
+    command = add("replay", help="one measurement again", allow_abbrev=False)
+    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument(
+        "run_id", metavar="RUN_ID", help="of a journal line, or its first digits"
+    )
+    _add_plugin(command)
+    _add_json(command)
+    command.set_defaults(run=commands.replay, parser=command)
+
     command = add("paper", help="every figure of the paper", allow_abbrev=False)
     command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))
     command.add_argument(

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from harness import show
 from harness.build import build, unbuilt
+from harness.capsule import open_capsule
 from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
@@ -29,6 +30,8 @@ from harness.qpfile import save_qp
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec, options_of, resolve
 from harness.remote import measured_once
+from harness.replay import compared
+from harness.replay import render as show_comparison
 from harness.run import run as run_suite
 from harness.suite import load_suite, with_overrides
 from harness.workbench import FORMATS, Workbench
@@ -238,6 +241,40 @@ def doctor(_workbench: Workbench, options: Namespace) -> int:
         text = render(checks, digest(environment))
         Console(highlight=False, soft_wrap=True).print(text)
     return 0
+
+
+def replay(workbench: Workbench, options: Namespace) -> int:
+    """Make one stored measurement again and compare; 0 if it is reproduced."""
+    workbench = workbench.with_files(options.plugin)
+    capsule = open_capsule(
+        options.folder, options.run_id, workbench.families, workbench.solvers
+    )
+    environment, then = capture(options.plugin), capsule.record
+    solver = resolve(capsule.spec, workbench.solvers)
+    case = _built(workbench, capsule.name)
+    record = blank(
+        capsule.name,
+        canonical(capsule.name, workbench.families[capsule.name.family]),
+        capsule.spec,
+        options=options_of(solver),
+        tol=then.tol,
+        repeat=then.repeat,
+        environment=digest(environment),
+    )
+    with redirect_stdout(sys.stderr):  # whatever the family prints
+        record, solution = measured_once(
+            workbench.worker_command(capsule.spec, options.plugin),
+            case,
+            record,
+            time_limit=capsule.time_limit,
+            memory_limit=capsule.memory_limit,
+        )
+    comparison = compared(options.folder, capsule, record, solution, environment)
+    if options.json:
+        print(json.dumps(comparison.to_dict()))
+    else:
+        print(show_comparison(comparison))
+    return 0 if comparison.reproduced else 1
 
 
 def worker(workbench: Workbench, arguments: Sequence[str]) -> int:

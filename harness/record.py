@@ -69,6 +69,7 @@ class Record:
     energy_bound: float | None = None  #: certified relative error, energy norm
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
+    qp: str | None = None  #: digest of the emitted QP; None in old journals
     environment: str = ""  #: digest of environment.json
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state

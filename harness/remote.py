@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from harness.judge import judged
 from harness.measure import Measurement
 from harness.plugin import Case
-from harness.qpfile import save_qp
+from harness.qpfile import qp_digest, save_qp
 from harness.record import Record
 from harness.solution import Solution, Status
 from harness.store import read_point
@@ -69,9 +69,14 @@ def measured(
 
 
 def measured_once(
-    command: list[str], case: Case, record: Record
+    command: list[str],
+    case: Case,
+    record: Record,
+    *,
+    time_limit: float = inf,
+    memory_limit: float = inf,
 ) -> tuple[Record, Solution | None]:
-    """Do as `measured`, with a worker for this one measurement and without limits.
+    """Do as `measured`, with a worker for this one measurement.
 
     command : starts the worker; two file descriptors are appended to it
     """
@@ -80,4 +85,11 @@ def measured_once(
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
         qp_file = hand_over(case, record.case, scratch)
-        return measured(worker, case, qp_file, record, time_limit=inf, memory_limit=inf)
+        return measured(
+            worker,
+            case,
+            qp_file,
+            record.but(qp=qp_digest(case.qp)),
+            time_limit=time_limit,
+            memory_limit=memory_limit,
+        )

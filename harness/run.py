@@ -23,6 +23,7 @@ from harness.journal import Journal, read_journal
 from harness.judge import blank, has_point, noted
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference, Solver
+from harness.qpfile import qp_digest
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec, options_of
 from harness.remote import hand_over, measured
@@ -176,6 +177,7 @@ def _run_case(bench: _Bench, name: CaseName) -> bool:
             bench.progress.advance(None)
         return False
     qp_file = hand_over(case, canonical_name, bench.scratch)
+    digest = qp_digest(case.qp)
     declined: set[tuple[str, float]] = set()
     for block in blocks:
         number = next(bench.blocks)
@@ -194,7 +196,7 @@ def _run_case(bench: _Bench, name: CaseName) -> bool:
             )
             if solution is not None:
                 record = _stored(bench.out, case, record, solution)
-            record = record.but(block=number)
+            record = record.but(block=number, qp=digest)
             bench.journal.append(record)
             bench.progress.advance(record)
             if record.status is Verdict.DECLINED:

@@ -103,6 +103,16 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     return arrays
 
 
+def content_digest(arrays: Arrays) -> str:
+    """Hash names, types, shapes and values, not an archive, which would hold dates."""
+    content = sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
+        content.update(array.tobytes())
+    return content.hexdigest()[:16]
+
+
 def _point(solution: Solution) -> Arrays:
     return {name: getattr(solution, name) for name in _POINT}
 
@@ -113,7 +123,7 @@ def _path(folder: Path, digest: str) -> Path:
 
 def _save(folder: Path, arrays: Arrays) -> str:
     """Write arrays under the digest of their content, unless they are there."""
-    digest = _digest(arrays)
+    digest = content_digest(arrays)
     path = _path(folder, digest)
     if path.exists():
         return digest
@@ -124,13 +134,3 @@ def _save(folder: Path, arrays: Arrays) -> str:
         os.fsync(file.fileno())  # before the journal line that will refer to it
     os.replace(file.name, path)
     return digest
-
-
-def _digest(arrays: Arrays) -> str:
-    """Hash names, types, shapes and values, not the archive, which holds dates."""
-    content = sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
-        content.update(array.tobytes())
-    return content.hexdigest()[:16]

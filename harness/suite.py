@@ -76,6 +76,21 @@ def load_suite(
         )
 
 
+def asked_solvers(text: str) -> dict[str, SolverSpec]:
+    """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
+    entries = checked.filled_list("solvers", _toml(text).get("solvers"))
+    return {spec.label: spec for spec in map(_spec, entries)}
+
+
+def limits(text: str) -> tuple[float, float]:
+    """Read the limits of a measurement from a suite's TOML, s and MiB."""
+    table = {**DEFAULTS, **_toml(text)}
+    time_limit, memory_limit = (
+        checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
+    )
+    return time_limit, memory_limit
+
+
 def with_overrides(
     suite: Suite,
     families: Mapping[str, Family],
