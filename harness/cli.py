@@ -57,8 +57,10 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
 
 def _run(workbench: Workbench, argv: Sequence[str]) -> int:
     workbench = workbench.extended(entry_point_plugins())
-    if argv[:1] == ["worker"]:  # how runs start their workers; not for users
+    if argv[:1] == ["worker"]:  # how runs start their processes; not for users
         return commands.worker(workbench, argv[1:])
+    if argv[:1] == ["generator"]:
+        return commands.generator(workbench, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")

@@ -19,6 +19,8 @@ from harness.capsule import open_capsule
 from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
+from harness.generator import Generator
+from harness.generator import serve as serve_cases
 from harness.journal import read_journal
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
@@ -97,9 +99,8 @@ def run(workbench: Workbench, options: Namespace) -> int:
         unbuilt_cases = run_suite(
             suite,
             families=workbench.families,
-            reference=workbench.reference,
             out=out,
-            command=lambda spec: workbench.worker_command(spec, options.plugin),
+            commands=workbench.commands(suite.solvers, options.plugin),
             resolve=lambda spec: resolve(spec, workbench.solvers),
             environment=environment,
             digest=digest(environment),
@@ -286,6 +287,19 @@ def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
         name=request["name"], label=request["name"], options=request["options"]
     )
     serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
+    return 0
+
+
+def generator(workbench: Workbench, arguments: Sequence[str]) -> int:
+    """Be the generator that `Workbench.commands` starts."""
+    text, request_fd, reply_fd = arguments
+    files = [Path(file) for file in json.loads(text)["plugins"]]
+    workbench = workbench.with_files(files)
+    serve_cases(
+        Generator(workbench.families, workbench.reference),
+        int(request_fd),
+        int(reply_fd),
+    )
     return 0
 
 

@@ -17,7 +17,7 @@ from harness.errors import InputError, some
 from harness.suite import Suite
 
 #: all that a run writes, which `fresh` deletes and nothing else
-_FOLDERS = ("journal", "vectors", "report")
+_FOLDERS = ("journal", "vectors", "cases", "report")
 _FILES = ("environment.json", "suite.toml")
 
 

@@ -23,7 +23,7 @@ from scipy.sparse import csc_array
 
 from harness.errors import InputError
 from harness.qp import QP, Matrix, Vector
-from harness.store import content_digest, read_arrays
+from harness.store import digest_of, read_arrays
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -37,8 +37,10 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
     return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
 
 
-def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
+def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> str:
     """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
+
+    Returns 16 hex digits that name its numbers: equal digests, equal QPs.
 
     `meta` is plain data; its key ``dense`` is filled in here.
 
@@ -48,13 +50,20 @@ def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         When the file cannot be written.
 
     """
-    arrays, dense = _arrays(qp)
+    matrices, dense = explicit_matrices(qp)
+    arrays = {name: getattr(qp, name) for name in _VECTORS}
+    for name, M in matrices.items():
+        M = csc_array(M)
+        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
+    digest = digest_of(arrays)
     arrays["meta"] = np.array(json.dumps({**meta, "dense": dense}))
     try:
         with path.open("wb") as file:  # given a name, savez would append .npz to it
-            np.savez(file, **arrays)  # type: ignore[arg-type]
+            np.savez(file, **arrays)
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    return digest
 
 
 def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
@@ -79,22 +88,6 @@ def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
         return QP(**vectors, **matrices), meta
     except (ValueError, TypeError) as e:
         raise InputError(f"{path}: {' '.join(str(e).split())}") from None
-
-
-def qp_digest(qp: QP) -> str:
-    """Name the numbers of a QP by 16 hex digits: equal digests, equal QPs."""
-    return content_digest(_arrays(qp)[0])
-
-
-def _arrays(qp: QP) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return all arrays that make up a QP, and the names of dense matrices."""
-    matrices, dense = explicit_matrices(qp)
-    arrays = {name: getattr(qp, name) for name in _VECTORS}
-    for name, M in matrices.items():
-        M = csc_array(M)
-        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
-        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
-    return arrays, dense
 
 
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:

@@ -9,11 +9,12 @@ from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.judge import judged
+from harness.judge import judged, noted, quantities_of
 from harness.measure import Measurement
 from harness.plugin import Case
-from harness.qpfile import qp_digest, save_qp
-from harness.record import Record
+from harness.qp import QP
+from harness.qpfile import save_qp
+from harness.record import Record, Verdict
 from harness.solution import Solution, Status
 from harness.store import read_point
 from harness.supervisor import WorkerProcess
@@ -21,32 +22,26 @@ from harness.supervisor import WorkerProcess
 _MEASURED = ("prepare_seconds", "solve_seconds", "total_seconds", "peak_mib")
 
 
-def hand_over(case: Case, name: str, scratch: Path) -> Path:
-    """Write the QP of a case, of that canonical name, to where workers read it."""
-    qp_file = scratch / "qp.npz"
-    save_qp(qp_file, case.qp, {"name": name})
-    return qp_file
-
-
 def measured(
     worker: WorkerProcess,
-    case: Case,
+    qp: QP,
     qp_file: Path,
     record: Record,
     *,
+    point: Path,
     time_limit: float,
     memory_limit: float,
 ) -> tuple[Record, Solution | None]:
     """Fill in `record` by one measurement; no solution where the worker ended.
 
-    qp_file : from `hand_over`; the worker writes its point next to it
+    qp_file : holds `qp`
+    point : where the worker writes its point
     time_limit, memory_limit : s and MiB
     """
     record = record.but(
-        sizes=case.qp.sizes,
+        sizes=qp.sizes,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
     )
-    point = qp_file.with_name("point.npz")
     reply = worker.ask(
         {"qp": str(qp_file), "tol": record.tol, "out": str(point)},
         time_limit=time_limit,
@@ -65,7 +60,7 @@ def measured(
         message=answer["message"],
     )
     seconds = {name: answer[name] for name in _MEASURED}
-    return judged(record, case, Measurement(solution=solution, **seconds)), solution
+    return judged(record, qp, Measurement(solution=solution, **seconds)), solution
 
 
 def measured_once(
@@ -84,12 +79,18 @@ def measured_once(
         scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
-        qp_file = hand_over(case, record.case, scratch)
-        return measured(
+        qp_file = scratch / "qp.npz"
+        digest = save_qp(qp_file, case.qp, {"name": record.case})
+        record, solution = measured(
             worker,
-            case,
+            case.qp,
             qp_file,
-            record.but(qp=qp_digest(case.qp)),
+            record.but(qp=digest),
+            point=scratch / "point.npz",
             time_limit=time_limit,
             memory_limit=memory_limit,
         )
+    if solution is None or record.status is Verdict.DECLINED:
+        return record, solution
+    quantities, note = quantities_of(case, solution)
+    return noted(record, note).but(quantities=quantities), solution

@@ -27,7 +27,7 @@ _NODAL = "nodal_"
 
 def save_solution(folder: Path, solution: Solution) -> str:
     """Store a primal-dual point and return its digest."""
-    return _save(folder, _point(solution))
+    return save(folder, point_arrays(solution))
 
 
 def load_solution(folder: Path, digest: str, status: Status) -> Solution:
@@ -44,9 +44,14 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
 
 def save_fields(folder: Path, fields: Fields) -> str:
     """Store a deformed state and return its digest."""
+    return save(folder, field_arrays(fields))
+
+
+def field_arrays(fields: Fields) -> Arrays:
+    """List the arrays of a deformed state by name."""
     arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
-    return _save(folder, {k: np.asarray(v) for k, v in arrays.items() if v is not None})
+    return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
 
 def load_fields(folder: Path, digest: str) -> Fields:
@@ -70,8 +75,13 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 def write_point(path: Path, solution: Solution) -> None:
     """Write the point of a solution to a file of its own."""
+    write_arrays(path, point_arrays(solution))
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write arrays to a file of their own."""
     with path.open("wb") as file:  # given a name, savez would append .npz to it
-        np.savez(file, **_point(solution))  # type: ignore[arg-type]
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_point(path: Path, status: Status) -> Solution:
@@ -103,17 +113,8 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     return arrays
 
 
-def content_digest(arrays: Arrays) -> str:
-    """Hash names, types, shapes and values, not an archive, which would hold dates."""
-    content = sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
-        content.update(array.tobytes())
-    return content.hexdigest()[:16]
-
-
-def _point(solution: Solution) -> Arrays:
+def point_arrays(solution: Solution) -> Arrays:
+    """List the four vectors of a primal-dual point by name."""
     return {name: getattr(solution, name) for name in _POINT}
 
 
@@ -121,9 +122,9 @@ def _path(folder: Path, digest: str) -> Path:
     return folder / "vectors" / f"{digest}.npz"
 
 
-def _save(folder: Path, arrays: Arrays) -> str:
-    """Write arrays under the digest of their content, unless they are there."""
-    digest = content_digest(arrays)
+def save(folder: Path, arrays: Arrays) -> str:
+    """Write arrays under the digest of their content, unless a folder has them."""
+    digest = digest_of(arrays)
     path = _path(folder, digest)
     if path.exists():
         return digest
@@ -134,3 +135,13 @@ def _save(folder: Path, arrays: Arrays) -> str:
         os.fsync(file.fileno())  # before the journal line that will refer to it
     os.replace(file.name, path)
     return digest
+
+
+def digest_of(arrays: Arrays) -> str:
+    """Hash names, types, shapes and values, not the archive, which holds dates."""
+    content = sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
+        content.update(array.tobytes())
+    return content.hexdigest()[:16]

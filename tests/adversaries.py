@@ -17,7 +17,16 @@ from threading import Timer
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from harness import (
+    QP,
+    Case,
+    Fields,
+    InputError,
+    Solution,
+    Status,
+    generator,
+    no_rows,
+)
 from harness.worker import serve
 
 
@@ -152,7 +161,7 @@ class Leaks(Honest):
         hoard = []
         while True:
             hoard.append(np.ones(2**20))  # 8 MiB
-            time.sleep(0.005)
+            time.sleep(0.001)
 
 
 class Forks(Honest):
@@ -246,4 +255,8 @@ SOLVERS = {
 PROBLEMS = {"tiny": Tiny()}
 
 if __name__ == "__main__":
-    serve(SOLVERS[sys.argv[1]], int(sys.argv[2]), int(sys.argv[3]))
+    what, *pipes = sys.argv[1:]
+    if what == "generator":
+        generator.serve(generator.Generator(PROBLEMS, None), *map(int, pipes))
+    else:
+        serve(SOLVERS[what], *map(int, pipes))

@@ -10,7 +10,7 @@ import pytest
 
 from harness.cli import main
 from harness.journal import read_journal
-from harness.qpfile import load_qp, qp_digest, save_qp
+from harness.qpfile import load_qp, save_qp
 from harness.registry import load_plugin
 from harness.workbench import Workbench
 
@@ -42,7 +42,7 @@ def workbench():
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
         report=no_report,
-        worker=(sys.executable, "-P", str(WELLS)),
+        start=(sys.executable, "-P", str(WELLS)),
         **nothing,
     )
 
@@ -231,9 +231,9 @@ def test_a_case_whose_file_has_changed_is_refused(planted, tmp_path):
 @pytest.mark.parametrize("shape", ["box", "everything"])
 def test_equal_qps_have_one_digest_and_others_another(planted, tmp_path, shape):
     qp, _ = planted(shape)
-    save_qp(tmp_path / "a.npz", qp, {"name": "whatever"})
-    again, _ = load_qp(tmp_path / "a.npz")
+    file = tmp_path / "a.npz"
+    digest = save_qp(file, qp, {"name": "whatever"})
 
-    assert qp_digest(again) == qp_digest(qp)
+    assert save_qp(file, load_qp(file)[0], {}) == digest
     for change in ({"q": 2 * qp.q}, {"P": 2 * qp.P}, {"ub": qp.ub + 1}):
-        assert qp_digest(replace(qp, **change)) != qp_digest(qp)
+        assert save_qp(file, replace(qp, **change), {}) != digest

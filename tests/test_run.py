@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from harness import InputError, Status, Verdict
+from harness.block import Commands
 from harness.journal import read_journal
 from harness.names import CaseName
 from harness.registry import SolverSpec, load_plugin, resolve
@@ -18,6 +19,7 @@ from harness.store import load_fields, load_solution
 from harness.suite import Suite
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
+START = [sys.executable, "-P", str(PLUGIN)]
 SOLVERS = load_plugin(PLUGIN).solvers
 FAMILIES = load_plugin(PLUGIN).problems
 
@@ -86,17 +88,17 @@ def measure(tmp_path):
         tally.unbuilt = run(
             suite,
             families=FAMILIES,
-            reference=None,
             out=out,
-            command=lambda spec: [
-                sys.executable, "-P", str(PLUGIN), spec.name
-            ],
+            commands=Commands(
+                solvers={spec.label: [*START, spec.name] for spec in suite.solvers},
+                generator=[*START, "generator"],
+            ),
             resolve=lambda spec: resolve(spec, SOLVERS),
             environment=environment or {"machine": "test"},
             digest=digest,
             progress=tally,
             fresh=fresh,
-        )  # fmt: skip
+        )
         return tally
 
     return measure
@@ -413,7 +415,7 @@ def test_scratch_files_lie_in_the_folder_while_a_run_lasts(
     measure(suite("honest"))
 
     (files,) = seen
-    assert {"qp.npz", "worker-0.log"} <= {file.name for file in files}
+    assert {"point.npz", "worker-0.log"} <= {file.name for file in files}
     assert old not in files
     assert not old.parent.exists()
 

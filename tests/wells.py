@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
-from harness.commands import worker
+from harness.cli import main
 from harness.workbench import Workbench
 
 FAULTS = {
@@ -139,4 +139,4 @@ PROBLEMS = {"well": Well()}
 if __name__ == "__main__":
     nothing = dict.fromkeys(("reference", "report", "plot", "vtu", "series", "paper"))
     workbench = Workbench(families=PROBLEMS, solvers=SOLVERS, **nothing)
-    sys.exit(worker(workbench, sys.argv[1:]))
+    sys.exit(main(workbench, sys.argv[1:]))
