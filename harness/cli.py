@@ -178,6 +178,11 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--fresh", action="store_true", help="forget what the folder holds"
     )
+    command.add_argument(
+        "--dask",
+        metavar="ADDRESS|local",
+        help="measure on the workers of a Dask scheduler, see docs/cluster.md",
+    )
 
 
 def _folder(text: str) -> Path:

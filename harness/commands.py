@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +14,14 @@ from typing import Any
 from rich.console import Console
 
 from harness import show
+from harness.block import Opens
 from harness.build import build, unbuilt
 from harness.capsule import open_capsule
+from harness.cluster import on_cluster
 from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
+from harness.folder import keep_environment
 from harness.generator import Generator
 from harness.generator import serve as serve_cases
 from harness.journal import read_journal
@@ -34,7 +37,9 @@ from harness.registry import SolverSpec, options_of, resolve
 from harness.remote import measured_once
 from harness.replay import compared
 from harness.replay import render as show_comparison
+from harness.run import Progress
 from harness.run import run as run_suite
+from harness.station import one_by_one
 from harness.suite import load_suite, with_overrides
 from harness.workbench import FORMATS, Workbench
 from harness.worker import serve
@@ -106,6 +111,7 @@ def run(workbench: Workbench, options: Namespace) -> int:
             digest=digest(environment),
             progress=progress,
             fresh=options.fresh,
+            engine=_engine(options, out, environment, progress),
         )
     records = read_journal(out)
     print(show.summary(records, [s.label for s in suite.solvers]))
@@ -116,6 +122,20 @@ def run(workbench: Workbench, options: Namespace) -> int:
     for page in (file for file in written if file.suffix == ".html"):
         print(page)
     return 1 if unbuilt_cases else 0
+
+
+def _engine(
+    options: Namespace, out: Path, environment: Mapping[str, Any], progress: Progress
+) -> Opens:
+    if options.dask is None:
+        return one_by_one
+    return on_cluster(
+        options.dask,
+        plugins=options.plugin,
+        environment=environment,
+        keep=lambda name, there: keep_environment(out, name, there),
+        warn=progress.warn,
+    )
 
 
 def solve(workbench: Workbench, options: Namespace) -> int:

@@ -90,14 +90,19 @@ def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
     }
 
 
-def capture_in(variables: Mapping[str, str]) -> dict[str, Any]:
+def capture_in(
+    variables: Mapping[str, str], plugins: Iterable[Path] = ()
+) -> dict[str, Any]:
     """Describe a process that is started with some variables set, as workers are.
 
     Libraries read their thread variables only once, when they are loaded.
     """
-    program = "import json, harness.environment as e; print(json.dumps(e.capture()))"
+    program = (
+        "import json, pathlib, sys, harness.environment as e; "
+        "print(json.dumps(e.capture(map(pathlib.Path, sys.argv[1:]))))"
+    )
     done = subprocess.run(
-        [sys.executable, "-P", "-c", program],
+        [sys.executable, "-P", "-c", program, *map(str, plugins)],
         env=os.environ | variables,
         capture_output=True,
         text=True,

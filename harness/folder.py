@@ -17,7 +17,7 @@ from harness.errors import InputError, some
 from harness.suite import Suite
 
 #: all that a run writes, which `fresh` deletes and nothing else
-_FOLDERS = ("journal", "vectors", "cases", "report")
+_FOLDERS = ("journal", "vectors", "cases", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
 
 
@@ -150,10 +150,22 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
         When the folder does not hold it.
 
     """
-    path = folder / "environment.json"
-    if not path.is_file() or (found := _environment(path))["digest"] != digest:
-        raise InputError(f"{folder} does not hold the environment {digest}")
-    return found
+    for path in (folder / "environment.json", _node_file(folder, digest)):
+        if path.is_file() and (found := _environment(path))["digest"] == digest:
+            return found
+    raise InputError(f"{folder} does not hold the environment {digest}")
+
+
+def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
+    """Store what one machine of a cluster is, under its digest."""
+    path = _node_file(folder, digest)
+    path.parent.mkdir(exist_ok=True)
+    text = json.dumps({"digest": digest, **environment}, indent=1)
+    _replace_text(path, text + "\n")
+
+
+def _node_file(folder: Path, digest: str) -> Path:
+    return folder / "environments" / f"{digest}.json"
 
 
 def differences(

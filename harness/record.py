@@ -70,7 +70,8 @@ class Record:
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
     qp: str | None = None  #: digest of the emitted QP; None in old journals
-    environment: str = ""  #: digest of environment.json
+    environment: str = ""  #: digest of environment.json or of one in environments/
+    node: str = ""  #: host name, where a cluster measured
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
     started: str = ""  #: UTC, ISO 8601
