@@ -71,14 +71,15 @@ def on_cluster(
             _forget_lost_runs(client)
             files = [file.resolve() for file in plugins]
             client.register_plugin(Node(commands, files, _sharing(client)), name=name)
-            stack.callback(client.unregister_worker_plugin, name)
-            nodes = _Nodes(environment, keep, warn)
-            yield _Cluster(client, name, nodes, address, warn)
+            stack.callback(_end, client, name)
+            nodes = Nodes(environment, keep, warn)
+            with _scheduler_there(client, address):
+                yield _Cluster(client, name, nodes, address, warn)
 
     return opened
 
 
-class _Nodes:
+class Nodes:
     """What is known of the machines that have measured."""
 
     def __init__(
@@ -124,7 +125,7 @@ class _Cluster:
         self,
         client: Any,
         name: str,
-        nodes: _Nodes,
+        nodes: Nodes,
         address: str,
         warn: Callable[[str], None],
     ) -> None:
@@ -182,9 +183,7 @@ class _Cluster:
     ) -> list[Result | Unbuilt]:
         from distributed import KilledWorker
 
-        if future.status in ("cancelled", "lost"):
-            if self._client.status != "running":
-                raise InputError(f"the Dask scheduler at {self._address} is gone")
+        if future.status in ("cancelled", "lost") and self._client.status == "running":
             under_way[self._submitted(block)] = block
             return []
         try:
@@ -227,6 +226,33 @@ def _connected(address: str, stack: ExitStack) -> Any:
             f"--dask {address}: no scheduler answers ({why}); expected 'local', or the "
             "address that `dask scheduler` prints, such as tcp://HOST:8786"
         ) from None
+
+
+@contextmanager
+def _scheduler_there(client: Any, address: str) -> Iterator[None]:
+    """Turn whatever a scheduler that has gone makes Dask raise into one line.
+
+    Raises
+    ------
+    InputError
+        When the connection is closed.
+
+    """
+    try:
+        yield
+    except Exception as e:
+        if isinstance(e, InputError) or client.status == "running":
+            raise
+        raise InputError(
+            f"the Dask scheduler at {address} is gone; start one, and the same command "
+            "continues"
+        ) from e
+
+
+def _end(client: Any, name: str) -> None:
+    """Have workers end the processes of this run, unless the scheduler is gone."""
+    if client.status == "running":
+        client.unregister_worker_plugin(name)
 
 
 def _sharing(client: Any) -> int:

@@ -15,6 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
+from threading import Lock
 from typing import Any, cast
 
 from distributed import Worker, get_worker
@@ -54,21 +55,30 @@ class Node(WorkerPlugin):
         self._sharing = sharing
         self._python = sys.executable
         self._open: _Open | None = None
+        self._ended = False
 
     def setup(self, worker: Worker) -> None:
-        """Do nothing yet: a block opens what it needs, in the thread that it runs in.
+        """Open nothing yet: a block does, in the thread that it runs in.
 
         The kernel kills solver processes with the thread that started them.
         """
+        self._busy = Lock()
 
-    def teardown(self, worker: Worker) -> None:
-        """End the processes of the station."""
+    def teardown(self, worker: Worker | None = None) -> None:
+        """End the processes of the station, at the latest when a measurement is made.
+
+        Dask cannot stop a block that is being carried out; its thread comes here last.
+        """
+        self._ended = True
+        if not self._busy.acquire(blocking=False):
+            return
         if self._open is not None:
             self._open.stack.close()
             self._open = None
+        self._busy.release()
 
     def carry_out(self, block: Block) -> Done:
-        """Measure a block.
+        """Measure a block, or what can be measured of it before the run ends.
 
         Raises
         ------
@@ -76,13 +86,25 @@ class Node(WorkerPlugin):
             When this machine is not fit to measure on.
 
         """
+        try:
+            with self._busy:
+                return self._carried_out(block)
+        finally:
+            if self._ended:
+                self.teardown()
+
+    def _carried_out(self, block: Block) -> Done:
         opened = self._open = self._open or self._opened()
         os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
-        results = opened.station.carry_out(replace(block, turns=turns))
+        results = []
+        for result in opened.station.carry_out(replace(block, turns=turns)):
+            results.append(result)
+            if self._ended:
+                break
         return Done(
-            results=list(results),
+            results=results,
             node=platform.node(),
             digest=opened.digest,
             environment=opened.environment,

@@ -116,6 +116,30 @@ class Hangs(Exact):
 
 
 @dataclass(frozen=True)
+class Slow(Exact):
+    """Takes a while. Adds a line to $STARTS at every start but those to warm up."""
+
+    seconds: float = 0.4
+
+    def prepare(self, qp, tol):
+        if qp.q.size != 2:
+            with Path(os.environ["STARTS"]).open("a") as starts:
+                starts.write(f"{os.getpid()} {os.sched_getaffinity(0)}\n")
+            time.sleep(self.seconds)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Murders(Exact):
+    """Kills whoever measures it, at depth 4."""
+
+    def prepare(self, qp, tol):
+        if qp.q[0] == -4:
+            os.kill(os.getppid(), signal.SIGKILL)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
 class Lax(Exact):
     """As good as asked for. Not better."""
 
@@ -133,6 +157,8 @@ SOLVERS = {
     "prints": Prints(),
     "dies": Dies(),
     "hangs": Hangs(),
+    "slow": Slow(),
+    "murders": Murders(),
 }
 PROBLEMS = {"well": Well()}
 
