@@ -37,6 +37,11 @@ class Block:
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
 
+    @property
+    def is_sequence(self) -> bool:
+        """Whether each solver may use, at a step, what the earlier ones left."""
+        return self.turns[0][0].mode == "sequence"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:

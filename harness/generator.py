@@ -19,6 +19,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 from harness.build import build, unbuilt
@@ -38,6 +39,7 @@ class Generator:
         self._families = families
         self._reference = reference
         self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
+        self._build_seconds = 0.0  # of the last case that was built
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request, whatever the family's code does."""
@@ -57,10 +59,12 @@ class Generator:
         case = self._cases.pop(key, None)
         while len(self._cases) >= keep:  # before building: two may be too large
             del self._cases[next(iter(self._cases))]
-        self._cases[key] = (
-            build(name, family, self._reference) if case is None else case
-        )
-        return self._cases[key]
+        if case is None:
+            start = perf_counter()
+            case = build(name, family, self._reference)
+            self._build_seconds = perf_counter() - start
+        self._cases[key] = case
+        return case
 
     def _written(self, case: Case, name: CaseName, path: Path) -> dict[str, Any]:
         meta = {
@@ -68,8 +72,12 @@ class Generator:
             "scale": case.scale,
             "constant": case.constant,
         }
-        digest = save_qp(path, case.qp, plain(meta))
-        return {"meta": {**meta, "qp": digest}}
+        digest = save_qp(path, case.qp, plain(meta), recipe=True)
+        seconds = {
+            "build_seconds": self._build_seconds,
+            "dualise_seconds": case.dualise_seconds,
+        }
+        return {"meta": {**meta, **seconds, "qp": digest}}
 
 
 def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
@@ -84,11 +92,13 @@ def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
 
 def _described(case: Case, request: dict[str, Any]) -> dict[str, Any]:
     s = read_point(Path(request["point"]), Status.SOLVED)
+    start = perf_counter()
     quantities, note = quantities_of(case, s)
+    seconds = perf_counter() - start
     notes = [note] if note else []
     if request["fields"] is not None and case.fields is not None:
         try:
             write_arrays(Path(request["fields"]), field_arrays(case.fields(s)))
         except Exception as e:  # the family's code; its fault must not lose the record
             notes.append(note_of("fields", e))
-    return {"quantities": quantities, "notes": notes}
+    return {"quantities": quantities, "notes": notes, "seconds": seconds}

@@ -71,6 +71,9 @@ def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
         solve_seconds=measurement.solve_seconds,
         total_seconds=measurement.total_seconds,
         peak_mib=measurement.peak_mib,
+        prepare_peak_mib=measurement.prepare_peak_mib,
+        solve_peak_mib=measurement.solve_peak_mib,
+        inner=measurement.inner,
     )
     if s.status is Status.DECLINED:
         return record.but(status=Verdict.DECLINED)

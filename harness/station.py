@@ -12,6 +12,7 @@ from typing import Any, Self
 from harness.block import Block, Commands, Result, Unbuilt
 from harness.cases import Entry, entry
 from harness.judge import has_point, noted
+from harness.measure import SAMPLE_SECONDS
 from harness.names import CaseName
 from harness.qp import QP
 from harness.qpfile import load_qp
@@ -66,17 +67,35 @@ class Station:
         self, block: Block, turn: tuple[Record, ...], entries: list[Entry]
     ) -> Iterator[Result]:
         worker = self._worker(turn[0].solver)
-        for name, record, at in zip(block.cases, turn, entries, strict=True):
+        for step, (name, record, at) in enumerate(
+            zip(block.cases, turn, entries, strict=True)
+        ):
+            request = {
+                "qp": str(at.qp),
+                "digest": at.digest,
+                "out": str(self._point),
+                "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
+                **({"step": step} if block.is_sequence else {}),
+            }
             record, solution = measured(
                 worker,
                 self._qp(at),
-                at.qp,
-                record.but(qp=at.meta["qp"]),
-                point=self._point,
+                record.but(
+                    qp=at.meta.get("qp"),
+                    build_seconds=at.meta.get("build_seconds"),
+                    dualise_seconds=at.meta.get("dualise_seconds"),
+                ),
+                request,
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
             )
             yield self._described(block, name, record, solution)
+            stopped = record.status is not Verdict.DECLINED and (
+                solution is None or not has_point(solution)
+            )
+            if block.is_sequence and stopped:  # what it carried is lost
+                yield from _broken(turn[step + 1 :], record)
+                return
 
     def _described(
         self, block: Block, name: CaseName, record: Record, solution: Solution | None
@@ -96,7 +115,9 @@ class Station:
         try:
             answer = self._ask_generator(request, block)
             notes = answer["notes"]
-            record = record.but(quantities=answer["quantities"])
+            record = record.but(
+                quantities=answer["quantities"], recover_seconds=answer["seconds"]
+            )
         except _UnbuiltError as e:
             notes = [f"no quantities: {e.reason}"]
         stored = read_arrays(fields, ()) if fields.exists() else None
@@ -158,6 +179,13 @@ class OneByOne:
         """Carry out all of `blocks`."""
         for block in blocks:
             yield from self._station.carry_out(block)
+
+
+def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
+    """Give the steps that a sequence did not come to, because of how one ended."""
+    for record in rest:
+        reason = f"the sequence ended at {end.case}: {end.message}"
+        yield Result(record=record.but(status=end.status, message=reason))
 
 
 class _UnbuiltError(Exception):
