@@ -110,7 +110,7 @@ OUTCOMES = {
     "exits": (Verdict.FAILED, "failed", "SystemExit: 3"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
-    "hangs": (Verdict.TIME_LIMIT, None, "killed after 1 s"),
+    "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
     "prints": (Verdict.VERIFIED, "solved", ""),
     "leaks": (Verdict.MEMORY_LIMIT, None, None),
     "forks": (Verdict.VERIFIED, "solved", ""),
@@ -134,7 +134,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
     measure, tmp_path
 ):
     cases = [{"h": 0.5}, {"h": 1.0}]
-    measure(suite(*OUTCOMES, cases=cases, time_limit=1.0, memory_limit=300.0))
+    measure(suite(*OUTCOMES, cases=cases, time_limit=3.0, memory_limit=300.0))
     records = read_journal(tmp_path)
 
     assert len(records) == 2 * len(OUTCOMES)
