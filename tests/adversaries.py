@@ -156,6 +156,98 @@ class Prints(Honest):
         return at_the_row(qp)
 
 
+class PrintsEndlessly(Honest):
+    def act(self, qp):
+        while True:
+            print("x" * 2**20)
+
+
+class AsksForTheMoon(Honest):
+    """One allocation beyond all memory, that the library refuses."""
+
+    def act(self, qp):
+        np.ones(2**40)
+
+
+class AbortsForMemory(Honest):
+    """As Rust and C++ end when an allocation fails."""
+
+    def act(self, qp):
+        print("memory allocation of 64 bytes failed", file=sys.stderr, flush=True)
+        os.abort()
+
+
+class SpikesUnseen(Honest):
+    """Answers, after more memory than allowed for a shorter time than one looks."""
+
+    def act(self, qp):
+        np.ones(2**26)  # 512 MiB
+        return at_the_row(qp)
+
+
+class ForksAHoarder(Honest):
+    """Leaves the hoarding to a child."""
+
+    def act(self, qp):
+        if os.fork() == 0:
+            Leaks().act(qp)
+        time.sleep(3600)
+
+
+class WrongSign(Honest):
+    """A multiplier that pulls where the row can only push; primal and gap are zero."""
+
+    def act(self, qp):
+        s = at_the_row(qp)
+        return replace(s, z=-s.z)
+
+
+class AnswersAnotherProblem(Honest):
+    """Gives the first problem's answer to all."""
+
+    first = None
+
+    def act(self, qp):
+        if AnswersAnotherProblem.first is None:
+            AnswersAnotherProblem.first = at_the_row(qp)
+        return AnswersAnotherProblem.first
+
+
+class Sleeps(Honest):
+    """Takes 20 ms."""
+
+    def act(self, qp):
+        time.sleep(0.02)
+        return at_the_row(qp)
+
+
+@dataclass(frozen=True)
+class Chains(Honest):
+    """Tells by its iterations how many QPs of a sequence it has seen."""
+
+    def chain(self, tol):
+        seen = []
+
+        def prepare(qp):
+            seen.append(qp)
+            return lambda: replace(at_the_row(qp), iterations=len(seen))
+
+        return prepare
+
+
+class BreaksItsChain(Honest):
+    """Dies at the second QP of a sequence."""
+
+    def chain(self, tol):
+        seen = []
+
+        def prepare(qp):
+            seen.append(qp)
+            return lambda: os._exit(9) if len(seen) == 2 else at_the_row(qp)
+
+        return prepare
+
+
 class Leaks(Honest):
     def act(self, qp):
         hoard = []
