@@ -18,8 +18,11 @@ from harness.registry import SolverSpec, load_plugin, resolve
 from harness.run import run
 from harness.store import load_fields, load_solution
 from harness.suite import Suite
+from reports.data import read_evidence
+from reports.scaling import ladders
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
+SIZES = (10, 20, 40, 80)
 START = [sys.executable, "-P", str(PLUGIN)]
 SOLVERS = load_plugin(PLUGIN).solvers
 FAMILIES = load_plugin(PLUGIN).problems
@@ -254,6 +257,20 @@ def test_answers_of_a_sweep_are_judged_at_one_accuracy(measure, tmp_path):
         (0.1, 1e-6, "honest", Verdict.VERIFIED), (0.1, 1e-6, "zero", Verdict.WRONG),
         (1e-8, 1e-6, "honest", Verdict.VERIFIED), (1e-8, 1e-6, "zero", Verdict.WRONG),
     }  # fmt: skip
+
+
+@pytest.mark.slow  # it sleeps, and other programs must not
+def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
+    measure, tmp_path
+):
+    sizes = [CaseName(family="sized", params={"n": n}, form="plain") for n in SIZES]
+    measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
+    (ladder,) = ladders(read_evidence(tmp_path))
+    law = ladder.time_law("sleepsbypower")
+
+    assert law.points == len(SIZES)
+    assert law.low <= 1.5 <= law.high
+    assert law.high - law.low < 0.1
 
 
 def test_a_damaged_case_on_disk_is_built_again(measure, tmp_path):
