@@ -30,15 +30,20 @@ def blank(
     repeat: int,
     environment: str,
     block: int = 0,
+    mode: str = "cold",
+    accuracy: float | None = None,
 ) -> Record:
     """Make the record of a measurement before it is made.
 
     case : the canonical name
     options : every option of the solver, defaults resolved
     environment : digest
+    mode, accuracy : see `Record`
     """
     options = plain(options)
     identity = [SCHEMA, case, spec.label, spec.name, options, tol, repeat]
+    if (mode, accuracy) != ("cold", None):
+        identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=sha256(text.encode()).hexdigest()[:12],
@@ -54,6 +59,9 @@ def blank(
         block=block,
         status=Verdict.FAILED,
         environment=environment,
+        mode=mode,
+        accuracy=accuracy,
+        arm=spec.arm,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
     )
 
@@ -81,7 +89,7 @@ def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
         residuals = kkt_residuals(qp, s)
         objective = qp.objective(s.x)
     return record.but(
-        status=verdict(s.status, residuals, record.tol),
+        status=verdict(s.status, residuals, record.accuracy or record.tol),
         objective=objective,
         **residuals._asdict(),
     )

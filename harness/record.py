@@ -74,6 +74,7 @@ class Record:
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to
     mode: str = "cold"  #: or "sequence": may use what earlier steps left
+    accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
     arm: str = ""  #: "null": the same solver once more, to show the noise
     primal: float | None = None  #: the four scale-free residuals of harness.kkt
     dual: float | None = None

@@ -136,10 +136,13 @@ class Station:
     def _ask_generator(
         self, request: Mapping[str, Any], block: Block
     ) -> Mapping[str, Any]:
-        reply = self._generator.ask(
-            {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
-        )
-        if reply.answer is None:
+        for _ in range(2):  # it may have died of something else
+            reply = self._generator.ask(
+                {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
+            )
+            if reply.answer is not None:
+                break
+        else:
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:

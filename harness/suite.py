@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -21,10 +21,16 @@ DEFAULTS: Mapping[str, Any] = {
     "repeats": 3,
     "time_limit": 60,
     "memory_limit": 4096,
+    "precision": None,
+    "max_repeats": 30,
+    "budget": 600,
+    "accuracy": None,
+    "null_arm": None,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _SOLVER_KEYS = ("name", "label", "options")
-_PROBLEM_KEYS = ("family", "forms", "params", "zip")
+_PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
+NULL = " (A/A)"  #: after the label of a solver that is measured once more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +43,24 @@ class Suite:
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
     solvers: tuple[SolverSpec, ...]  #: of distinct labels
-    cases: tuple[CaseName, ...]  #: all distinct
+    cases: tuple[CaseName, ...]  #: all distinct; those that are solved cold
     text: str  #: the TOML as read, but with the limits that hold
+    sequences: tuple[tuple[CaseName, ...], ...] = ()  #: each: its steps in order
+    precision: float | None = None
+    """Go on beyond `repeats` until every ratio to the fastest is known so well."""
+    max_repeats: int = 30  #: where there is a precision to reach
+    budget: float = 600.0  #: s of measured time per case and tolerance, likewise
+    accuracy: float | None = None  #: judge answers at this, whatever was asked for
+
+    @property
+    def groups(self) -> tuple[tuple[CaseName, ...], ...]:
+        """What one block is made of: a single case, or the steps of a sequence."""
+        return (*((case,) for case in self.cases), *self.sequences)
+
+    @property
+    def names(self) -> tuple[CaseName, ...]:
+        """Every case, cold or in a sequence."""
+        return tuple(case for group in self.groups for case in group)
 
 
 def load_suite(
@@ -70,8 +92,13 @@ def load_suite(
             repeats=checked.at_least_one("repeats", table["repeats"]),
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
-            solvers=_solvers(table["solvers"], solvers),
+            solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
             cases=_cases(table["problems"], families),
+            sequences=_sequences(table["problems"], families),
+            precision=_between("precision", table["precision"]),
+            max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
+            budget=checked.positive("budget", table["budget"]),
+            accuracy=_between("accuracy", table["accuracy"]),
             text=text,
         )
 
@@ -117,7 +144,7 @@ def with_overrides(
     if solvers:
         changes["solvers"] = _chosen_solvers(suite, solvers, registry)
     if cases:
-        changes["cases"] = _chosen_cases(suite, cases, families)
+        changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:
         changes["repeats"] = checked.at_least_one("--repeats", repeats)
     text = suite.text
@@ -150,13 +177,16 @@ def _chosen_solvers(
             chosen[name] = SolverSpec(name=name, label=name)
             with checked.located("--solver"):
                 resolve(chosen[name], {**known, **registry})
-    return tuple(chosen[name] for name in dict.fromkeys(names))
+    kept = dict.fromkeys(names)
+    null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
+    return tuple(chosen[name] for name in (*kept, *null))
 
 
 def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
-) -> tuple[CaseName, ...]:
-    named = {canonical(case, families[case.family]): case for case in suite.cases}
+) -> dict[str, Any]:
+    """Keep what matches; of a sequence all or nothing."""
+    named = {canonical(case, families[case.family]): case for case in suite.names}
     kept: set[str] = set()
     for pattern in patterns:
         matched = match(_canonical_pattern(pattern, families), named)
@@ -166,7 +196,14 @@ def _chosen_cases(
                 f"{suite.name!r}; there are {some(named)}"
             )
         kept.update(matched)
-    return tuple(case for name, case in named.items() if name in kept)
+
+    def wanted(case: CaseName) -> bool:
+        return canonical(case, families[case.family]) in kept
+
+    return {
+        "cases": tuple(filter(wanted, suite.cases)),
+        "sequences": tuple(s for s in suite.sequences if any(map(wanted, s))),
+    }
 
 
 def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
@@ -229,8 +266,40 @@ def _spec(entry: object) -> SolverSpec:
 
 
 def _cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ...]:
-    """All cases in the order written; one that two blocks share is kept once."""
+    """All cold cases in the order written; one that two blocks share is kept once."""
     found: dict[str, CaseName] = {}
+    for block in _blocks(blocks, families):
+        if block.along is None:
+            for case in block.cases:
+                found.setdefault(canonical(case, block.family), case)
+    return tuple(found.values())
+
+
+def _sequences(
+    blocks: object, families: Mapping[str, Family]
+) -> tuple[tuple[CaseName, ...], ...]:
+    """Group the cases that differ in the key of their sequence only, in its order."""
+    found: dict[str, tuple[CaseName, ...]] = {}
+    for block in _blocks(blocks, families):
+        if block.along is None:
+            continue
+        steps: dict[str, list[CaseName]] = {}
+        for case in block.cases:
+            rest = {k: v for k, v in case.params.items() if k != block.along}
+            steps.setdefault(f"{case.form} {rest}", []).append(case)
+        found |= {repr(cases): tuple(cases) for cases in steps.values()}
+    return tuple(found.values())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Block:
+    family: Family
+    cases: list[CaseName]
+    along: str | None  #: the key of a sequence
+
+
+def _blocks(blocks: object, families: Mapping[str, Family]) -> Iterator[_Block]:
+    """Read the tables under problems, one by one."""
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
             table = checked.table("entry", block)
@@ -241,12 +310,50 @@ def _cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ..
             if name not in families:
                 raise unknown("family", name, families)
             family = families[name]
+            params = table.get("params", {})
+            along = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
-            for params in _grid(table.get("params", {}), table.get("zip", [])):
-                for form in forms:
-                    case = assemble(family, params, checked.text("forms", form))
-                    found.setdefault(canonical(case, family), case)
-    return tuple(found.values())
+            cases = [
+                assemble(family, point, checked.text("forms", form))
+                for point in _grid(params, table.get("zip", []))
+                for form in forms
+            ]
+            yield _Block(family=family, cases=cases, along=along)
+
+
+def _along(key: object, params: object) -> str | None:
+    """Check the key that a sequence runs along."""
+    if key is None:
+        return None
+    params = checked.table("params", params)
+    values = params.get(checked.text("sequence", key))
+    if not isinstance(values, list) or len(values) < 2:
+        lists = [k for k, v in params.items() if isinstance(v, list)]
+        hint = f"; there are {some(lists)}" if lists else ""
+        raise InputError(
+            f"sequence = {key!r} is no list in params; expected the key whose values "
+            f"are the steps{hint}"
+        )
+    return str(key)
+
+
+def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
+    """Add the solver of that label once more, as a null arm."""
+    if label is None:
+        return specs
+    known = {spec.label: spec for spec in specs}
+    if label not in known:
+        raise unknown("null_arm", str(label), known)
+    return (*specs, replace(known[label], label=f"{label}{NULL}", arm="null"))
+
+
+def _between(key: str, value: Any) -> float | None:
+    """Take nothing, or a number between 0 and 1."""
+    if value is None:
+        return None
+    if not checked.is_number(value) or not 0 < value < 1:
+        raise InputError(f"{key} = {value!r}; expected a number between 0 and 1")
+    return float(value)
 
 
 def _grid(params: object, groups: object) -> list[dict[str, object]]:
