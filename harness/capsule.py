@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from harness.block import Block
 from harness.errors import InputError
 from harness.folder import environment_of, suite_text
 from harness.journal import read_journal
-from harness.judge import plain
-from harness.names import CaseName, assemble
+from harness.judge import blank, plain
+from harness.names import CaseName, assemble, canonical
 from harness.plugin import Family, Solver
 from harness.record import Record
 from harness.registry import SolverSpec, options_of, resolve
-from harness.suite import asked_solvers, limits
+from harness.suite import asked_solvers, limits, steps_up_to
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,7 +26,7 @@ class Capsule:
 
     record: Record
     repeats: list[Record]  #: of the same cell: other repeats, and itself
-    name: CaseName
+    cases: tuple[CaseName, ...]  #: its own is the last; of a sequence those before
     spec: SolverSpec
     environment: Mapping[str, Any]
     time_limit: float  #: s
@@ -51,26 +52,65 @@ def open_capsule(
     """
     records = read_journal(folder)
     record = _found(folder, run_id, records)
-    environment = environment_of(folder, record.environment)
-    spec = asked_solvers(suite_text(folder)).get(
+    environment, text = environment_of(folder, record.environment), suite_text(folder)
+    spec = asked_solvers(text).get(
         record.solver, SolverSpec(name=record.solver, label=record.solver)
     )
     try:
         name = assemble(_family(record, families), record.params, record.form)
+        in_sequence = record.mode == "sequence"
+        cases = steps_up_to(text, name, families) if in_sequence else (name,)
         spec = _with_options(record, spec, solvers)
     except InputError as e:
         raise InputError(f"{record.run_id}: {e}{_needs(environment)}") from None
-    cell = (record.case, record.solver, record.options, record.tol)
-    time_limit, memory_limit = limits(suite_text(folder))
+    time_limit, memory_limit = limits(text)
     return Capsule(
         record=record,
-        repeats=[r for r in records if (r.case, r.solver, r.options, r.tol) == cell],
-        name=name,
+        repeats=[r for r in records if _cell(r) == _cell(record)],
+        cases=cases,
         spec=spec,
         environment=environment,
         time_limit=time_limit,
         memory_limit=memory_limit,
     )
+
+
+def block_of(
+    capsule: Capsule,
+    families: Mapping[str, Family],
+    solvers: Mapping[str, Solver],
+    environment: str,
+) -> Block:
+    """Make the block that measures a capsule again; its last result is that.
+
+    environment : digest
+    """
+    record = capsule.record
+    turn = tuple(
+        blank(
+            name,
+            canonical(name, families[name.family]),
+            capsule.spec,
+            options=options_of(resolve(capsule.spec, solvers)),
+            tol=record.tol,
+            repeat=record.repeat,
+            environment=environment,
+            mode=record.mode,
+            accuracy=record.accuracy,
+        )
+        for name in capsule.cases
+    )
+    return Block(
+        number=0,
+        cases=capsule.cases,
+        turns=(turn,),
+        time_limit=capsule.time_limit,
+        memory_limit=capsule.memory_limit,
+    )
+
+
+def _cell(r: Record) -> tuple[Any, ...]:
+    return r.mode, r.case, r.solver, r.options, r.tol, r.accuracy
 
 
 def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
@@ -101,12 +141,12 @@ def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
     """Ask for those stored options that are not today's defaults."""
-    asked = SolverSpec(name=spec.name, label=spec.label)
+    asked = replace(spec, options={})
     if spec.name not in solvers and f"{spec.name.partition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")
     today = plain(options_of(resolve(asked, solvers)))
     options = {k: v for k, v in record.options.items() if today.get(k, ...) != v}
-    changed = SolverSpec(name=spec.name, label=spec.label, options=options)
+    changed = replace(spec, options=options)
     resolve(changed, solvers)
     return changed
 

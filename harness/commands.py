@@ -9,14 +9,15 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from rich.console import Console
 
 from harness import show
-from harness.block import Opens
+from harness.block import Opens, Unbuilt
 from harness.build import build, unbuilt
-from harness.capsule import open_capsule
+from harness.capsule import block_of, open_capsule
 from harness.cluster import on_cluster
 from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
@@ -30,14 +31,13 @@ from harness.matfile import save_mat
 from harness.names import CaseName, canonical, completed, parse
 from harness.noise import noise_floor
 from harness.plugin import Case, Fields
-from harness.progress import shown_on
+from harness.progress import Progress, shown_on
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec, options_of, resolve
 from harness.remote import measured_once
 from harness.replay import compared
 from harness.replay import render as show_comparison
-from harness.run import Progress
 from harness.run import run as run_suite
 from harness.station import one_by_one
 from harness.suite import load_suite, with_overrides
@@ -270,27 +270,18 @@ def replay(workbench: Workbench, options: Namespace) -> int:
     capsule = open_capsule(
         options.folder, options.run_id, workbench.families, workbench.solvers
     )
-    environment, then = capture(options.plugin), capsule.record
-    solver = resolve(capsule.spec, workbench.solvers)
-    case = _built(workbench, capsule.name)
-    record = blank(
-        capsule.name,
-        canonical(capsule.name, workbench.families[capsule.name.family]),
-        capsule.spec,
-        options=options_of(solver),
-        tol=then.tol,
-        repeat=then.repeat,
-        environment=digest(environment),
+    environment = capture(options.plugin)
+    block = block_of(
+        capsule, workbench.families, workbench.solvers, digest(environment)
     )
-    with redirect_stdout(sys.stderr):  # whatever the family prints
-        record, solution = measured_once(
-            workbench.worker_command(capsule.spec, options.plugin),
-            case,
-            record,
-            time_limit=capsule.time_limit,
-            memory_limit=capsule.memory_limit,
-        )
-    comparison = compared(options.folder, capsule, record, solution, environment)
+    commands = workbench.commands([capsule.spec], options.plugin)
+    with TemporaryDirectory(prefix="mortarbench-") as scratch:
+        folder = Path(scratch)
+        with one_by_one(commands, folder, folder / "cases") as carry_out:
+            *_, result = carry_out(iter([block]))
+    if isinstance(result, Unbuilt):
+        raise InputError(f"{capsule.record.run_id}: {result.reason}")
+    comparison = compared(options.folder, capsule, result, environment)
     if options.json:
         print(json.dumps(comparison.to_dict()))
     else:

@@ -91,14 +91,9 @@ def _within(limit: float, record: Record) -> Record:
 
 
 def measured_once(
-    command: list[str],
-    case: Case,
-    record: Record,
-    *,
-    time_limit: float = inf,
-    memory_limit: float = inf,
+    command: list[str], case: Case, record: Record
 ) -> tuple[Record, Solution | None]:
-    """Do as `measured`, with a worker for this one measurement.
+    """Do as `measured`, with a worker for this one measurement and without limits.
 
     command : starts the worker; two file descriptors are appended to it
     """
@@ -113,8 +108,8 @@ def measured_once(
             case.qp,
             record.but(qp=digest),
             {"qp": str(qp_file), "out": str(scratch / "point.npz")},
-            time_limit=time_limit,
-            memory_limit=memory_limit,
+            time_limit=inf,
+            memory_limit=inf,
         )
     if solution is None or record.status is Verdict.DECLINED:
         return record, solution

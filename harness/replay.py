@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from harness.block import Result
 from harness.capsule import Capsule
 from harness.errors import InputError
 from harness.folder import differences
-from harness.judge import has_point
 from harness.record import Record, finite
 from harness.show import aligned
-from harness.solution import Solution, Status
-from harness.store import load_solution
+from harness.solution import Status
+from harness.store import Arrays, load_solution
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
@@ -57,19 +57,18 @@ class Comparison:
 def compared(
     folder: Path,
     capsule: Capsule,
-    now: Record,
-    solution: Solution | None,
+    result: Result,
     environment: Mapping[str, Any],
 ) -> Comparison:
-    """Compare the new measurement `now` and its point with what `folder` holds."""
-    then = capsule.record
+    """Compare a new measurement and its point with what `folder` holds."""
+    then, now = capsule.record, result.record
     return Comparison(
         then=then,
         now=now,
         same_qp=None if then.qp is None else then.qp == now.qp,
         same_options=then.options == now.options,
         same_counts=(then.iterations, then.counts) == (now.iterations, now.counts),
-        distance=_distance(folder, then, solution),
+        distance=_distance(folder, then, result.point),
         ratios={name: _ratio(name, capsule.repeats, now) for name in _SECONDS},
         environment=list(differences(_keyed(capsule.environment), _keyed(environment))),
     )
@@ -146,17 +145,17 @@ def _times(c: Comparison) -> Iterable[list[str]]:
         ]  # fmt: skip
 
 
-def _distance(folder: Path, then: Record, solution: Solution | None) -> float | None:
-    if then.vectors is None or solution is None or not has_point(solution):
+def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
+    if then.vectors is None or point is None:
         return None
     try:
         stored = load_solution(folder, then.vectors, Status.SOLVED).x
     except InputError:  # the vectors may have been thrown away: records suffice
         return None
-    if stored.shape != solution.x.shape:
+    if stored.shape != point["x"].shape:
         return None
     scale = np.abs(stored).max(initial=0.0) or 1.0
-    return float(np.abs(solution.x - stored).max(initial=0.0) / scale)
+    return float(np.abs(point["x"] - stored).max(initial=0.0) / scale)
 
 
 def _ratio(

@@ -105,8 +105,26 @@ def load_suite(
 
 def asked_solvers(text: str) -> dict[str, SolverSpec]:
     """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
-    entries = checked.filled_list("solvers", _toml(text).get("solvers"))
-    return {spec.label: spec for spec in map(_spec, entries)}
+    table = _toml(text)
+    specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
+    return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
+
+
+def steps_up_to(
+    text: str, name: CaseName, families: Mapping[str, Family]
+) -> tuple[CaseName, ...]:
+    """Read from a suite's TOML the steps of a sequence that lead to one of them.
+
+    Raises
+    ------
+    InputError
+        When no sequence has it.
+
+    """
+    for steps in _sequences(_toml(text).get("problems"), families):
+        if name in steps:
+            return steps[: steps.index(name) + 1]
+    raise InputError("the suite has no sequence with that case")
 
 
 def limits(text: str) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """A stored measurement, made again: what must be the same, what must be told."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -35,7 +36,7 @@ def no_report(folder, formats):
     return []
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def workbench():
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
     return Workbench(
@@ -45,6 +46,16 @@ def workbench():
         start=(sys.executable, "-P", str(WELLS)),
         **nothing,
     )
+
+
+@pytest.fixture(scope="module")
+def finished(workbench, tmp_path_factory):
+    """The folder of a run, which no test may write to."""
+    folder = tmp_path_factory.mktemp("finished")
+    suite = folder / "wells.toml"
+    suite.write_text(SUITE)
+    assert main(workbench, ["run", str(suite), "--out", str(folder / "done")]) == 0
+    return folder / "done"
 
 
 @pytest.fixture
@@ -60,10 +71,9 @@ def cli(workbench, capsys, monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def stored(cli, tmp_path):
-    """The records of a run, by solver and depth, in the folder `done`."""
-    (tmp_path / "wells.toml").write_text(SUITE)
-    assert cli("run", "wells.toml", "--out", "done")[0] == 0
+def stored(finished, tmp_path):
+    """The records of a run, by solver, depth and repeat, in the folder `done`."""
+    shutil.copytree(finished, tmp_path / "done")
     records = read_journal(tmp_path / "done")
     return {(r.solver, r.params["depth"], r.repeat): r for r in records}
 
@@ -104,28 +114,64 @@ def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):
     assert content() == before
 
 
-def test_another_verdict_is_told_and_counts_as_no(cli, stored, tmp_path):
+def rewrite(record, **changes):
+    """Append a record to the journal as if it had been measured so."""
+    (journal,) = Path("done/journal").glob("*.jsonl")
+    journal.write_text(journal.read_text() + record.but(**changes).to_json() + "\n")
+
+
+def test_another_verdict_is_told_and_counts_as_no(cli, stored):
     then = stored["exact", 1, 0]
-    (journal,) = (tmp_path / "done" / "journal").glob("*.jsonl")
-    lied = then.but(status="wrong")
-    journal.write_text(journal.read_text() + lied.to_json() + "\n")
+    rewrite(then, status="wrong")
     code, out, _ = cli("replay", "done", then.run_id)
 
     assert code == 1
     assert out.endswith("Not reproduced: wrong then, verified now.\n")
 
 
-def test_another_qp_is_told_and_counts_as_no(cli, stored, workbench):
-    class Deeper(type(PLUGIN.problems["well"])):
-        def build(self, form, params, reference):
-            return super().build(form, {**params, "depth": 3}, reference)
-
-    changed = replace(workbench, families={"well": Deeper()})
+def test_another_qp_is_told_and_counts_as_no(cli, stored):
     then = stored["exact", 1, 0]
-    code, out, _ = cli("replay", "done", then.run_id, workbench=changed)
+    rewrite(then, qp="0123456789abcdef")
+    code, out, _ = cli("replay", "done", then.run_id)
 
     assert code == 1
     assert "another QP" in out
+
+
+def test_a_journal_without_digests_of_qps_is_no_reason_to_complain(cli, stored):
+    then = stored["exact", 1, 0]
+    rewrite(then, qp=None)
+    code, out, _ = cli("replay", "done", then.run_id)
+
+    assert code == 0
+    assert "not recorded" in out
+
+
+SEQUENCE = """
+name = "steps"
+repeats = 1
+null_arm = "exact"
+solvers = ["exact", "liar"]
+[[problems]]
+family = "well"
+forms = ["primal"]
+params = { depth = [1, 2, 3] }
+sequence = "depth"
+"""
+
+
+@pytest.mark.parametrize("solver", ["exact (A/A)", "liar"])
+def test_a_step_of_a_sequence_is_made_again_after_those_before(cli, tmp_path, solver):
+    (tmp_path / "steps.toml").write_text(SEQUENCE)
+    assert cli("run", "steps.toml", "--out", "done")[0] == 0
+    records = [r for r in read_journal(tmp_path / "done") if r.solver == solver]
+    (then,) = [r for r in records if r.params["depth"] == 3]
+    told = json.loads(cli("replay", "done", then.run_id, "--json")[1])
+
+    assert told["reproduced"] is True
+    assert told["now"]["mode"] == "sequence"
+    assert told["now"]["run_id"] == then.run_id
+    assert told["now"]["params"]["depth"] == 3
 
 
 def test_what_differs_in_the_environment_is_named(cli, stored, tmp_path):
