@@ -226,6 +226,9 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
 
     assert {r.mode for r in first} == {"cold", "sequence"}
     assert len({r.run_id for r in first}) == 2
+    evidence = read_evidence(tmp_path)
+    assert evidence.solvers == ("honest", "honest (sequence)")
+    assert all(len(o.records) == 1 for o in evidence.flat)
 
 
 def test_a_sequence_that_breaks_says_where(measure, tmp_path):
