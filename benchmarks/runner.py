@@ -33,6 +33,7 @@ class Watch:
 
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
+        self.solving = []  # s: one timing more than `inner` where there were several
         self._fsync, self._waited = os.fsync, 0.0
         os.fsync = self._timed
 
@@ -51,7 +52,8 @@ class Watch:
         print(text, file=sys.stderr)
 
     def advance(self, record):
-        self.records.append(record)
+        self.records.append((record.solver, record.repeat, record.total_seconds))
+        self.solving.append(record.total_seconds * (record.inner + (record.inner > 1)))
         self.at.append(perf_counter())
         self.synced.append(self._waited)
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
@@ -60,11 +62,8 @@ class Watch:
         """Seconds between records that were neither the solver's nor the disk's."""
         found = []
         for i in range(1, len(self.at)):
-            r = self.records[i]
-            # one timing more than `inner` where there were several
-            solver = r.total_seconds * (r.inner + (r.inner > 1))
             gap = self.at[i] - self.at[i - 1]
-            found.append(gap - solver - (self.synced[i] - self.synced[i - 1]))
+            found.append(gap - self.solving[i] - (self.synced[i] - self.synced[i - 1]))
         return found
 
 
@@ -120,8 +119,8 @@ def null(trials=40, blocks=10):
         with tempfile.TemporaryDirectory() as out:
             watch = measure(Path(out), "products", repeats=blocks)
         times = {}
-        for r in watch.records:
-            times.setdefault(r.solver, {})[r.repeat] = r.total_seconds
+        for solver, repeat, seconds in watch.records:
+            times.setdefault(solver, {})[repeat] = seconds
         ratio = paired_ratio(*times.values())
         hits += ratio.low <= 1 <= ratio.high
         widths.append(ratio.half_width)

@@ -1,7 +1,8 @@
 """Which measurements of a suite are left, in which order, and when there are enough.
 
 Blocks are complete and randomised: each is every solver once on one case (or one
-sequence) at one tolerance. With a precision to reach, blocks go on beyond the repeats
+sequence) at one tolerance, in random order, and every second one in the reverse order
+of the one before. With a precision to reach, blocks go on beyond the repeats
 of the suite until the ratio of every verified solver to the fastest is known so well,
 by the paired interval of `harness.pairs`, or a limit is met. The rule is in the suite,
 before anything is measured, and uses the journal alone: a resumed run stops where an
@@ -25,6 +26,7 @@ from harness.record import Record, Verdict
 from harness.suite import Suite
 
 Group = tuple[CaseName, ...]
+Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 
 @dataclass(eq=False, kw_only=True)
@@ -37,7 +39,8 @@ class Schedule:
     environment: str  #: digest
     progress: Progress
     unbuilt: list[CaseName] = field(default_factory=list)
-    _seen: dict[tuple[str, str, float], list[Record]] = field(default_factory=dict)
+    _seen: dict[Cell, list[Record]] = field(default_factory=dict)  # for `_enough`
+    _declined: set[tuple[str, Cell]] = field(default_factory=set)
     _done: set[str] = field(default_factory=set)  #: run ids
     _next: int = 0  #: number of a new block
 
@@ -51,15 +54,15 @@ class Schedule:
         """Know of a measurement that is in the journal."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
-        key = (record.mode, record.case, record.tol)
-        self._seen.setdefault(key, []).append(record)
+        if record.status is Verdict.DECLINED:
+            self._declined.add((record.solver, _cell(record)))
+        if self.suite.precision is not None:
+            self._seen.setdefault(_cell(record), []).append(record)
 
     def knows(self, record: Record) -> bool:
         """Whether nothing is left to be learnt from measuring that."""
-        return record.run_id in self._done or any(
-            r.solver == record.solver and r.status is Verdict.DECLINED
-            for r in self._seen.get((record.mode, record.case, record.tol), ())
-        )
+        declined = (record.solver, _cell(record)) in self._declined
+        return declined or record.run_id in self._done
 
     def give_up(self, block: Block) -> bool:
         """Leave out the cases of a block that cannot be built; False if known."""
@@ -130,8 +133,10 @@ class Schedule:
                 left.append(turn)
         if not left:
             return None
-        seed = f"{self.suite.name} {left[0][0].case} {tol} {repeat}"
+        seed = f"{self.suite.name} {self._canonical(group[0])} {tol} {repeat // 2}"
         random.Random(seed).shuffle(left)
+        if repeat % 2:  # who was first is last: no place in a block favours anybody
+            left.reverse()
         self._next += 1
         return Block(
             number=left[0][0].block,
@@ -154,3 +159,7 @@ class Schedule:
 
 def _mode(group: Group) -> str:
     return "sequence" if len(group) > 1 else "cold"
+
+
+def _cell(record: Record) -> Cell:
+    return record.mode, record.case, record.tol
