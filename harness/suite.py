@@ -120,7 +120,7 @@ def steps_up_to(
         When no sequence has it.
 
     """
-    for steps in _sequences(_toml(text).get("problems"), families):
+    for steps in sequences(_toml(text).get("problems"), families):
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")
