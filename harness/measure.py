@@ -69,7 +69,7 @@ def measure(
             answer, seconds, peaks = _timed(begin, qp)
             inner = _inner(sum(seconds), sample_seconds)
             if inner > 1:
-                again = [_timed(begin, qp)[1] for _ in range(inner)]
+                again = [_timed(begin, qp, peaks=False)[1] for _ in range(inner)]
                 seconds = tuple(
                     sum(phase) / inner for phase in zip(*again, strict=True)
                 )
@@ -91,17 +91,17 @@ def measure(
 
 
 def _timed(
-    prepare: Prepare, qp: QP
+    prepare: Prepare, qp: QP, *, peaks: bool = True
 ) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
     """Prepare and solve once: the answer, and both phases' seconds and peaks in MiB."""
-    reset = _reset_peak()
+    reset = peaks and _reset_peak()
     start = perf_counter()
     if isinstance(qp.P, Recipe):
         qp.P.build()
     solve = prepare(qp)
     ready = perf_counter()
     prepare_peak = memory_mib("VmHWM") if reset else None
-    reset = _reset_peak()
+    reset = peaks and _reset_peak()
     again = perf_counter()
     answer = solve()
     end = perf_counter()
