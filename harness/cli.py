@@ -57,8 +57,10 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
 
 def _run(workbench: Workbench, argv: Sequence[str]) -> int:
     workbench = workbench.extended(entry_point_plugins())
-    if argv[:1] == ["worker"]:  # how runs start their workers; not for users
+    if argv[:1] == ["worker"]:  # how runs start their processes; not for users
         return commands.worker(workbench, argv[1:])
+    if argv[:1] == ["generator"]:
+        return commands.generator(workbench, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
@@ -136,6 +138,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.set_defaults(run=commands.report, parser=command)
 
+    command = add("replay", help="one measurement again", allow_abbrev=False)
+    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument(
+        "run_id", metavar="RUN_ID", help="of a journal line, or its first digits"
+    )
+    _add_plugin(command)
+    _add_json(command)
+    command.set_defaults(run=commands.replay, parser=command)
+
     command = add("paper", help="every figure of the paper", allow_abbrev=False)
     command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))
     command.add_argument(
@@ -144,6 +155,7 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=commands.paper, parser=command)
 
     command = add("doctor", help="is this machine fit to measure", allow_abbrev=False)
+    _add_json(command)
     command.set_defaults(run=commands.doctor, parser=command)
     return parser
 
@@ -165,6 +177,11 @@ def _add_run_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--memory-limit", metavar="MIB", type=float)
     command.add_argument(
         "--fresh", action="store_true", help="forget what the folder holds"
+    )
+    command.add_argument(
+        "--dask",
+        metavar="ADDRESS|local",
+        help="measure on the workers of a Dask scheduler, see docs/cluster.md",
     )
 
 

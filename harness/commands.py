@@ -5,29 +5,42 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from rich.console import Console
+
 from harness import show
+from harness.block import Opens, Unbuilt
 from harness.build import build, unbuilt
-from harness.doctor import QUIET_LOAD, advice, noise_floor, render
+from harness.capsule import block_of, open_capsule
+from harness.cluster import on_cluster
+from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
+from harness.folder import keep_environment
+from harness.generator import Generator
+from harness.generator import serve as serve_cases
 from harness.history import History
 from harness.journal import read_journal
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
 from harness.names import CaseName, canonical, completed, parse
+from harness.noise import noise_floor
 from harness.plugin import Case, Fields
-from harness.progress import shown_on
+from harness.progress import Progress, shown_on
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict, finite
 from harness.registry import SolverSpec, options_of, resolve
 from harness.remote import measured_once
+from harness.replay import compared
+from harness.replay import render as show_comparison
 from harness.run import run as run_suite
+from harness.station import one_by_one
 from harness.suite import load_suite, with_overrides
 from harness.workbench import FORMATS, Workbench
 from harness.worker import serve
@@ -86,20 +99,20 @@ def run(workbench: Workbench, options: Namespace) -> int:
     )
     out = options.out or Path("out") / suite.name
     environment = capture(options.plugin)
-    if (load := environment["now"]["load"]) > QUIET_LOAD:
+    if load_advice(load := environment["now"]["load"]):
         _say(f"other programs keep {load:.1f} cores busy; times will be less certain")
     with shown_on(sys.stderr) as progress:
         unbuilt_cases = run_suite(
             suite,
             families=workbench.families,
-            reference=workbench.reference,
             out=out,
-            command=lambda spec: workbench.worker_command(spec, options.plugin),
+            commands=workbench.commands(suite.solvers, options.plugin),
             resolve=lambda spec: resolve(spec, workbench.solvers),
             environment=environment,
             digest=digest(environment),
             progress=progress,
             fresh=options.fresh,
+            engine=_engine(options, out, environment, progress),
         )
     records = read_journal(out)
     print(show.summary(records, [s.label for s in suite.solvers]))
@@ -110,6 +123,20 @@ def run(workbench: Workbench, options: Namespace) -> int:
     for page in (file for file in written if file.suffix == ".html"):
         print(page)
     return 1 if unbuilt_cases else 0
+
+
+def _engine(
+    options: Namespace, out: Path, environment: Mapping[str, Any], progress: Progress
+) -> Opens:
+    if options.dask is None:
+        return one_by_one
+    return on_cluster(
+        options.dask,
+        plugins=options.plugin,
+        environment=environment,
+        keep=lambda name, there: keep_environment(out, name, there),
+        warn=progress.warn,
+    )
 
 
 def solve(workbench: Workbench, options: Namespace) -> int:
@@ -229,11 +256,41 @@ def paper(workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
-def doctor(_workbench: Workbench, _options: Namespace) -> int:
+def doctor(_workbench: Workbench, options: Namespace) -> int:
     """Describe this machine and say what to change before measuring."""
-    environment = capture()
-    print(render(environment, advice(environment), noise_floor()))
+    environment, noise = capture(), noise_floor()
+    checks = examine(environment, noise)
+    if options.json:
+        print(json.dumps(as_json(environment, noise, checks)))
+    else:
+        text = render(checks, digest(environment))
+        Console(highlight=False, soft_wrap=True).print(text)
     return 0
+
+
+def replay(workbench: Workbench, options: Namespace) -> int:
+    """Make one stored measurement again and compare; 0 if it is reproduced."""
+    workbench = workbench.with_files(options.plugin)
+    capsule = open_capsule(
+        options.folder, options.run_id, workbench.families, workbench.solvers
+    )
+    environment = capture(options.plugin)
+    block = block_of(
+        capsule, workbench.families, workbench.solvers, digest(environment)
+    )
+    commands = workbench.commands([capsule.spec], options.plugin)
+    with TemporaryDirectory(prefix="mortarbench-") as scratch:
+        folder = Path(scratch)
+        with one_by_one(commands, folder, folder / "cases") as carry_out:
+            *_, result = carry_out(iter([block]))
+    if isinstance(result, Unbuilt):
+        raise InputError(f"{capsule.record.run_id}: {result.reason}")
+    comparison = compared(options.folder, capsule, result, environment)
+    if options.json:
+        print(json.dumps(comparison.to_dict()))
+    else:
+        print(show_comparison(comparison))
+    return 0 if comparison.reproduced else 1
 
 
 def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
@@ -245,6 +302,19 @@ def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
         name=request["name"], label=request["name"], options=request["options"]
     )
     serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
+    return 0
+
+
+def generator(workbench: Workbench, arguments: Sequence[str]) -> int:
+    """Be the generator that `Workbench.commands` starts."""
+    text, request_fd, reply_fd = arguments
+    files = [Path(file) for file in json.loads(text)["plugins"]]
+    workbench = workbench.with_files(files)
+    serve_cases(
+        Generator(workbench.families, workbench.reference),
+        int(request_fd),
+        int(reply_fd),
+    )
     return 0
 
 

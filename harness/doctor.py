@@ -1,222 +1,266 @@
-"""Is this machine fit for measuring? Advice, and a noise floor that was measured."""
+"""Is this machine fit for measuring? What was looked at, and what to change."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
 from typing import Any
 
-import numpy as np
+from rich.text import Text
 
 from harness.environment import digest
-from harness.qp import Vector
+from harness.noise import NoiseFloor
 
 ENOUGH_MEMORY_MIB = 2048
 QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells
+FINE_CLOCK_SECONDS = 1e-6
+STEADY = 0.10  #: one pair of equal measurements differs by less, 19 times out of 20
+EQUAL = 0.01  #: an A/A ratio nearer to 1 than this is as good as 1
 ONE_THREAD = (
     "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
     "RAYON_NUM_THREADS=1"
 )
 
 
+class Level(StrEnum):
+    """What a check came to."""
+
+    OK = "ok"
+    WARN = "warn"
+    UNKNOWN = "unknown"  #: the machine does not tell
+
+
+_STYLES = {Level.OK: "green", Level.WARN: "bold yellow", Level.UNKNOWN: "dim"}
+
+
 @dataclass(frozen=True, kw_only=True)
-class NoiseFloor:
-    """How well this machine tells two equal things apart, when one times them."""
+class Check:
+    """One thing that was looked at."""
 
-    clock_seconds: float  #: smallest step of the clock that was seen
-    kernel_seconds: float  #: median time of the kernel
-    pairs: int
-    ratio: float  #: median of arm A over median of arm B: 1 but for noise
-    half_width: float  #: of the ratio's 95 % bootstrap interval
+    section: str
+    name: str
+    value: str
+    level: Level = Level.OK
+    advice: str = ""  #: what to change, where the level is WARN
 
 
-def advice(environment: Mapping[str, Any]) -> list[str]:
-    """Say what to change before measuring, one sentence each; empty when all is well.
+def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
+    """Look at everything that times depend on.
 
     environment : as `harness.environment.capture` returns it
     """
-    candidates = (
-        _about_cholmod(environment),
-        _about_threads(environment["threads"]["pools"]),
-        _about_processor(environment["machine"]),
-        _about_load(environment["now"]["load"]),
-        _about_memory(environment["now"]["available_memory_mib"]),
-    )
-    return [sentence for found in candidates for sentence in found]
-
-
-def noise_floor(
-    seconds: float = 1.0, clock: Callable[[], float] = time.perf_counter
-) -> NoiseFloor:
-    """Time one kernel against itself: what differs by less than this is noise.
-
-    The arms are interleaved as ABBA…, so that a drift of the machine hits both alike.
-    The interval resamples blocks of consecutive pairs, not single ones, because
-    disturbances last longer than one pair.
-
-    seconds : how long to go on, by `clock`
-    clock : returns seconds
-    """
-    a, b = _paired_times(seconds, clock)
-    blocks = min(20, a.size)
-    rng = np.random.default_rng(20260)
-    split = [np.array_split(arm, blocks) for arm in (a, b)]
-    ratios = [
-        np.divide(
-            *(np.median(np.concatenate([arm[i] for i in drawn])) for arm in split)
-        )
-        for drawn in rng.integers(blocks, size=(400, blocks))
-    ]
-    low, high = np.quantile(ratios, (0.025, 0.975))
-    return NoiseFloor(
-        clock_seconds=_clock_step(clock),
-        kernel_seconds=float(np.median(np.concatenate((a, b)))),
-        pairs=a.size,
-        ratio=float(np.median(a) / np.median(b)),
-        half_width=float((high - low) / 2),
-    )
-
-
-def render(
-    environment: Mapping[str, Any],
-    sentences: Iterable[str],
-    noise: NoiseFloor | None = None,
-) -> str:
-    """Lay out what `mortarbench doctor` prints: aligned lines, then the advice."""
-    rows = [("environment", digest(environment)), *_rows(environment)]
-    if noise is not None:
-        rows += _noise_rows(noise)
-    width = max(len(key) for key, _ in rows)
-    lines = [f"{key:<{width}}  {value}" for key, value in rows]
-    todo = [f"- {sentence}" for sentence in sentences]
-    return "\n".join([*lines, "", *(todo or ["Nothing to change."])])
-
-
-def _about_cholmod(environment: Mapping[str, Any]) -> list[str]:
-    blas, machine = environment["cholmod"]["blas"], environment["machine"]
-    if environment["versions"]["scikit-sparse"] is None:
-        return ["scikit-sparse is not installed, so nothing is factorised: make setup"]
-    if blas != "reference BLAS":
-        return []
-    link = f"libblas.so.3-{machine['architecture']}-linux-gnu"
+    machine, now = environment["machine"], environment["now"]
     return [
-        "CHOLMOD uses the reference BLAS, which is several times slower: "
-        "sudo apt-get install libopenblas0-pthread "
-        f"(if it is there already: sudo update-alternatives --auto {link})"
+        _processor(machine),
+        _cpu_limit(machine["cpu_limit"]),
+        _governor(machine),
+        _turbo(machine),
+        _siblings(machine["smt"]),
+        _load(now["load"]),
+        _memory(machine["memory_mib"], now["available_memory_mib"]),
+        *_blas(environment),
+        *_threads(environment["threads"]),
+        *_clock(noise),
+        *_versions(environment),
     ]
 
 
-def _about_threads(pools: Iterable[Mapping[str, Any]]) -> list[str]:
-    many = [p for p in pools if p["threads"] > 1]
-    names = ", ".join(f"{p['library']} of {p['owner']}: {p['threads']}" for p in many)
-    if not many:
-        return []
-    return [f"More than one thread ({names}) blurs times: {ONE_THREAD}"]
+def as_json(
+    environment: Mapping[str, Any], noise: NoiseFloor, checks: Sequence[Check]
+) -> dict[str, Any]:
+    """Collect all that `examine` saw and said, as plain data."""
+    return {
+        "digest": digest(environment),
+        "fit": all(check.level is not Level.WARN for check in checks),
+        "checks": [asdict(check) for check in checks],
+        "noise": asdict(noise),
+        "environment": environment,
+    }
 
 
-def _about_processor(machine: Mapping[str, Any]) -> list[str]:
-    found = []
-    if machine["governor"] not in (None, "performance"):
-        found.append(
-            f"The frequency governor is {machine['governor']!r}: "
-            "sudo cpupower frequency-set -g performance"
-        )
-    if machine["cpu_limit"] is not None and machine["cpu_limit"] < 2:
-        found.append(
-            f"The container is throttled to {machine['cpu_limit']:g} cores: "
-            "give it 2 or more (docker run --cpus=2)"
-        )
-    return found
-
-
-def _about_load(load: float) -> list[str]:
+def load_advice(load: float) -> str:
+    """Say what to do about other programs; empty where they keep quiet."""
     if load <= QUIET_LOAD:
-        return []
-    return [
-        f"Other programs keep {load:.1f} cores busy: stop them (top lists them) "
-        f"and wait until the load is below {QUIET_LOAD}"
-    ]
-
-
-def _about_memory(available: int | None) -> list[str]:
-    if available is None or available >= ENOUGH_MEMORY_MIB:
-        return []
-    return [
-        f"Only {available} MiB of memory are free: make room for {ENOUGH_MEMORY_MIB}, "
-        "or lower memory_limit in the suite"
-    ]
-
-
-def _rows(environment: Mapping[str, Any]) -> list[tuple[str, str]]:
-    machine, versions = environment["machine"], environment["versions"]
-    source, cholmod = environment["source"], environment["cholmod"]
-    dirty = " with changes" if source and source["dirty"] else ""
-    cores = (
-        f"{machine['physical_cores'] or '?'} physical, {machine['usable_cores']} usable"
+        return ""
+    return (
+        "Stop other programs (top lists them) and wait until the load is below "
+        f"{QUIET_LOAD}"
     )
-    memory = (
-        f"{machine['memory_mib']} MiB, {environment['now']['available_memory_mib']}"
+
+
+def _check(section: str, name: str, value: object, advice: str = "") -> Check:
+    """Make a check that warns where there is advice; a value None is unknown."""
+    level = Level.WARN if advice else Level.UNKNOWN if value is None else Level.OK
+    shown = "the system does not tell" if value is None else str(value)
+    return Check(section=section, name=name, value=shown, level=level, advice=advice)
+
+
+def _processor(machine: Mapping[str, Any]) -> Check:
+    cores, usable = machine["physical_cores"] or "?", machine["usable_cores"]
+    virtual = ", a virtual machine" if machine["virtual"] else ""
+    value = (
+        f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
+        f"{usable} usable{virtual})"
     )
-    return [
-        ("processor", f"{machine['cpu'] or machine['architecture']} ({cores} cores)"),
-        ("cpu limit", _or_unknown(machine["cpu_limit"], "none")),
-        ("governor", _or_unknown(machine["governor"])),
-        ("turbo", _or_unknown(machine["turbo"])),
-        ("memory", f"{memory} free"),
-        ("load", f"{environment['now']['load']:.2f}"),
-        ("system", f"{machine['system']} {machine['kernel']}"),
-        *((name, _or_unknown(number, "missing")) for name, number in versions.items()),
-        ("commit", source["commit"][:12] + dirty if source else "not a checkout"),
-        (
-            "CHOLMOD",
-            f"{cholmod['version'] or 'missing'}, {_or_unknown(cholmod['blas'])}",
-        ),
-        *(("threads", _pool_text(pool)) for pool in environment["threads"]["pools"]),
-    ]
+    advice = "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch"
+    return _check("Machine", "processor", value, advice)
 
 
-def _pool_text(pool: Mapping[str, Any]) -> str:
-    name = " ".join(filter(None, (pool["library"], pool["version"])))
-    return f"{pool['threads']} in {name} ({pool['owner']})"
+def _cpu_limit(limit: float | None) -> Check:
+    if limit is None:
+        return _check("Machine", "cpu limit", "none")
+    advice = (
+        "The container is throttled: give it 2 cores or more (docker run --cpus=2)"
+        if limit < 2
+        else ""
+    )
+    return _check("Machine", "cpu limit", f"{limit:g} cores", advice)
 
 
-def _noise_rows(noise: NoiseFloor) -> list[tuple[str, str]]:
-    return [
-        ("clock step", f"{noise.clock_seconds * 1e9:.0f} ns"),
-        (
-            "noise floor",
-            f"±{noise.half_width:.2%} (A/A ratio {noise.ratio:.4f}, "
-            f"{noise.pairs} pairs of {noise.kernel_seconds * 1e6:.0f} µs)",
-        ),
-    ]
+def _governor(machine: Mapping[str, Any]) -> Check:
+    governor = machine["governor"]
+    advice = "Fix the frequency: sudo cpupower frequency-set -g performance"
+    good = governor in (None, "performance")
+    return _check("Machine", "governor", governor, "" if good else advice)
 
 
-def _or_unknown(value: object, absent: str = "unknown") -> str:
-    return absent if value is None else str(value)
+def _turbo(machine: Mapping[str, Any]) -> Check:
+    if not machine["turbo"]:
+        value = None if machine["turbo"] is None else "off"
+        return _check("Machine", "turbo", value)
+    advice = (
+        "Frequencies above the nominal one depend on temperature and on neighbours: "
+        "echo 0 | sudo tee /sys/devices/system/cpu/cpufreq/boost "
+        "(Intel: echo 1 | sudo tee /sys/devices/system/cpu/intel_pstate/no_turbo)"
+    )
+    return _check("Machine", "turbo", "on", advice)
 
 
-def _paired_times(seconds: float, clock: Callable[[], float]) -> tuple[Vector, Vector]:
-    """Time arms A and B of the same kernel; returns two arrays of equal length."""
-    matrix, vector = np.ones((512, 512)), np.ones(512)
-
-    def timed() -> float:
-        start = clock()
-        matrix @ vector
-        return clock() - start
-
-    timed()  # the first product finds cold caches
-    arms: tuple[list[float], list[float]] = ([], [])
-    first, end = 0, clock() + seconds
-    while clock() < end or not arms[0]:
-        arms[first].append(timed())
-        arms[1 - first].append(timed())
-        first = 1 - first
-    return np.array(arms[0]), np.array(arms[1])
+def _siblings(smt: bool | None) -> Check:
+    if not smt:
+        return _check("Machine", "hyper-threads", None if smt is None else "off")
+    advice = (
+        "Two programs share a core: keep the machine free of others, or "
+        "echo off | sudo tee /sys/devices/system/cpu/smt/control"
+    )
+    return _check("Machine", "hyper-threads", "on", advice)
 
 
-def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:
-    """Find the smallest step between consecutive readings that is not zero."""
-    readings = np.array([clock() for _ in range(tries)])
-    steps = np.diff(readings)
-    return float(steps[steps > 0].min(initial=np.inf))
+def _load(load: float) -> Check:
+    return _check("Machine", "load", f"{load:.2f} cores busy", load_advice(load))
+
+
+def _memory(total: int | None, available: int | None) -> Check:
+    if total is None or available is None:
+        return _check("Machine", "memory", None)
+    advice = (
+        f"Make room for {ENOUGH_MEMORY_MIB} MiB, or lower memory_limit in the suite"
+        if available < ENOUGH_MEMORY_MIB
+        else ""
+    )
+    return _check("Machine", "memory", f"{available} of {total} MiB free", advice)
+
+
+def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
+    pools = environment["threads"]["pools"]
+    for owner in ("numpy", "scipy"):
+        yield _check("BLAS", f"of {owner}", _blas_of(owner, pools))
+    blas, version = environment["cholmod"]["blas"], environment["cholmod"]["version"]
+    advice = ""
+    if environment["versions"]["scikit-sparse"] is None:
+        advice = "scikit-sparse is not installed, nothing is factorised: make setup"
+    elif blas == "reference BLAS":
+        link = f"libblas.so.3-{environment['machine']['architecture']}-linux-gnu"
+        advice = (
+            "The reference BLAS is several times slower: "
+            "sudo apt-get install libopenblas0-pthread "
+            f"(if it is there already: sudo update-alternatives --auto {link})"
+        )
+    linked = blas and f"{blas}, linked by CHOLMOD {version or '?'}"
+    yield _check("BLAS", "of CHOLMOD", linked, advice)
+
+
+def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
+    """Name the BLAS in a package's wheel; without one there, that of the system."""
+    for place in (owner, "system"):
+        for pool in pools:
+            if pool["owner"] == place and pool["library"] != "libgomp":
+                return " ".join(filter(None, (pool["library"], pool["version"])))
+    return None
+
+
+def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
+    for pool in threads["pools"]:
+        count = pool["threads"]
+        advice = f"More than one blurs times: {ONE_THREAD}" if count > 1 else ""
+        value = f"{count} thread{'s' if count > 1 else ''}"
+        yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
+    variables = ", ".join(f"{k}={v}" for k, v in threads["variables"].items())
+    yield _check("Threads", "variables", variables or "none set")
+
+
+def _clock(noise: NoiseFloor) -> Iterable[Check]:
+    step = noise.clock_seconds
+    coarse = "" if step <= FINE_CLOCK_SECONDS else "Measure on a machine with a clock"
+    yield _check(
+        "clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
+    )
+    biased = abs(noise.ratio - 1) > EQUAL and not noise.low <= 1 <= noise.high
+    yield _check(
+        "Clock",
+        "A/A ratio",
+        f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
+        f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
+        "Equal things seem to differ: let the machine rest, then ask again"
+        if biased
+        else "",
+    )
+    yield _check(
+        "Clock",
+        "noise floor",
+        f"two equal measurements differ by up to {noise.one_pair:.1%} (19 of 20)",
+        f"Raise repeats: a single measurement tells nothing below {noise.one_pair:.0%}"
+        if noise.one_pair > STEADY
+        else "",
+    )
+
+
+def _versions(environment: Mapping[str, Any]) -> Iterable[Check]:
+    machine, source = environment["machine"], environment["source"]
+    yield _check("Versions", "system", f"{machine['system']} {machine['kernel']}")
+    for name, number in environment["versions"].items():
+        advice = "" if number else "It is missing: make setup"
+        yield _check("Versions", name, number or "missing", advice)
+    dirty = source is not None and source["dirty"]
+    commit = (source["commit"][:12] if source else "not a checkout") + (
+        " with changes" if dirty else ""
+    )
+    advice = "Commit before you publish, so that others can measure the same code"
+    yield _check("Versions", "commit", commit, advice if dirty else "")
+
+
+def render(checks: Sequence[Check], environment: str) -> Text:
+    """Lay out what `mortarbench doctor` prints: sections, marks, what to change.
+
+    environment : its digest, as records name it
+    """
+    width = max(len(check.name) for check in checks)
+    text, section = Text(), ""
+    for check in checks:
+        if check.section != section:
+            section = check.section
+            text.append(f"{section}\n", "bold")
+        text.append(f"  {check.level:<7}  ", _STYLES[check.level])
+        text.append(f"{check.name:<{width}}  {check.value}\n")
+        if check.advice:
+            text.append(f"{'':{width + 13}}→ {check.advice}\n", "yellow")
+    return text.append(f"\n{_conclusion(checks)} Environment {environment}.")
+
+
+def _conclusion(checks: Sequence[Check]) -> str:
+    warnings = sum(check.level is Level.WARN for check in checks)
+    if not warnings:
+        return "Fit for measuring: nothing to change."
+    things = "thing" if warnings == 1 else "things"
+    return f"{warnings} {things} to change before measuring (marked warn)."

@@ -90,14 +90,19 @@ def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
     }
 
 
-def capture_in(variables: Mapping[str, str]) -> dict[str, Any]:
+def capture_in(
+    variables: Mapping[str, str], plugins: Iterable[Path] = ()
+) -> dict[str, Any]:
     """Describe a process that is started with some variables set, as workers are.
 
     Libraries read their thread variables only once, when they are loaded.
     """
-    program = "import json, harness.environment as e; print(json.dumps(e.capture()))"
+    program = (
+        "import json, pathlib, sys, harness.environment as e; "
+        "print(json.dumps(e.capture(map(pathlib.Path, sys.argv[1:]))))"
+    )
     done = subprocess.run(
-        [sys.executable, "-P", "-c", program],
+        [sys.executable, "-P", "-c", program, *map(str, plugins)],
         env=os.environ | variables,
         capture_output=True,
         text=True,
@@ -203,8 +208,10 @@ def _machine() -> dict[str, Any]:
         "system": platform.system(),
         "kernel": platform.release(),
         "libc": " ".join(platform.libc_ver()).strip() or None,
-        "governor": _read(_CPU / "cpu0/cpufreq/scaling_governor") or None,
+        "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
+        "governor": _governor(),
         "turbo": _turbo(),
+        "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
     }
 
 
@@ -254,6 +261,12 @@ def _cpu_limit() -> float | None:
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
         period = _read(_CGROUP / "cpu/cpu.cfs_period_us")
     return int(quota) / int(period) if quota.isdigit() and period.isdigit() else None
+
+
+def _governor() -> str | None:
+    """Name the frequency governor; all, where CPUs have different ones."""
+    files = _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")
+    return ", ".join(sorted({_read(file) for file in files} - {""})) or None
 
 
 def _turbo() -> bool | None:

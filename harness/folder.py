@@ -17,7 +17,7 @@ from harness.errors import InputError, some
 from harness.suite import Suite
 
 #: all that a run writes, which `fresh` deletes and nothing else
-_FOLDERS = ("journal", "vectors", "report")
+_FOLDERS = ("journal", "vectors", "cases", "environments", "report")
 _FILES = ("environment.json", "suite.toml")
 
 
@@ -115,13 +115,72 @@ def claim(
     if environment_file.exists():
         then = _environment(environment_file)
         if then["digest"] != environment["digest"]:
-            keys = some(_differing(then, environment))
+            keys = some(key for key, *_ in differences(then, environment))
             raise InputError(
                 f"{out} was measured in another environment ({then['digest']}, now "
                 f"{environment['digest']}{keys and f': {keys} changed'}); {remedy}"
             )
     _replace_text(suite_file, suite.text)
     _replace_text(environment_file, json.dumps(environment, indent=1) + "\n")
+
+
+def suite_text(folder: Path) -> str:
+    """Read the suite of a result folder, as TOML.
+
+    Raises
+    ------
+    InputError
+        When it is missing.
+
+    """
+    try:
+        return (folder / "suite.toml").read_text("utf-8")
+    except OSError as e:
+        raise InputError(
+            f"{folder}/suite.toml: {e.strerror}; expected a result folder"
+        ) from None
+
+
+def environment_of(folder: Path, digest: str) -> dict[str, Any]:
+    """Read the environment of that digest from a result folder.
+
+    Raises
+    ------
+    InputError
+        When the folder does not hold it.
+
+    """
+    for path in (folder / "environment.json", _node_file(folder, digest)):
+        if path.is_file() and (found := _environment(path))["digest"] == digest:
+            return found
+    raise InputError(f"{folder} does not hold the environment {digest}")
+
+
+def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
+    """Store what one machine of a cluster is, under its digest."""
+    path = _node_file(folder, digest)
+    path.parent.mkdir(exist_ok=True)
+    text = json.dumps({"digest": digest, **environment}, indent=1)
+    _replace_text(path, text + "\n")
+
+
+def _node_file(folder: Path, digest: str) -> Path:
+    return folder / "environments" / f"{digest}.json"
+
+
+def differences(
+    then: Mapping[str, Any], now: Mapping[str, Any]
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield what differs in the lasting parts of two environments.
+
+    As (dotted key, value then, value now); None where there is none.
+    """
+    for key in sorted((then.keys() | now.keys()) - {"digest", *VOLATILE}):
+        a, b = then.get(key), now.get(key)
+        if isinstance(a, Mapping) and isinstance(b, Mapping):
+            yield from ((f"{key}.{k}", *pair) for k, *pair in differences(a, b))
+        elif a != b:
+            yield key, a, b
 
 
 def _toml(path: Path) -> dict[str, Any] | None:
@@ -139,16 +198,6 @@ def _environment(path: Path) -> dict[str, Any]:
     if not isinstance(environment, dict) or "digest" not in environment:
         raise InputError(f"{path}: no JSON object with a digest") from None
     return environment
-
-
-def _differing(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the dotted keys of the lasting parts that are not the same in both."""
-    for key in sorted((then.keys() | now.keys()) - {"digest", *VOLATILE}):
-        a, b = then.get(key), now.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            yield from (f"{key}.{inner}" for inner in _differing(a, b))
-        elif a != b:
-            yield key
 
 
 def _replace_text(path: Path, text: str) -> None:

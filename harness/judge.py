@@ -14,6 +14,7 @@ from harness.kkt import kkt_residuals, verdict
 from harness.measure import Measurement
 from harness.names import CaseName
 from harness.plugin import Case
+from harness.qp import QP
 from harness.record import SCHEMA, Record, Verdict
 from harness.registry import SolverSpec
 from harness.solution import Solution, Status
@@ -28,15 +29,21 @@ def blank(
     tol: float,
     repeat: int,
     environment: str,
+    block: int = 0,
+    mode: str = "cold",
+    accuracy: float | None = None,
 ) -> Record:
     """Make the record of a measurement before it is made.
 
     case : the canonical name
     options : every option of the solver, defaults resolved
     environment : digest
+    mode, accuracy : see `Record`
     """
     options = plain(options)
     identity = [SCHEMA, case, spec.label, spec.name, options, tol, repeat]
+    if (mode, accuracy) != ("cold", None):
+        identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=sha256(text.encode()).hexdigest()[:12],
@@ -49,21 +56,21 @@ def blank(
         options=options,
         tol=tol,
         repeat=repeat,
-        block=0,
+        block=block,
         status=Verdict.FAILED,
         environment=environment,
+        mode=mode,
+        accuracy=accuracy,
+        arm=spec.arm,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
     )
 
 
-def judged(record: Record, case: Case, measurement: Measurement) -> Record:
-    """Fill in what `measurement` is worth on `case`, by our own evaluation.
-
-    Quantities that cannot be computed leave a note in the message.
-    """
+def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
+    """Fill in what `measurement` is worth on `qp`, by our own evaluation."""
     s = measurement.solution
     record = record.but(
-        sizes=case.qp.sizes,
+        sizes=qp.sizes,
         claimed=s.status.value,
         message=s.message,
         iterations=s.iterations,
@@ -72,23 +79,30 @@ def judged(record: Record, case: Case, measurement: Measurement) -> Record:
         solve_seconds=measurement.solve_seconds,
         total_seconds=measurement.total_seconds,
         peak_mib=measurement.peak_mib,
+        prepare_peak_mib=measurement.prepare_peak_mib,
+        solve_peak_mib=measurement.solve_peak_mib,
+        inner=measurement.inner,
     )
     if s.status is Status.DECLINED:
         return record.but(status=Verdict.DECLINED)
     with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
-        residuals = kkt_residuals(case.qp, s)
-        objective = case.qp.objective(s.x)
-    record = record.but(
-        status=verdict(s.status, residuals, record.tol),
+        residuals = kkt_residuals(qp, s)
+        objective = qp.objective(s.x)
+    return record.but(
+        status=verdict(s.status, residuals, record.accuracy or record.tol),
         objective=objective,
         **residuals._asdict(),
     )
+
+
+def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
+    """Evaluate what a point means physically; with a note, if that is impossible."""
     if not has_point(s):
-        return record
+        return {}, ""
     try:
-        return record.but(quantities=plain(case.quantities(s)))
+        return plain(case.quantities(s)), ""
     except Exception as e:  # the family's code; its fault must not lose the record
-        return noted(record, "quantities", e)
+        return {}, note_of("quantities", e)
 
 
 def has_point(s: Solution) -> bool:
@@ -96,10 +110,14 @@ def has_point(s: Solution) -> bool:
     return all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))
 
 
-def noted(record: Record, what: str, e: Exception) -> Record:
-    """Say in the message of a record what could not be computed of it."""
-    reason = " ".join(f"no {what}: {type(e).__name__}: {e}".split())
-    return record.but(message="; ".join(filter(None, [record.message, reason])))
+def note_of(what: str, e: Exception) -> str:
+    """Say in one line what could not be computed of a record."""
+    return " ".join(f"no {what}: {type(e).__name__}: {e}".split())
+
+
+def noted(record: Record, *notes: str) -> Record:
+    """Add notes to the message of a record."""
+    return record.but(message="; ".join(filter(None, [record.message, *notes])))
 
 
 def plain(data: Any) -> Any:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from time import perf_counter
 
@@ -14,7 +15,11 @@ import numpy as np
 from harness.history import usable
 from harness.plugin import Solver
 from harness.qp import QP
+from harness.recipe import Recipe
 from harness.solution import Solution, Status
+
+SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
+MOST_INNER = 100
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,41 +30,93 @@ class Measurement:
     prepare_seconds: float | None = None
     solve_seconds: float | None = None
     total_seconds: float | None = None  #: prepare + solve
-    peak_mib: float | None = (
-        None  #: largest resident memory while prepare and solve ran
-    )
+    prepare_peak_mib: float | None = None  #: largest resident memory while it ran
+    solve_peak_mib: float | None = None
+    inner: int = 1  #: times that it was prepared and solved; seconds are the mean
+
+    @property
+    def peak_mib(self) -> float | None:
+        """Largest resident memory while prepare and solve ran."""
+        peaks = (self.prepare_peak_mib, self.solve_peak_mib)
+        return max((p for p in peaks if p is not None), default=None)
 
 
-def measure(solver: Solver, qp: QP, tol: float) -> Measurement:
-    """Let `solver` prepare and solve `qp` once, both timed.
+Prepare = Callable[[QP], Callable[[], Solution]]
+
+
+def measure(
+    solver: Solver,
+    qp: QP,
+    tol: float,
+    *,
+    prepare: Prepare | None = None,
+    sample_seconds: float = 0.0,
+) -> Measurement:
+    """Let `solver` prepare and solve `qp`, both timed.
 
     Nothing that the solver does wrong raises: an exception, a missing library or a
     malformed answer becomes the status and message of a solution without a point.
+
+    prepare : where that is a step of a sequence, see `harness.plugin.Chained`
+    sample_seconds : what takes less is prepared afresh and solved again until all that
+        takes as long; the answer is the first, the times are the mean of the others,
+        since the first meets cold caches
     """
     with _garbage_collection_off():
-        reset = _reset_peak()
         try:  # only the solver's own code: a bug of ours must not pass for its failure
             if (reason := solver.declines(qp)) is not None:
                 return _without_point(qp, Status.DECLINED, reason)
-            start = perf_counter()
-            solve = solver.prepare(qp, tol)
-            ready = perf_counter()
-            answer = solve()
-            end = perf_counter()
+            begin = prepare or (lambda qp: solver.prepare(qp, tol))
+            answer, seconds, peaks = _timed(begin, qp)
+            inner = _inner(sum(seconds), sample_seconds)
+            if inner > 1:
+                again = [_timed(begin, qp, peaks=False)[1] for _ in range(inner)]
+                seconds = tuple(
+                    sum(phase) / inner for phase in zip(*again, strict=True)
+                )
         except ImportError as e:
             name = e.name or str(e)
             message = f"not installed: {name} (pip install {name.partition('.')[0]})"
             return _without_point(qp, Status.DECLINED, message)
         except (Exception, SystemExit) as e:
             return _without_point(qp, Status.FAILED, f"{type(e).__name__}: {e}")
-        peak = memory_mib("VmHWM") if reset else None
     return Measurement(
         solution=_checked(answer, qp),
-        prepare_seconds=ready - start,
-        solve_seconds=end - ready,
-        total_seconds=end - start,
-        peak_mib=peak,
+        prepare_seconds=seconds[0],
+        solve_seconds=seconds[1],
+        total_seconds=sum(seconds),
+        prepare_peak_mib=peaks[0],
+        solve_peak_mib=peaks[1],
+        inner=inner,
     )
+
+
+def _timed(
+    prepare: Prepare, qp: QP, *, peaks: bool = True
+) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
+    """Prepare and solve once: the answer, and both phases' seconds and peaks in MiB."""
+    reset = peaks and _reset_peak()
+    start = perf_counter()
+    if isinstance(qp.P, Recipe):
+        qp.P.build()
+    solve = prepare(qp)
+    ready = perf_counter()
+    prepare_peak = memory_mib("VmHWM") if reset else None
+    reset = peaks and _reset_peak()
+    again = perf_counter()
+    answer = solve()
+    end = perf_counter()
+    solve_peak = memory_mib("VmHWM") if reset else None
+    if isinstance(qp.P, Recipe):
+        qp.P.forget()
+    return answer, (ready - start, end - again), (prepare_peak, solve_peak)
+
+
+def _inner(seconds: float, sample_seconds: float) -> int:
+    """Choose how often to repeat so that a sample takes `sample_seconds`."""
+    if seconds >= sample_seconds / 2:
+        return 1
+    return min(ceil(sample_seconds / max(seconds, 1e-9)), MOST_INNER)
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:

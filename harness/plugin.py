@@ -69,6 +69,9 @@ class Case:
     scale: float = 1.0
     constant: float = 0.0
     matrices: Mapping[str, Any] = field(default_factory=dict)  #: to export with the QP
+    dualise_seconds: float | None = (
+        None  #: what a dual form took to come by, factor too
+    )
 
 
 class Family(Protocol):

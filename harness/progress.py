@@ -4,24 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import Protocol, TextIO
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.progress import Progress as Bar
 
 from harness.record import Record
-from harness.run import Progress as Listener
+
+
+class Progress(Protocol):
+    """Who is told how a run goes."""
+
+    def start(self, total: int) -> None:
+        """Begin; `total` cells, those that an earlier run measured included."""
+
+    def say(self, text: str) -> None:
+        """Show what happens now."""
+
+    def warn(self, text: str) -> None:
+        """Show what went wrong, in a line that stays."""
+
+    def advance(self, record: Record | None) -> None:
+        """Count one cell as done; None where nothing had to be measured."""
 
 
 @contextmanager
-def shown_on(stream: TextIO) -> Iterator[Listener]:
+def shown_on(stream: TextIO) -> Iterator[Progress]:
     """Give what a run reports its progress to."""
     if not stream.isatty():
         yield _Lines(stream)
@@ -32,12 +47,12 @@ def shown_on(stream: TextIO) -> Iterator[Listener]:
         TimeElapsedColumn(),
         TextColumn("{task.description}"),
     )
-    with Progress(*columns, console=Console(file=stream)) as bar:
+    with Bar(*columns, console=Console(file=stream)) as bar:
         yield _Bar(bar)
 
 
 class _Bar:
-    def __init__(self, bar: Progress) -> None:
+    def __init__(self, bar: Bar) -> None:
         self._bar = bar
         self._task = bar.add_task("starting", total=None)
 

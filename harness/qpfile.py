@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from harness.errors import InputError
+from harness.npz import write_mappable
 from harness.qp import QP, Matrix, Structure, Vector
-from harness.store import read_arrays
+from harness.recipe import Recipe
+from harness.store import digest_of, mapped_arrays
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
 _STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
+_INGREDIENT = "P_from_"  #: of a P that is a recipe
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
@@ -39,10 +43,16 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
     return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
 
 
-def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
+def save_qp(
+    path: Path, qp: QP, meta: Mapping[str, Any], *, recipe: bool = False
+) -> str:
     """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
 
-    `meta` is plain data; its key ``dense`` is filled in here.
+    Returns 16 hex digits that name its numbers: equal digests, equal QPs. A P that is
+    written as a recipe has another digest than the same one multiplied out.
+
+    meta : plain data; its keys ``dense`` and ``maker`` are filled in here
+    recipe : whether a P that is a `Recipe` is written as such, which only we can read
 
     Raises
     ------
@@ -50,21 +60,28 @@ def save_qp(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         When the file cannot be written.
 
     """
+    P, maker = qp.P, {}
+    if recipe and isinstance(P, Recipe):
+        maker = {"maker": P.maker}
+        qp = replace(qp, P=csc_array(P.shape))
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
-    if qp.structure is not None:
+    if recipe and qp.structure is not None:
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed
+    if maker:
+        arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
     for name, M in matrices.items():
         M = csc_array(M)
         parts = (M.data, M.indices, M.indptr, np.array(M.shape))
         arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
-    arrays["meta"] = np.array(json.dumps({**meta, "dense": dense}))
+    digest = digest_of(arrays)
+    arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
     try:
-        with path.open("wb") as file:  # given a name, savez would append .npz to it
-            np.savez(file, **arrays)
+        write_mappable(path, arrays)
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    return digest
 
 
 def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
@@ -77,7 +94,7 @@ def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
 
     """
     parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
-    arrays = read_arrays(path, (*_VECTORS, *parts, "meta"))
+    arrays = mapped_arrays(path, (*_VECTORS, *parts, "meta"))
     try:
         meta = json.loads(str(arrays["meta"]))
         if not isinstance(meta, dict):
@@ -86,7 +103,9 @@ def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in set(_MATRICES).intersection(meta.get("dense", ())):
-            matrices[name] = matrices[name].toarray()
+            matrices[name] = _dense(matrices[name])
+        if "maker" in meta:
+            matrices["P"] = _recipe(meta["maker"], arrays, vectors["q"].size)
         return QP(**vectors, **matrices, structure=structure), meta
     except (ValueError, TypeError) as e:
         raise InputError(f"{path}: {' '.join(str(e).split())}") from None
@@ -100,10 +119,26 @@ def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     return Structure(K=_matrix(arrays, "K"), B=_matrix(arrays, "B"), fixed=fixed)
 
 
+def _recipe(maker: str, arrays: Mapping[str, NDArray[Any]], n: int) -> Recipe:
+    ingredients = {
+        name.removeprefix(_INGREDIENT): array
+        for name, array in arrays.items()
+        if name.startswith(_INGREDIENT)
+    }
+    return Recipe(n, maker, ingredients)
+
+
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
     if arrays[name].dtype.kind not in "iuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
-    return arrays[name].astype(float)
+    return arrays[name].astype(float, copy=False)
+
+
+def _dense(M: Any) -> Matrix:
+    """Make a dense matrix; the values of a full one are viewed, not copied."""
+    rows, columns = M.shape
+    full = M.nnz == rows * columns and M.has_canonical_format
+    return M.data.reshape(columns, rows).T if full else M.toarray()
 
 
 def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:

@@ -62,6 +62,20 @@ class Record:
     solve_seconds: float | None = None
     total_seconds: float | None = None  #: prepare + solve
     peak_mib: float | None = None  #: resident memory of the worker, peak
+    prepare_peak_mib: float | None = None
+    solve_peak_mib: float | None = None
+    inner: int = 1  #: prepared and solved so often; the seconds are the mean
+    build_seconds: float | None = None  #: of the case, in the process that built it
+    dualise_seconds: float | None = (
+        None  #: part of build: factor, dual; dual forms only
+    )
+    recover_seconds: float | None = None  #: from the point to quantities
+    canary_seconds: float | None = None  #: a fixed kernel, just before: drift
+    threads: int | None = None  #: most threads of any library in the worker, as checked
+    cpu: int | None = None  #: that the worker was bound to
+    mode: str = "cold"  #: or "sequence": may use what earlier steps left
+    accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
+    arm: str = ""  #: "null": the same solver once more, to show the noise
     primal: float | None = None  #: the four scale-free residuals of harness.kkt
     dual: float | None = None
     complementarity: float | None = None
@@ -69,7 +83,9 @@ class Record:
     energy_bound: float | None = None  #: certified relative error, energy norm
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
-    environment: str = ""  #: digest of environment.json
+    qp: str | None = None  #: digest of the emitted QP; None in old journals
+    environment: str = ""  #: digest of environment.json or of one in environments/
+    node: str = ""  #: host name, where a cluster measured
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
     started: str = ""  #: UTC, ISO 8601

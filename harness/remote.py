@@ -2,70 +2,92 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime
-from math import inf
+from math import inf, isinf
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from harness.judge import judged
+from harness.judge import judged, noted, quantities_of
 from harness.measure import Measurement
 from harness.plugin import Case
+from harness.qp import QP
 from harness.qpfile import save_qp
-from harness.record import Record
+from harness.record import Record, Verdict
 from harness.solution import Solution, Status
 from harness.store import read_point
-from harness.supervisor import WorkerProcess
+from harness.supervisor import WorkerProcess, out_of_memory
 
-_MEASURED = ("prepare_seconds", "solve_seconds", "total_seconds", "peak_mib")
-
-
-def hand_over(case: Case, name: str, scratch: Path) -> Path:
-    """Write the QP of a case, of that canonical name, to where workers read it."""
-    qp_file = scratch / "qp.npz"
-    save_qp(qp_file, case.qp, {"name": name})
-    return qp_file
+_MEASURED = (
+    "prepare_seconds",
+    "solve_seconds",
+    "total_seconds",
+    "prepare_peak_mib",
+    "solve_peak_mib",
+    "inner",
+)
 
 
 def measured(
     worker: WorkerProcess,
-    case: Case,
-    qp_file: Path,
+    qp: QP,
     record: Record,
+    request: Mapping[str, Any],
     *,
     time_limit: float,
     memory_limit: float,
 ) -> tuple[Record, Solution | None]:
     """Fill in `record` by one measurement; no solution where the worker ended.
 
-    qp_file : from `hand_over`; the worker writes its point next to it
+    request : to the worker, see `harness.worker`; less what stands in the record
     time_limit, memory_limit : s and MiB
     """
-    record = record.but(
-        sizes=case.qp.sizes,
-        started=datetime.now(UTC).isoformat(timespec="milliseconds"),
-    )
-    point = qp_file.with_name("point.npz")
+    limited = {} if isinf(memory_limit) else {"memory_limit": memory_limit}
+    started = datetime.now(UTC).isoformat(timespec="milliseconds")
     reply = worker.ask(
-        {"qp": str(qp_file), "tol": record.tol, "out": str(point)},
+        {**request, **limited, "tol": record.tol},
         time_limit=time_limit,
         memory_limit=memory_limit,
     )
+    record = record.but(
+        sizes=qp.sizes,
+        started=started,
+        message=reply.message,
+        peak_mib=reply.peak_mib,
+        threads=reply.threads,
+        cpu=reply.cpu,
+    )
     if reply.answer is None:
-        record = record.but(
-            status=reply.verdict, message=reply.message, peak_mib=reply.peak_mib
-        )
-        return record, None
+        return record.but(status=reply.verdict), None
     answer = reply.answer
     solution = replace(
-        read_point(point, Status(answer["claimed"])),
+        read_point(Path(request["out"]), Status(answer["claimed"])),
         iterations=answer["iterations"],
         counts=answer["counts"],
         message=answer["message"],
     )
-    seconds = {name: answer[name] for name in _MEASURED}
-    return judged(record, case, Measurement(solution=solution, **seconds)), solution
+    told = {name: answer[name] for name in _MEASURED}
+    record = judged(record, qp, Measurement(solution=solution, **told))
+    return _within(memory_limit, record).but(
+        canary_seconds=answer["canary_seconds"]
+    ), solution
+
+
+def _within(limit: float, record: Record) -> Record:
+    """Say so where an answer went beyond the memory limit, or failed because of it."""
+    if record.status is Verdict.DECLINED:
+        return record
+    peak = record.peak_mib
+    if peak is not None and peak > limit:
+        message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
+        return noted(record.but(status=Verdict.MEMORY_LIMIT), message)
+    succeeded = record.status in (Verdict.VERIFIED, Verdict.INACCURATE)
+    if not succeeded and out_of_memory(record.message, peak, limit):
+        return record.but(status=Verdict.MEMORY_LIMIT)
+    return record
 
 
 def measured_once(
@@ -79,5 +101,17 @@ def measured_once(
         scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
-        qp_file = hand_over(case, record.case, scratch)
-        return measured(worker, case, qp_file, record, time_limit=inf, memory_limit=inf)
+        qp_file = scratch / "qp.npz"
+        digest = save_qp(qp_file, case.qp, {"name": record.case}, recipe=True)
+        record, solution = measured(
+            worker,
+            case.qp,
+            record.but(qp=digest),
+            {"qp": str(qp_file), "out": str(scratch / "point.npz")},
+            time_limit=inf,
+            memory_limit=inf,
+        )
+    if solution is None or record.status is Verdict.DECLINED:
+        return record, solution
+    quantities, note = quantities_of(case, solution)
+    return noted(record, note).but(quantities=quantities), solution

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from harness.errors import InputError
 from harness.history import History, checked
+from harness.npz import mapped
 from harness.plugin import Fields
 from harness.solution import Solution, Status
 
@@ -29,7 +31,7 @@ _HISTORY = "history_"
 
 def save_solution(folder: Path, solution: Solution) -> str:
     """Store a primal-dual point and its history; return the digest of both."""
-    return _save(folder, _point(solution))
+    return save(folder, point_arrays(solution))
 
 
 def load_solution(folder: Path, digest: str, status: Status) -> Solution:
@@ -59,9 +61,14 @@ def load_history(folder: Path, digest: str) -> History:
 
 def save_fields(folder: Path, fields: Fields) -> str:
     """Store a deformed state and return its digest."""
+    return save(folder, field_arrays(fields))
+
+
+def field_arrays(fields: Fields) -> Arrays:
+    """List the arrays of a deformed state by name."""
     arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
-    return _save(folder, {k: np.asarray(v) for k, v in arrays.items() if v is not None})
+    return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
 
 def load_fields(folder: Path, digest: str) -> Fields:
@@ -81,8 +88,13 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 def write_point(path: Path, solution: Solution) -> None:
     """Write the point of a solution, and its history, to a file of its own."""
+    write_arrays(path, point_arrays(solution))
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write arrays to a file of their own."""
     with path.open("wb") as file:  # given a name, savez would append .npz to it
-        np.savez(file, **_point(solution))  # type: ignore[arg-type]
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_point(path: Path, status: Status) -> Solution:
@@ -106,10 +118,41 @@ def read_arrays(
         When the file cannot be read, is no npz, or lacks one of the `expected` arrays.
 
     """
+    return _expected(path, partial(_read, only=only), expected)
+
+
+def mapped_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Do as `read_arrays`, but map what can be mapped; see `harness.npz`.
+
+    Raises
+    ------
+    InputError
+        As `read_arrays`.
+
+    """
+    return _expected(path, _mapped, expected)
+
+
+def _read(path: Path, only: str = "") -> dict[str, NDArray[Any]]:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        names = [name for name in stored.files if name.startswith(only)]
+        return {name: stored[name] for name in names}
+
+
+def _mapped(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            names = [name for name in stored.files if name.startswith(only)]
-            arrays = {name: stored[name] for name in names}
+        return mapped(path)
+    except ValueError:  # an npz file of somebody else
+        return _read(path)
+
+
+def _expected(
+    path: Path,
+    read: Callable[[Path], dict[str, NDArray[Any]]],
+    expected: tuple[str, ...],
+) -> dict[str, NDArray[Any]]:
+    try:
+        arrays = read(path)
     except OSError as e:
         raise InputError(f"{path}: {e.strerror or e}; expected an npz file") from None
     except (ValueError, TypeError, AttributeError, EOFError, BadZipFile):
@@ -120,7 +163,8 @@ def read_arrays(
     return arrays
 
 
-def _point(solution: Solution) -> Arrays:
+def point_arrays(solution: Solution) -> Arrays:
+    """List the four vectors of a point, and the columns of its history, by name."""
     point = {name: getattr(solution, name) for name in _POINT}
     return point | {_HISTORY + name: v for name, v in solution.history.items()}
 
@@ -146,9 +190,9 @@ def _path(folder: Path, digest: str) -> Path:
     return folder / "vectors" / f"{digest}.npz"
 
 
-def _save(folder: Path, arrays: Arrays) -> str:
-    """Write arrays under the digest of their content, unless they are there."""
-    digest = _digest(arrays)
+def save(folder: Path, arrays: Arrays) -> str:
+    """Write arrays under the digest of their content, unless a folder has them."""
+    digest = digest_of(arrays)
     path = _path(folder, digest)
     if path.exists():
         return digest
@@ -161,7 +205,7 @@ def _save(folder: Path, arrays: Arrays) -> str:
     return digest
 
 
-def _digest(arrays: Arrays) -> str:
+def digest_of(arrays: Arrays) -> str:
     """Hash names, types, shapes and values, not the archive, which holds dates."""
     content = sha256()
     for name in sorted(arrays):

@@ -6,13 +6,13 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 from harness import checked
 from harness.errors import InputError, some, unknown
-from harness.names import CaseName, assemble, canonical, match, parse
+from harness.grids import cold_cases, sequences
+from harness.names import CaseName, canonical, match, parse
 from harness.plugin import Family, Solver
 from harness.registry import SolverSpec, resolve
 
@@ -21,10 +21,15 @@ DEFAULTS: Mapping[str, Any] = {
     "repeats": 3,
     "time_limit": 60,
     "memory_limit": 4096,
+    "precision": None,
+    "max_repeats": 30,
+    "budget": 600,
+    "accuracy": None,
+    "null_arm": None,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _SOLVER_KEYS = ("name", "label", "options")
-_PROBLEM_KEYS = ("family", "forms", "params", "zip")
+NULL = " (A/A)"  #: after the label of a solver that is measured once more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,8 +42,24 @@ class Suite:
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
     solvers: tuple[SolverSpec, ...]  #: of distinct labels
-    cases: tuple[CaseName, ...]  #: all distinct
+    cases: tuple[CaseName, ...]  #: all distinct; those that are solved cold
     text: str  #: the TOML as read, but with the limits that hold
+    sequences: tuple[tuple[CaseName, ...], ...] = ()  #: each: its steps in order
+    precision: float | None = None
+    """Go on beyond `repeats` until every ratio to the fastest is known so well."""
+    max_repeats: int = 30  #: where there is a precision to reach
+    budget: float = 600.0  #: s of measured time per case and tolerance, likewise
+    accuracy: float | None = None  #: judge answers at this, whatever was asked for
+
+    @property
+    def groups(self) -> tuple[tuple[CaseName, ...], ...]:
+        """What one block is made of: a single case, or the steps of a sequence."""
+        return (*((case,) for case in self.cases), *self.sequences)
+
+    @property
+    def names(self) -> tuple[CaseName, ...]:
+        """Every case, cold or in a sequence."""
+        return tuple(case for group in self.groups for case in group)
 
 
 def load_suite(
@@ -70,10 +91,48 @@ def load_suite(
             repeats=checked.at_least_one("repeats", table["repeats"]),
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
-            solvers=_solvers(table["solvers"], solvers),
-            cases=_cases(table["problems"], families),
+            solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
+            cases=cold_cases(table["problems"], families),
+            sequences=sequences(table["problems"], families),
+            precision=_between("precision", table["precision"]),
+            max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
+            budget=checked.positive("budget", table["budget"]),
+            accuracy=_between("accuracy", table["accuracy"]),
             text=text,
         )
+
+
+def asked_solvers(text: str) -> dict[str, SolverSpec]:
+    """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
+    table = _toml(text)
+    specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
+    return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
+
+
+def steps_up_to(
+    text: str, name: CaseName, families: Mapping[str, Family]
+) -> tuple[CaseName, ...]:
+    """Read from a suite's TOML the steps of a sequence that lead to one of them.
+
+    Raises
+    ------
+    InputError
+        When no sequence has it.
+
+    """
+    for steps in sequences(_toml(text).get("problems"), families):
+        if name in steps:
+            return steps[: steps.index(name) + 1]
+    raise InputError("the suite has no sequence with that case")
+
+
+def limits(text: str) -> tuple[float, float]:
+    """Read the limits of a measurement from a suite's TOML, s and MiB."""
+    table = {**DEFAULTS, **_toml(text)}
+    time_limit, memory_limit = (
+        checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
+    )
+    return time_limit, memory_limit
 
 
 def with_overrides(
@@ -102,7 +161,7 @@ def with_overrides(
     if solvers:
         changes["solvers"] = _chosen_solvers(suite, solvers, registry)
     if cases:
-        changes["cases"] = _chosen_cases(suite, cases, families)
+        changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:
         changes["repeats"] = checked.at_least_one("--repeats", repeats)
     text = suite.text
@@ -135,13 +194,16 @@ def _chosen_solvers(
             chosen[name] = SolverSpec(name=name, label=name)
             with checked.located("--solver"):
                 resolve(chosen[name], {**known, **registry})
-    return tuple(chosen[name] for name in dict.fromkeys(names))
+    kept = dict.fromkeys(names)
+    null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
+    return tuple(chosen[name] for name in (*kept, *null))
 
 
 def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
-) -> tuple[CaseName, ...]:
-    named = {canonical(case, families[case.family]): case for case in suite.cases}
+) -> dict[str, Any]:
+    """Keep what matches; of a sequence all or nothing."""
+    named = {canonical(case, families[case.family]): case for case in suite.names}
     kept: set[str] = set()
     for pattern in patterns:
         matched = match(_canonical_pattern(pattern, families), named)
@@ -151,7 +213,14 @@ def _chosen_cases(
                 f"{suite.name!r}; there are {some(named)}"
             )
         kept.update(matched)
-    return tuple(case for name, case in named.items() if name in kept)
+
+    def wanted(case: CaseName) -> bool:
+        return canonical(case, families[case.family]) in kept
+
+    return {
+        "cases": tuple(filter(wanted, suite.cases)),
+        "sequences": tuple(s for s in suite.sequences if any(map(wanted, s))),
+    }
 
 
 def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
@@ -213,58 +282,23 @@ def _spec(entry: object) -> SolverSpec:
     )
 
 
-def _cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ...]:
-    """All cases in the order written; one that two blocks share is kept once."""
-    found: dict[str, CaseName] = {}
-    for i, block in enumerate(checked.filled_list("problems", blocks)):
-        with checked.located(f"problems[{i}]"):
-            table = checked.table("entry", block)
-            checked.only_keys(table, _PROBLEM_KEYS)
-            if "family" not in table:
-                raise InputError("family is missing")
-            name = checked.text("family", table["family"])
-            if name not in families:
-                raise unknown("family", name, families)
-            family = families[name]
-            forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
-            for params in _grid(table.get("params", {}), table.get("zip", [])):
-                for form in forms:
-                    case = assemble(family, params, checked.text("forms", form))
-                    found.setdefault(canonical(case, family), case)
-    return tuple(found.values())
+def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
+    """Add the solver of that label once more, as a null arm."""
+    if label is None:
+        return specs
+    known = {spec.label: spec for spec in specs}
+    if label not in known:
+        raise unknown("null_arm", str(label), known)
+    return (*specs, replace(known[label], label=f"{label}{NULL}", arm="null"))
 
 
-def _grid(params: object, groups: object) -> list[dict[str, object]]:
-    """Span the grid of `params`, first key slowest; zipped keys run together."""
-    table = checked.table("params", params)
-    columns = {
-        key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
-        for key, v in table.items()
-    }
-    zipped: dict[str, list[str]] = {}
-    for group in checked.any_list("zip", groups):
-        for key in checked.filled_list("zip", group):
-            if (
-                not isinstance(table.get(checked.text("zip", key)), list)
-                or key in zipped
-            ):
-                raise InputError(
-                    f"zip: {key!r} is no list in params, or is paired twice; "
-                    'expected groups of such keys, like [["Nr", "Nh"]]'
-                )
-            zipped[key] = group
-        if len({len(columns[key]) for key in group}) > 1:
-            lengths = ", ".join(f"{key} has {len(columns[key])}" for key in group)
-            raise InputError(f"zip: {lengths} values; expected equally many")
-    axes = []
-    for key in columns:
-        together = zipped.get(key, [key])
-        if key == min(together, key=list(columns).index):
-            rows = zip(*(columns[k] for k in together), strict=True)
-            axes.append([dict(zip(together, row, strict=True)) for row in rows])
-    return [
-        {k: v for part in point for k, v in part.items()} for point in product(*axes)
-    ]
+def _between(key: str, value: Any) -> float | None:
+    """Take nothing, or a number between 0 and 1."""
+    if value is None:
+        return None
+    if not checked.is_number(value) or not 0 < value < 1:
+        raise InputError(f"{key} = {value!r}; expected a number between 0 and 1")
+    return float(value)
 
 
 def _tolerances(value: object) -> tuple[float, ...]:

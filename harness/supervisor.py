@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -28,6 +29,7 @@ WARM_UP_SECONDS = 60.0
 CLOSE_SECONDS = 1.0
 LOG_BYTES = 2**20  #: what a solver may print before we drop it
 LAST_WORDS = 300  #: characters of its last line that a message holds
+NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
 
 _LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
@@ -41,6 +43,8 @@ class Reply:
     verdict: Verdict | None = None  #: None where there is an answer
     message: str = ""
     peak_mib: float | None = None  #: largest resident memory seen from outside
+    threads: int | None = None  #: of the worker, as it found by itself
+    cpu: int | None = None
 
 
 class WorkerProcess:
@@ -59,6 +63,7 @@ class WorkerProcess:
         self._requests = self._replies = -1  # our ends of the two pipes
         self._unread = b""
         self._warms_up = True
+        self._facts: dict[str, Any] = {}  # what it told of its warm-up
         self._peak_mib = 0.0
 
     def ask(
@@ -82,13 +87,19 @@ class WorkerProcess:
             answer = self._await("done", time_limit, memory_limit)
         except _EndedError as end:
             self._kill()
+            verdict = end.verdict
+            if out_of_memory(str(end), self._peak_mib, memory_limit):
+                verdict = Verdict.MEMORY_LIMIT
             return Reply(
-                verdict=end.verdict, message=str(end), peak_mib=self._peak_mib or None
+                verdict=verdict,
+                message=str(end),
+                peak_mib=self._peak_mib or None,
+                **self._facts,
             )
         self._trim_log()
-        if self._has_children():  # they would disturb the next measurement
+        if self._children():  # they would disturb the next measurement
             self._kill()
-        return Reply(answer=answer)
+        return Reply(answer=answer, peak_mib=self._peak_mib or None, **self._facts)
 
     def close(self) -> None:
         """Let the worker end by itself, soon; its children end with it."""
@@ -108,7 +119,12 @@ class WorkerProcess:
             return
         try:
             self._send({"warm_up": True})
-            self._await("warm", WARM_UP_SECONDS, memory_limit)
+            told = self._await("warm", WARM_UP_SECONDS, memory_limit)
+            cpus = told.get("cpus", ())
+            self._facts = {
+                "threads": told.get("threads"),
+                "cpu": cpus[0] if len(cpus) == 1 else None,
+            }
         except _EndedError:
             self._warms_up = False
             self._kill()
@@ -178,15 +194,23 @@ class WorkerProcess:
         return reply
 
     def _check_memory(self, event: str, limit: float) -> None:
-        resident = memory_mib("VmRSS", self._pid) or 0.0
+        family = (self._pid, *self._children())
+        resident = sum(memory_mib("VmRSS", process) or 0.0 for process in family)
         self._peak_mib = max(self._peak_mib, resident)
         if resident > limit:
             how = f"killed at {resident:.0f} MiB, above the limit of {limit:g} MiB"
             raise _EndedError(event, Verdict.MEMORY_LIMIT, how)
 
-    def _has_children(self) -> bool:
-        tasks = Path(f"/proc/{self._pid}/task").glob("*/children")
-        return any(task.read_bytes() for task in tasks)
+    def _children(self) -> list[int]:
+        """List the processes that the worker started, and those that these started."""
+        found, unseen = [], [self._pid]
+        while unseen:
+            for task in Path(f"/proc/{unseen.pop()}/task").glob("*/children"):
+                with suppress(OSError):  # it may have ended
+                    children = list(map(int, task.read_bytes().split()))
+                    found += children
+                    unseen += children
+        return found
 
     @property
     def _pid(self) -> int:
@@ -232,6 +256,27 @@ class _EndedError(Exception):
     def __init__(self, event: str, verdict: Verdict, how: str) -> None:
         super().__init__(how if event == "done" else f"before solving: {how}")
         self.verdict = verdict if event == "done" else _BEFORE.get(verdict, verdict)
+
+
+_EXHAUSTION = re.compile(
+    r"MemoryError|bad_?alloc|out of memory|(un|can ?not |not )(able to )?allocate"
+    r"|memory allocation|allocation (error|fail)",
+    re.IGNORECASE,
+)
+
+
+def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
+    """Tell whether what failed did so for want of memory.
+
+    Solvers answer exhaustion by an exception, an abort, a segmentation fault, a hang or
+    a false result. What gives them away is their peak or, where a single allocation
+    was refused, what the library says.
+
+    message : of the failure, its last words included
+    limit : MiB
+    """
+    near = peak_mib is not None and peak_mib >= NEAR * limit
+    return near or _EXHAUSTION.search(message) is not None
 
 
 #: running out of time before the clock started is no fault of the solver's speed

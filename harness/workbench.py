@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from harness.block import Commands
 from harness.errors import InputError, unknown
 from harness.plugin import Family, Fields, Reference, Solver
 from harness.registry import Plugin, SolverSpec, load_plugin, merged
@@ -32,9 +33,9 @@ class Workbench:
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)
-    #: starts `harness.commands.worker`; less its arguments. -P: what lies in the
-    #: working directory must not pass for a library
-    worker: Sequence[str] = (sys.executable, "-P", "-m", "harness", "worker")
+    #: starts `harness.cli`, less the name of a process that runs need. -P: what lies
+    #: in the working directory must not pass for a library
+    start: Sequence[str] = (sys.executable, "-P", "-m", "harness")
 
     def extended(self, plugin: Plugin) -> Workbench:
         """Add the solvers and problems of a plug-in.
@@ -77,7 +78,17 @@ class Workbench:
             "options": spec.options,
             "plugins": [str(path.resolve()) for path in plugins],
         }
-        return [*self.worker, json.dumps(request)]
+        return [*self.start, "worker", json.dumps(request)]
+
+    def commands(
+        self, specs: Iterable[SolverSpec], plugins: Sequence[Path]
+    ) -> Commands:
+        """Make the commands that start the processes of a run."""
+        request = {"plugins": [str(path.resolve()) for path in plugins]}
+        return Commands(
+            solvers={s.label: self.worker_command(s, plugins) for s in specs},
+            generator=[*self.start, "generator", json.dumps(request)],
+        )
 
     def suite_path(self, text: str) -> Path:
         """Find a suite by path, or by its bare name among the suites of the checkout.

@@ -1,100 +1,168 @@
 """The process that one solver lives in, between measurements too.
 
-It answers one line of JSON with one or more on another pipe:
+It answers the requests of `harness.serving` with these of its own:
 
-* it says ``{"event": "ready"}`` when it can be asked
-* ``{"warm_up": true}``: it solves tiny QPs, so that imports which a solver puts off
-  until its first solve are not timed, and says ``{"event": "warm"}``
-* ``{"qp": PATH, "tol": TOL, "out": PATH}``: it loads the QP, says
-  ``{"event": "start"}``, measures, writes the point to `out` and says
-  ``{"event": "done", "claimed": …, "message": …, …}``
+* the warm-up solves tiny QPs, so that imports which a solver puts off until its first
+  solve are not timed
+* ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
+  writes the point to `out`. Optional: ``digest`` of the file, which is checked;
+  ``memory_limit`` in MiB; ``sample_seconds``, see `harness.measure`; ``step`` 0,
+  1, … of a sequence
 
-and ends when its requests do. Every measurement loads its QP afresh, so that nothing
-that a solver did to the last one is left.
+Every measurement loads its QP afresh, so that nothing that a solver did to the last one
+is left.
 """
 
 from __future__ import annotations
 
-import ctypes
 import gc
-import json
 import os
-import signal
-import sys
+import resource
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TextIO
+from statistics import median
+from time import perf_counter
+from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from harness.measure import Measurement, measure
+from harness.cases import content_digest
+from harness.measure import Measurement, Prepare, measure, memory_mib
 from harness.plugin import Solver
 from harness.qp import QP, no_rows
 from harness.qpfile import load_qp
+from harness.serving import answer_requests
+from harness.solution import Solution
 from harness.store import write_point
-
-_PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 def serve(solver: Solver, request_fd: int, reply_fd: int) -> None:
     """Answer requests until there are no more."""
-    _die_with_parent()
-    with os.fdopen(request_fd) as requests, os.fdopen(reply_fd, "w") as replies:
-        _send(replies, event="ready")
-        for line in requests:
-            request = json.loads(line)
-            if "warm_up" in request:
-                _warm_up(solver)
-                _send(replies, event="warm")
-            else:
-                _answer(solver, request, replies)
+    bench = _Bench(solver)
+    answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
 
 
-def _answer(solver: Solver, request: dict[str, Any], replies: TextIO) -> None:
-    qp, _ = load_qp(Path(request["qp"]))
-    _send(replies, event="start")
-    measurement = _measured_here(solver, qp, request["tol"])
-    sys.stdout.flush()  # what the solver printed belongs to this measurement
-    s = measurement.solution
-    write_point(Path(request["out"]), s)
-    _send(
-        replies,
-        event="done",
-        claimed=s.status,
-        message=s.message,
-        iterations=s.iterations,
-        counts=s.counts,
-        prepare_seconds=measurement.prepare_seconds,
-        solve_seconds=measurement.solve_seconds,
-        total_seconds=measurement.total_seconds,
-        peak_mib=measurement.peak_mib,
-    )
+class _Bench:
+    """One solver, what it was handed last, and the sequence that it is in."""
+
+    def __init__(self, solver: Solver) -> None:
+        self._solver = solver
+        self._chain: Prepare | None = None
+        self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
+
+    def warm_up(self) -> dict[str, Any]:
+        """Solve a QP with bounds and one with rows; how that ends will show later."""
+        eye, ones = np.eye(2), np.ones(2)
+        bounds: dict[str, Any] = dict(q=-ones, lb=np.zeros(2), ub=np.full(2, np.inf))
+        no_row = dict(A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0))
+        one_row_each = dict(A=ones[None], b=ones[:1], G=eye[:1], h=ones[:1])
+        for rows in (no_row, one_row_each):
+            _measured_here(self._solver, QP(P=eye, **bounds, **rows), 1e-6)
+        canary_seconds()
+        gc.freeze()  # the modules that are loaded by now need no further collecting
+        return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
+
+    def answer(
+        self, request: dict[str, Any], start: Callable[[], None]
+    ) -> dict[str, Any]:
+        """Measure once."""
+        path = Path(request["qp"])
+        self._check(path, request.get("digest"))
+        qp, _ = load_qp(path)
+        canary = canary_seconds()
+        _limit_memory(request.get("memory_limit"))
+        start()
+        m = _measured_here(
+            self._solver,
+            qp,
+            request["tol"],
+            prepare=self._step(request),
+            sample_seconds=request.get("sample_seconds", 0.0),
+        )
+        _limit_memory(None)
+        s = m.solution
+        write_point(Path(request["out"]), s)
+        return {
+            "claimed": s.status,
+            "message": s.message,
+            "iterations": s.iterations,
+            "counts": s.counts,
+            "prepare_seconds": m.prepare_seconds,
+            "solve_seconds": m.solve_seconds,
+            "total_seconds": m.total_seconds,
+            "peak_mib": m.peak_mib,
+            "prepare_peak_mib": m.prepare_peak_mib,
+            "solve_peak_mib": m.solve_peak_mib,
+            "inner": m.inner,
+            "canary_seconds": canary,
+        }
+
+    def _step(self, request: dict[str, Any]) -> Prepare | None:
+        """Begin a sequence at its first step, and go on with it at the others."""
+        step = request.get("step")
+        if step is None or not hasattr(self._solver, "chain"):
+            return None
+        if step == 0:
+            self._chain = None
+            chain, tol = self._solver.chain, request["tol"]
+
+            def begin(qp: QP) -> Callable[[], Solution]:  # on the clock, as its step is
+                self._chain = chain(tol)
+                return self._chain(qp)
+
+            return begin
+        return self._chain
+
+    def _check(self, path: Path, digest: str | None) -> None:
+        """Refuse a file that is not what it was; one that has not changed is known."""
+        if digest is None:
+            return
+        at = path.stat()
+        seen = (at.st_ino, at.st_size, at.st_mtime_ns)
+        if self._trusted.get(digest) != seen:
+            if content_digest(path) != digest:
+                raise ValueError(f"{path.name} was changed on disk")
+            self._trusted[digest] = seen
 
 
-def _measured_here(solver: Solver, qp: QP, tol: float) -> Measurement:
+def canary_seconds() -> float:
+    """Time a fixed small kernel, the median of five: a drift of it is the machine's."""
+    matrix, vector = np.ones((128, 128)), np.ones(128)
+    times = []
+    for _ in range(5):
+        start = perf_counter()
+        for _ in range(10):
+            matrix @ vector
+        times.append(perf_counter() - start)
+    return median(times)
+
+
+def _one_thread() -> int:
+    """Return the most threads of any library, after setting those that can be set."""
+    threadpool_limits(limits=1)
+    return max((pool["num_threads"] for pool in threadpool_info()), default=1)
+
+
+def _limit_memory(mib: float | None) -> None:
+    """Have allocations fail that would exceed `mib`; None lifts the limit.
+
+    The parent looks at what is resident and kills; that comes too late for a single
+    allocation beyond all memory. RLIMIT_DATA counts what is there already as well.
+    """
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    soft = hard
+    if mib is not None and (data := memory_mib("VmData")) is not None:
+        soft = int((data + mib) * 2**20)
+        if hard != resource.RLIM_INFINITY:
+            soft = min(soft, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _measured_here(solver: Solver, qp: QP, tol: float, **how: Any) -> Measurement:
     """Measure; a child that the solver forked and let return to us ends here."""
     process = os.getpid()
-    measurement = measure(solver, qp, tol)
+    measurement = measure(solver, qp, tol, **how)
     if os.getpid() != process:
         os._exit(0)
     return measurement
-
-
-def _warm_up(solver: Solver) -> None:
-    """Solve a QP with bounds and one with rows; how that ends will show later."""
-    eye, ones = np.eye(2), np.ones(2)
-    bounds: dict[str, Any] = dict(q=-ones, lb=np.zeros(2), ub=np.full(2, np.inf))
-    no_row = dict(A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0))
-    one_row_each = dict(A=ones[None], b=ones[:1], G=eye[:1], h=ones[:1])
-    for rows in (no_row, one_row_each):
-        _measured_here(solver, QP(P=eye, **bounds, **rows), 1e-6)
-    gc.freeze()  # the modules that are loaded by now need no further collecting
-
-
-def _send(replies: TextIO, **event: Any) -> None:
-    replies.write(json.dumps(event) + "\n")
-    replies.flush()
-
-
-def _die_with_parent() -> None:
-    """Have the kernel kill us when the parent dies, even in the middle of a solve."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,7 @@ def contact_case(
 
     """
     matrices: Mapping[str, Any] = {}
+    start = perf_counter()
     match form:
         case "primal":
             new = Transformed(primal, lambda s: s, 1.0, 0.0)
@@ -50,6 +52,7 @@ def contact_case(
             inverse = clamped()
             new = dual_bounds(primal, inverse)
             matrices = _paper(new.qp, csr_array(primal.G), primal.h, inverse)
+    seconds = None if form == "primal" else perf_counter() - start
     energy = bodies.force * bodies.length
     return Case(
         qp=new.qp,
@@ -59,6 +62,7 @@ def contact_case(
         scale=new.sign * energy,
         constant=new.constant * energy,
         matrices=matrices,
+        dualise_seconds=seconds,
     )
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 from types import MappingProxyType
 from typing import Any
 
@@ -59,17 +60,19 @@ class Obstacle:
         self.check(params)
         p: Any = params
         problem = obstacle_problem(p["dim"], p["n"])
-        rows = problem.qp
+        rows, start = problem.qp, perf_counter()
         if form == "primal":
             new = with_bounds(rows)
         else:
             new = dual_bounds(rows, regular_inverse(rows.P, rows.G.indices))
+        seconds = None if form == "primal" else perf_counter() - start
         return Case(
             qp=new.qp,
             recover=lambda s: problem.lift + new.recover(s).x,
             quantities=lambda s: obstacle_quantities(problem, new.recover(s)),
             scale=new.sign,
             constant=new.constant + problem.energy(np.zeros(rows.q.size)),
+            dualise_seconds=seconds,
         )
 
 

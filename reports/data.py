@@ -182,7 +182,7 @@ def read_evidence(directory: Path) -> Evidence:
     try:
         return Evidence(
             directory=directory,
-            records=arrange(records),
+            records=arrange(map(_apart, records)),
             environment=json.loads(environment.read_text("utf-8"))
             if environment.exists()
             else {},
@@ -191,6 +191,13 @@ def read_evidence(directory: Path) -> Evidence:
     except (json.JSONDecodeError, tomllib.TOMLDecodeError) as e:
         what = environment if isinstance(e, json.JSONDecodeError) else suite
         raise InputError(f"{what}: malformed: {e}") from None
+
+
+def _apart(record: Record) -> Record:
+    """Call a solver that drove a sequence by another name than one that began cold."""
+    if record.mode == "cold":
+        return record
+    return record.but(solver=f"{record.solver} ({record.mode})")
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:

@@ -52,7 +52,8 @@ def summary(evidence: Evidence) -> Section:
             f"Warning: the measurements come from {len(digests)} different "
             f"environments ({listing(digests)}); their times are not comparable."
         )
-    prose += [text for text in (_busy(evidence), _unequal(evidence)) if text]
+    notes = (_judged(evidence), _busy(evidence), _unequal(evidence))
+    prose += [text for text in notes if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
     return Section(
         name="summary",
@@ -93,6 +94,17 @@ def _repeats(evidence: Evidence) -> int:
     asked = evidence.suite.get("repeats")
     most = max(len(o.records) for o in evidence.flat)
     return asked if isinstance(asked, int) and asked > 0 else most
+
+
+def _judged(evidence: Evidence) -> str:
+    """Say so if answers were judged at another accuracy than was asked for: a sweep."""
+    at = sorted({r.accuracy for r in evidence.records if r.accuracy is not None})
+    if not at:
+        return ""
+    return (
+        f"The tolerances are what the solvers were asked for; verified means accurate "
+        f"to {listing([tolerance(a) for a in at])} whatever was asked for."
+    )
 
 
 def _busy(evidence: Evidence) -> str:

@@ -17,7 +17,16 @@ from threading import Timer
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from harness import (
+    QP,
+    Case,
+    Fields,
+    InputError,
+    Solution,
+    Status,
+    generator,
+    no_rows,
+)
 from harness.worker import serve
 
 
@@ -61,6 +70,26 @@ class Tiny:
             lb=np.zeros(2), ub=np.full(2, np.inf),
         )  # fmt: skip
         return Case(qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields)
+
+
+@dataclass(frozen=True)
+class Sized:
+    """min ½|x|² + qᵀx over x ≥ 0 with q > 0, of any size: x = 0."""
+
+    name: str = "sized"
+    forms: tuple[str, ...] = ("plain",)
+
+    @property
+    def defaults(self):
+        return {"n": 10}
+
+    def build(self, form, params, reference):
+        n = params["n"]
+        qp = QP(
+            P=csr_array(np.eye(n)), q=np.ones(n), A=no_rows(n), b=np.zeros(0),
+            G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf),
+        )  # fmt: skip
+        return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {"dofs": n})
 
 
 def at_the_row(qp):
@@ -147,12 +176,130 @@ class Prints(Honest):
         return at_the_row(qp)
 
 
+class PrintsEndlessly(Honest):
+    def act(self, qp):
+        while True:
+            print("x" * 2**20)
+
+
+class AsksForTheMoon(Honest):
+    """One allocation beyond all memory, that the library refuses."""
+
+    def act(self, qp):
+        np.ones(2**40)
+
+
+class AbortsForMemory(Honest):
+    """As Rust and C++ end when an allocation fails."""
+
+    def act(self, qp):
+        print("memory allocation of 64 bytes failed", file=sys.stderr, flush=True)
+        os.abort()
+
+
+class SpikesUnseen(Honest):
+    """Answers, after more memory than allowed for a shorter time than one looks."""
+
+    def act(self, qp):
+        np.ones(2**26)  # 512 MiB
+        return at_the_row(qp)
+
+
+class ForksAHoarder(Honest):
+    """Leaves the hoarding to a child."""
+
+    def act(self, qp):
+        if os.fork() == 0:
+            Leaks().act(qp)
+        time.sleep(3600)
+
+
+class WrongSign(Honest):
+    """A multiplier that pulls where the row can only push; primal and gap are zero."""
+
+    def act(self, qp):
+        s = at_the_row(qp)
+        return replace(s, z=-s.z)
+
+
+class AnswersAnotherProblem(Honest):
+    """Gives the first problem's answer to all."""
+
+    first = None
+
+    def act(self, qp):
+        if AnswersAnotherProblem.first is None:
+            AnswersAnotherProblem.first = at_the_row(qp)
+        return AnswersAnotherProblem.first
+
+
+class Sleeps(Honest):
+    """Takes 20 ms."""
+
+    def act(self, qp):
+        time.sleep(0.02)
+        return at_the_row(qp)
+
+
+class Products(Honest):
+    """Takes some milliseconds of arithmetic."""
+
+    def act(self, qp):
+        matrix, vector = np.ones((200, 200)), np.ones(200)
+        for _ in range(1000):
+            matrix @ vector
+        return at_the_row(qp)
+
+
+@dataclass(frozen=True)
+class SleepsByPower(Honest):
+    """Sleeps 0.02·(n/10)^1.5 s on the QPs of `Sized`."""
+
+    def prepare(self, qp, tol):
+        return lambda: self.act(qp)
+
+    def act(self, qp):
+        if qp.q.size >= 10:  # no warm-up
+            time.sleep(0.02 * (qp.q.size / 10) ** 1.5)
+        return Solution(
+            status=Status.SOLVED, x=np.zeros(qp.q.size), y=0 * qp.b, z=0 * qp.h,
+            z_box=-qp.q,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Chains(Honest):
+    """Tells by its iterations how many QPs of a sequence it has seen."""
+
+    def chain(self, tol):
+        seen = []
+
+        def prepare(qp):
+            seen.append(qp)
+            return lambda: replace(at_the_row(qp), iterations=len(seen))
+
+        return prepare
+
+
+class BreaksItsChain(Honest):
+    """Dies at the second QP of a sequence."""
+
+    def chain(self, tol):
+        seen = []
+
+        def prepare(qp):
+            seen.append(qp)
+            return lambda: os._exit(9) if len(seen) == 2 else at_the_row(qp)
+
+        return prepare
+
+
 class Leaks(Honest):
     def act(self, qp):
         hoard = []
         while True:
             hoard.append(np.ones(2**20))  # 8 MiB
-            time.sleep(0.005)
+            time.sleep(0.001)
 
 
 class Forks(Honest):
@@ -243,7 +390,11 @@ SOLVERS = {
     for name, kind in list(globals().items())
     if isinstance(kind, type) and issubclass(kind, Honest)
 }
-PROBLEMS = {"tiny": Tiny()}
+PROBLEMS = {"tiny": Tiny(), "sized": Sized()}
 
 if __name__ == "__main__":
-    serve(SOLVERS[sys.argv[1]], int(sys.argv[2]), int(sys.argv[3]))
+    what, *pipes = sys.argv[1:]
+    if what == "generator":
+        generator.serve(generator.Generator(PROBLEMS, None), *map(int, pipes))
+    else:
+        serve(SOLVERS[what], *map(int, pipes))

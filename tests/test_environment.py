@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from hashlib import sha256
 from itertools import count
 from pathlib import Path
@@ -16,8 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.doctor import advice, noise_floor, render
+from harness.doctor import Level, as_json, examine, render
 from harness.environment import capture, capture_in, digest, source, system_blas
+from harness.noise import NoiseFloor, noise_floor
 
 ROOT = Path(__file__).resolve().parents[1]
 DEBIAN = "/usr/lib/x86_64-linux-gnu"
@@ -41,6 +43,7 @@ def quiet():
             "usable_cores": 8, "cpu_limit": None, "memory_mib": 16000,
             "architecture": "x86_64", "system": "Linux", "kernel": "6.1",
             "libc": "glibc 2.36", "governor": "performance", "turbo": False,
+            "virtual": False, "smt": False,
         },
         "versions": {"python": "3.11.2", "scikit-sparse": "0.4.16"},
         "source": {"commit": "0123456789abcdef", "dirty": False},
@@ -193,8 +196,22 @@ def test_cholmods_blas_is_the_one_outside_the_wheels_of_others(mapped, name):
     assert system_blas(mapped, pools) == name
 
 
+QUIET_NOISE = NoiseFloor(
+    clock_seconds=1e-7, kernel_seconds=1e-3, pairs=1000,
+    ratio=1.002, low=0.99, high=1.01, one_pair=0.05,
+)  # fmt: skip
+
+
+def warnings(environment, noise=QUIET_NOISE):
+    return [c for c in examine(environment, noise) if c.level is Level.WARN]
+
+
 def test_a_quiet_machine_gets_no_advice(quiet):
-    assert advice(quiet) == []
+    checks = examine(quiet, QUIET_NOISE)
+
+    assert {c.level for c in checks} == {Level.OK}
+    assert not any(c.advice for c in checks)
+    assert as_json(quiet, QUIET_NOISE, checks)["fit"] is True
 
 
 @pytest.mark.parametrize(
@@ -203,54 +220,122 @@ def test_a_quiet_machine_gets_no_advice(quiet):
         ("cholmod.blas", "reference BLAS", "sudo apt-get install libopenblas0-pthread"),
         ("threads.pools", [pool(threads=2)], "export OMP_NUM_THREADS=1 OPENBLAS_NUM_"),
         ("machine.governor", "powersave", "cpupower frequency-set -g performance"),
+        ("machine.governor", "performance, powersave", "cpupower frequency-set"),
+        ("machine.turbo", True, "echo 0 | sudo tee"),
+        ("machine.smt", True, "echo off | sudo tee"),
         ("machine.cpu_limit", 0.5, "docker run --cpus=2"),
-        ("now.load", 0.6, "stop them"),
+        ("machine.usable_cores", 1, "2 cores"),
+        ("now.load", 0.6, "Stop other programs"),
         ("now.available_memory_mib", 500, "memory_limit"),
+        ("source.dirty", True, "Commit"),
         ("versions.scikit-sparse", None, "make setup"),
     ],
 )
-def test_each_trouble_gets_one_sentence_with_its_remedy(quiet, path, value, remedy):
-    (sentence,) = advice(changed(quiet, path, value))
-    assert remedy in sentence
-    assert "\n" not in sentence
+def test_each_trouble_says_what_to_change(quiet, path, value, remedy):
+    found = warnings(changed(quiet, path, value))
+
+    assert any(remedy in check.advice for check in found)
+    assert all(check.advice and "\n" not in check.advice for check in found)
+    assert {c.section for c in found} <= {"Machine", "BLAS", "Threads", "Versions"}
 
 
-def test_what_cannot_be_read_is_no_reason_to_complain(quiet):
-    for path in ("machine.governor", "now.available_memory_mib", "machine.turbo"):
-        quiet = changed(quiet, path, None)
-    assert advice(quiet) == []
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"clock_seconds": 1e-3}, "smallest step"),
+        ({"ratio": 1.05, "low": 1.04, "high": 1.06}, "A/A ratio"),
+        ({"one_pair": 0.3}, "noise floor"),
+    ],
+)
+def test_a_clock_that_cannot_be_trusted_is_warned_of(quiet, change, name):
+    (check,) = warnings(quiet, replace(QUIET_NOISE, **change))
+
+    assert check.name == name
 
 
-def test_the_rendered_values_stand_in_one_column_and_the_advice_below(quiet):
-    table, _, below = render(quiet, ["Do this."]).partition("\n\n")
-    rows = [re.match(r"(\S+(?: \S+)*)\s{2,}", line) for line in table.splitlines()]
-    assert len({row.end() for row in rows}) == 1
-    assert below == "- Do this."
-    assert "OpenBLAS 0.3.21 (pthreads)" in table
-    assert digest(quiet) in table
+def test_a_ratio_whose_interval_holds_one_is_no_difference(quiet):
+    wide = replace(QUIET_NOISE, ratio=1.05, low=0.95, high=1.15)
+    assert warnings(quiet, wide) == []
+
+
+def test_what_cannot_be_read_is_unknown_and_no_reason_to_complain(quiet):
+    paths = ("governor", "turbo", "smt")
+    for path in paths:
+        quiet = changed(quiet, f"machine.{path}", None)
+    quiet = changed(quiet, "now.available_memory_mib", None)
+    checks = examine(quiet, QUIET_NOISE)
+    unknown = [c.name for c in checks if c.level is Level.UNKNOWN]
+
+    assert unknown == ["governor", "turbo", "hyper-threads", "memory"]
+    assert warnings(quiet) == []
+
+
+def test_the_blas_of_each_package_is_named_apart(quiet):
+    pools = [
+        pool("libscipy_openblas", "numpy") | {"version": "0.3.31"},
+        pool("libmkl_rt", "scipy") | {"version": "2024.1"},
+        pool("libgomp"),
+        pool(),
+    ]
+    checks = examine(changed(quiet, "threads.pools", pools), QUIET_NOISE)
+    blas = {c.name: c.value for c in checks if c.section == "BLAS"}
+
+    assert blas["of numpy"] == "libscipy_openblas 0.3.31"
+    assert blas["of scipy"] == "libmkl_rt 2024.1"
+    assert blas["of CHOLMOD"].startswith("OpenBLAS 0.3.21 (pthreads), linked by")
+
+
+def test_a_package_without_a_blas_of_its_own_uses_the_systems(quiet):
+    pools = [pool("libgomp"), pool()]
+    checks = examine(changed(quiet, "threads.pools", pools), QUIET_NOISE)
+
+    assert [c.value for c in checks if c.section == "BLAS"][:2] == [
+        "libopenblas 0.3.21"
+    ] * 2
+
+
+def test_the_values_stand_in_one_column_with_the_advice_below(quiet):
+    environment = changed(quiet, "machine.governor", "powersave")
+    lines = str(render(examine(environment, QUIET_NOISE), "0123456789ab")).splitlines()
+    rows = [re.match(r"  (ok|warn) +\S+(?: \S+)* {2,}", line) for line in lines]
+    governor = next(i for i, line in enumerate(lines) if "powersave" in line)
+
+    assert len({row.end() for row in rows if row}) == 1
+    assert lines[governor].split()[0] == "warn"
+    assert "cpupower" in lines[governor + 1]
+    assert lines[-1].startswith("1 thing to change")
+    assert "0123456789ab" in lines[-1]
 
 
 def test_a_perfect_clock_shows_no_noise_between_equal_arms():
     ticks = count()
     noise = noise_floor(500.0, clock=lambda: float(next(ticks)))
-    assert (noise.ratio, noise.half_width) == (1.0, 0.0)
+    assert (noise.ratio, noise.low, noise.high, noise.one_pair) == (1, 1, 1, 0)
     assert (noise.kernel_seconds, noise.clock_seconds) == (1.0, 1.0)
 
 
 def test_a_steady_drift_hits_both_arms_alike():
-    readings = (0.5 * k**2 for k in count())  # every interval 1 longer than the last
-    noise = noise_floor(200.0, clock=lambda: next(readings))
-    assert noise.pairs == 4  # two times ABBA
-    assert noise.ratio == pytest.approx(1.0, rel=1e-12)
+    readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
+    noise = noise_floor(30_000.0, clock=lambda: next(readings))
+    assert noise.one_pair > 0.003  # what pairs in one order would be off by
+    assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of that
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 0.5])
 def test_the_interval_of_an_unsteady_clock_holds_the_true_ratio(amplitude):
     rng = np.random.default_rng(271828)
     readings = (k + amplitude * rng.random() for k in count())
-    noise = noise_floor(1000.0, clock=lambda: next(readings))
-    assert abs(noise.ratio - 1) < 2 * noise.half_width
-    assert 0.01 * amplitude < noise.half_width < amplitude
+    noise = noise_floor(2000.0, clock=lambda: next(readings))
+    assert noise.low < 1 < noise.high
+    assert 0.01 * amplitude < noise.high - noise.low < amplitude
+    assert noise.high - noise.low < noise.one_pair
+
+
+def test_the_comparison_leaves_the_process_where_it_ran():
+    usable = os.sched_getaffinity(0)
+    noise = noise_floor(0.05)
+    assert os.sched_getaffinity(0) == usable
+    assert noise.low <= noise.ratio <= noise.high
 
 
 def read_pins():

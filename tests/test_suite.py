@@ -355,7 +355,8 @@ def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "cases"), [("demo", 12), ("smoke", 3), ("scaling", 12)]
+    ("name", "cases"),
+    [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6), ("crossval", 22)],
 )
 def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
     path = Path(__file__).parents[1] / "suites" / f"{name}.toml"
@@ -365,3 +366,76 @@ def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
     assert suite.text.startswith("# ")
     assert len(suite.cases) == cases
     assert [s.label for s in suite.solvers] == ["smalbe", "osqp", "clarabel", "proxqp"]
+
+
+def shipped(name):
+    path = Path(__file__).parents[1] / "suites" / f"{name}.toml"
+    return load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
+
+
+def test_the_suite_of_the_load_path_is_one_sequence_per_form():
+    path = shipped("path")
+
+    assert path.cases == ()
+    assert [[c.params["step"] for c in s] for s in path.sequences] == [
+        list(range(1, 11))
+    ] * 2
+    assert [{c.form for c in s} for s in path.sequences] == [{"dual"}, {"dual-bounds"}]
+
+
+def test_the_suite_of_accuracies_judges_at_one():
+    sweep = shipped("accuracy")
+
+    assert sweep.accuracy == 1e-6
+    assert len(sweep.tolerances) == 6
+
+
+def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():
+    paper = shipped("paper")
+
+    assert len(paper.cases) == 30
+    assert [(s.label, s.arm) for s in paper.solvers if s.name == "smalbe"] == [
+        ("smalbe", ""), ("smalbe (A/A)", "null"),
+    ]  # fmt: skip
+    assert (paper.precision, paper.max_repeats) == (0.1, 15)
+    kept = with_overrides(paper, problems.PROBLEMS, solvers.SOLVERS, solvers=["smalbe"])
+    assert [s.label for s in kept.solvers] == ["smalbe", "smalbe (A/A)"]
+
+
+def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
+    kept = with_overrides(
+        shipped("path"), problems.PROBLEMS, solvers.SOLVERS, cases=["*/step=3/dual"]
+    )
+
+    assert [[c.form for c in s] for s in kept.sequences] == [["dual"] * 10]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("precision = 2", "precision = 2; expected a number between 0 and 1"),
+        ("precison = 0.1", "unknown key 'precison'.*precision"),
+        ("max_repeats = 0", "max_repeats = 0; expected an integer of at least 1"),
+        ("budget = -1", "budget = -1; expected a positive number"),
+        ("accuracy = 'high'", "accuracy = 'high'; expected a number between 0 and 1"),
+        ("null_arm = 'smalb'", "unknown null_arm 'smalb'.*smalbe"),
+    ],
+)
+def test_a_schedule_that_makes_no_sense_is_refused(tmp_path, line, message):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        f"name = 's'\nsolvers = ['smalbe']\n{line}\n[[problems]]\nfamily = 'obstacle'\n"
+    )
+    with pytest.raises(InputError, match=message):
+        load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
+
+
+@pytest.mark.parametrize("key", ["'dim'", "'m'", "3"])
+def test_a_sequence_along_no_list_is_refused(tmp_path, key):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        "name = 's'\nsolvers = ['smalbe']\n[[problems]]\nfamily = 'obstacle'\n"
+        f"sequence = {key}\nparams = {{ dim = 2, n = [4, 8] }}\n"
+    )
+    with pytest.raises(InputError, match=r"problems\[0\]: sequence = "):
+        load_suite(file, problems.PROBLEMS, solvers.SOLVERS)

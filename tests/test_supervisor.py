@@ -10,7 +10,7 @@ import pytest
 from harness import Verdict, supervisor
 from harness.qpfile import save_qp
 from harness.registry import load_plugin
-from harness.supervisor import LOG_BYTES, WorkerProcess
+from harness.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
 
@@ -224,3 +224,23 @@ def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     os.waitpid(parent, 0)
 
     assert soon(lambda: not running(worker))
+
+
+@pytest.mark.parametrize(
+    ("message", "peak", "expected"),
+    [
+        ("SIGSEGV", 95.0, True),
+        ("SIGSEGV", 50.0, False),
+        ("SIGSEGV", None, False),
+        ("MemoryError: Unable to allocate 8.00 TiB for an array", 1.0, True),
+        ("SIGABRT: terminate called: std::bad_alloc", 1.0, True),
+        ("SIGABRT: memory allocation of 64 bytes failed", 1.0, True),
+        ("ScsWork allocation error", 1.0, True),
+        ("numerical difficulties", 1.0, False),
+        ("step size could not be allocated a sign", 1.0, False),
+    ],
+)
+def test_want_of_memory_is_told_from_the_peak_and_from_the_words(
+    message, peak, expected
+):
+    assert out_of_memory(message, peak, 100.0) is expected

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
-from harness.commands import worker
+from harness.cli import main
 from harness.workbench import Workbench
 
 FAULTS = {
@@ -116,6 +116,30 @@ class Hangs(Exact):
 
 
 @dataclass(frozen=True)
+class Slow(Exact):
+    """Takes a while. Adds a line to $STARTS at every start but those to warm up."""
+
+    seconds: float = 0.4
+
+    def prepare(self, qp, tol):
+        if qp.q.size != 2:
+            with Path(os.environ["STARTS"]).open("a") as starts:
+                starts.write(f"{os.getpid()} {os.sched_getaffinity(0)}\n")
+            time.sleep(self.seconds)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Murders(Exact):
+    """Kills whoever measures it, at depth 4."""
+
+    def prepare(self, qp, tol):
+        if qp.q[0] == -4:
+            os.kill(os.getppid(), signal.SIGKILL)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
 class Lax(Exact):
     """As good as asked for. Not better."""
 
@@ -133,10 +157,12 @@ SOLVERS = {
     "prints": Prints(),
     "dies": Dies(),
     "hangs": Hangs(),
+    "slow": Slow(),
+    "murders": Murders(),
 }
 PROBLEMS = {"well": Well()}
 
 if __name__ == "__main__":
     nothing = dict.fromkeys(("reference", "report", "plot", "vtu", "series", "paper"))
     workbench = Workbench(families=PROBLEMS, solvers=SOLVERS, **nothing)
-    sys.exit(worker(workbench, sys.argv[1:]))
+    sys.exit(main(workbench, sys.argv[1:]))

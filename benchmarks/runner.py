@@ -1,0 +1,135 @@
+"""What the runner itself costs, and what its clock can tell apart.
+
+    .venv/bin/python benchmarks/runner.py overhead [N]   ms per tiny measurement
+    .venv/bin/python benchmarks/runner.py growth [N]     memory, descriptors over N
+    .venv/bin/python benchmarks/runner.py null [TRIALS]  A/A: intervals of a ratio of 1
+
+Overhead is the time from one record to the next, less what the worker spent in the
+solver and what the disk took to sync.
+"""
+
+import os
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from statistics import median, quantiles
+from time import perf_counter
+
+from harness.block import Commands
+from harness.journal import read_journal
+from harness.measure import SAMPLE_SECONDS, memory_mib
+from harness.names import CaseName
+from harness.pairs import paired_ratio
+from harness.registry import SolverSpec, load_plugin, resolve
+from harness.run import run
+from harness.suite import NULL, Suite
+
+PLUGIN = Path(__file__).parents[1] / "tests" / "adversaries.py"
+
+
+class Watch:
+    """A progress that notes when records come, and how large this process is."""
+
+    def __init__(self):
+        self.records, self.at, self.synced, self.sizes = [], [], [], []
+        self.solving = []  # s: one timing more than `inner` where there were several
+        self._fsync, self._waited = os.fsync, 0.0
+        os.fsync = self._timed
+
+    def _timed(self, fd):
+        start = perf_counter()
+        self._fsync(fd)
+        self._waited += perf_counter() - start
+
+    def start(self, total):
+        pass
+
+    def say(self, text):
+        pass
+
+    def warn(self, text):
+        print(text, file=sys.stderr)
+
+    def advance(self, record):
+        self.records.append((record.solver, record.repeat, record.total_seconds))
+        self.solving.append(record.total_seconds * (record.inner + (record.inner > 1)))
+        self.at.append(perf_counter())
+        self.synced.append(self._waited)
+        self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
+
+    def overheads(self):
+        """Seconds between records that were neither the solver's nor the disk's."""
+        found = []
+        for i in range(1, len(self.at)):
+            gap = self.at[i] - self.at[i - 1]
+            found.append(gap - self.solving[i] - (self.synced[i] - self.synced[i - 1]))
+        return found
+
+
+def measure(out, *solvers, repeats):
+    """Run solvers of the plug-in on its tiny QP; returns who watched."""
+    plugin = load_plugin(PLUGIN)
+    specs = [SolverSpec(name=s, label=s) for s in solvers]
+    specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", arm="null")]
+    tiny = plugin.problems["tiny"]
+    suite = Suite(
+        name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,
+        memory_limit=4096.0, solvers=tuple(specs), text="",
+        cases=(CaseName(family="tiny", params=dict(tiny.defaults), form="plain"),),
+    )  # fmt: skip
+    start = [sys.executable, "-P", str(PLUGIN)]
+    watch = Watch()
+    run(
+        suite, families=plugin.problems, out=out, environment={}, digest="here",
+        commands=Commands(
+            solvers={s.label: [*start, s.name] for s in specs},
+            generator=[*start, "generator"],
+        ),
+        resolve=lambda spec: resolve(spec, plugin.solvers), progress=watch,
+    )  # fmt: skip
+    return watch
+
+
+def overhead(n=500):
+    """Print the overhead of tiny measurements."""
+    with tempfile.TemporaryDirectory() as out:
+        watch = measure(Path(out), "honest", repeats=n // 2)
+    low, middle, high = quantiles(watch.overheads()[4:], n=4)
+    print(
+        f"overhead {1e3 * middle:.2f} ms [{1e3 * low:.2f}, {1e3 * high:.2f}] over "
+        f"{n} measurements of {SAMPLE_SECONDS * 1e3:g} ms"
+    )
+
+
+def growth(n=10_000):
+    """Print memory and descriptors of the run early on and at its end."""
+    with tempfile.TemporaryDirectory() as out:
+        watch = measure(Path(out), "honest", repeats=n // 2)
+        lines = len(read_journal(Path(out)))
+    for i in (n // 10, n // 2, len(watch.sizes) - 1):
+        mib, descriptors = watch.sizes[i]
+        print(f"after {i:>6} of {lines}: {mib:.1f} MiB, {descriptors} descriptors")
+
+
+def null(trials=40, blocks=10):
+    """Print how often the 95 % interval of A/A contains 1, and how wide it is."""
+    hits, widths = 0, []
+    for _ in range(trials):
+        with tempfile.TemporaryDirectory() as out:
+            watch = measure(Path(out), "products", repeats=blocks)
+        times = {}
+        for solver, repeat, seconds in watch.records:
+            times.setdefault(solver, {})[repeat] = seconds
+        ratio = paired_ratio(*times.values())
+        hits += ratio.low <= 1 <= ratio.high
+        widths.append(ratio.half_width)
+    print(
+        f"{hits} of {trials} intervals contain 1; "
+        f"median half-width {median(widths):.1%}"
+    )
+
+
+if __name__ == "__main__":
+    what, *numbers = sys.argv[1:] or ["overhead"]
+    {"overhead": overhead, "growth": growth, "null": null}[what](*map(int, numbers))

@@ -1,0 +1,104 @@
+"""The process that builds cases: the code of families, away from what counts.
+
+It answers the requests of `harness.serving` with these of its own:
+
+* ``{"build": NAME, "qp": PATH, "keep": N}``: it builds the case, writes its QP to PATH
+  and says ``{"event": "done", "meta": {…}}``, with the digest of its numbers
+* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
+  point means: ``{"event": "done", "quantities": {…}, "notes": […]}``, and the deformed
+  state in ``fields`` where the case has one
+
+or to both ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME is
+``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to stay
+in memory. What leads back from a point to the bodies is code, which no file can hold: a
+case that is on file is built again when a point of it comes.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from harness.build import build, unbuilt
+from harness.judge import note_of, plain, quantities_of
+from harness.names import CaseName, canonical
+from harness.plugin import Case, Family, Reference
+from harness.qpfile import save_qp
+from harness.serving import answer_requests
+from harness.solution import Status
+from harness.store import field_arrays, read_point, write_arrays
+
+
+class Generator:
+    """Builds cases of `families`, with the injected `reference` solve."""
+
+    def __init__(self, families: Mapping[str, Family], reference: Reference) -> None:
+        self._families = families
+        self._reference = reference
+        self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
+        self._build_seconds = 0.0  # of the last case that was built
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer one request, whatever the family's code does."""
+        name = CaseName(**(request.get("build") or request["describe"]))
+        try:
+            case = self._case(name, request["keep"])
+        except (Exception, SystemExit) as e:  # the family's code
+            text = unbuilt(canonical(name, self._families[name.family]), e)
+            return {"unbuilt": text, "trace": traceback.format_exc()}
+        if "build" in request:
+            return self._written(case, name, Path(request["qp"]))
+        return _described(case, request)
+
+    def _case(self, name: CaseName, keep: int) -> Case:
+        family = self._families[name.family]
+        key = canonical(name, family)
+        case = self._cases.pop(key, None)
+        while len(self._cases) >= keep:  # before building: two may be too large
+            del self._cases[next(iter(self._cases))]
+        if case is None:
+            start = perf_counter()
+            case = build(name, family, self._reference)
+            self._build_seconds = perf_counter() - start
+        self._cases[key] = case
+        return case
+
+    def _written(self, case: Case, name: CaseName, path: Path) -> dict[str, Any]:
+        meta = {
+            "name": canonical(name, self._families[name.family]),
+            "scale": case.scale,
+            "constant": case.constant,
+        }
+        digest = save_qp(path, case.qp, plain(meta), recipe=True)
+        seconds = {
+            "build_seconds": self._build_seconds,
+            "dualise_seconds": case.dualise_seconds,
+        }
+        return {"meta": {**meta, **seconds, "qp": digest}}
+
+
+def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
+    """Answer requests until there are no more."""
+
+    def handle(request: dict[str, Any], start: Callable[[], None]) -> dict[str, Any]:
+        start()
+        return generator.answer(request)
+
+    answer_requests(handle, lambda: None, request_fd, reply_fd)
+
+
+def _described(case: Case, request: dict[str, Any]) -> dict[str, Any]:
+    s = read_point(Path(request["point"]), Status.SOLVED)
+    start = perf_counter()
+    quantities, note = quantities_of(case, s)
+    seconds = perf_counter() - start
+    notes = [note] if note else []
+    if request["fields"] is not None and case.fields is not None:
+        try:
+            write_arrays(Path(request["fields"]), field_arrays(case.fields(s)))
+        except Exception as e:  # the family's code; its fault must not lose the record
+            notes.append(note_of("fields", e))
+    return {"quantities": quantities, "notes": notes, "seconds": seconds}

@@ -1,0 +1,200 @@
+"""One machine of a cluster: what a Dask worker does for a run.
+
+A `Station` stays open in each Dask worker for as long as the run lasts, with its solver
+processes on a CPU that no other station of that machine has. It ends with the run.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from threading import Lock
+from typing import Any, cast
+
+from distributed import Worker, get_worker
+from distributed.diagnostics.plugin import WorkerPlugin
+
+from harness.block import Block, Commands, Result, Unbuilt
+from harness.environment import capture_in, digest
+from harness.errors import InputError
+from harness.station import Station
+from harness.supervisor import ONE_THREAD
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Done:
+    """What came of a block, and where."""
+
+    results: list[Result | Unbuilt]
+    node: str  #: host name
+    digest: str  #: of the environment
+    environment: dict[str, Any]
+
+
+class Node(WorkerPlugin):
+    """Opens a station in every Dask worker, those that join later included.
+
+    commands : of the parent; its Python is replaced by that of the node
+    plugins : files, which must be there under the same paths
+    sharing : Dask workers on one machine; more than one disturb each other, which
+        makes another environment
+    """
+
+    def __init__(
+        self, commands: Commands, plugins: Sequence[Path], sharing: int
+    ) -> None:
+        self._commands = commands
+        self._plugins = plugins
+        self._sharing = sharing
+        self._python = sys.executable
+        self._open: _Open | None = None
+        self._ended = False
+
+    def setup(self, worker: Worker) -> None:
+        """Open nothing yet: a block does, in the thread that it runs in.
+
+        The kernel kills solver processes with the thread that started them.
+        """
+        self._busy = Lock()
+
+    def teardown(self, worker: Worker | None = None) -> None:
+        """End the processes of the station, at the latest when a measurement is made.
+
+        Dask cannot stop a block that is being carried out; its thread comes here last.
+        """
+        self._ended = True
+        if not self._busy.acquire(blocking=False):
+            return
+        if self._open is not None:
+            self._open.stack.close()
+            self._open = None
+        self._busy.release()
+
+    def carry_out(self, block: Block) -> Done:
+        """Measure a block, or what can be measured of it before the run ends.
+
+        Raises
+        ------
+        InputError
+            When this machine is not fit to measure on.
+
+        """
+        try:
+            with self._busy:
+                return self._carried_out(block)
+        finally:
+            if self._ended:
+                self.teardown()
+
+    def _carried_out(self, block: Block) -> Done:
+        opened = self._open = self._open or self._opened()
+        os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
+        here = {"environment": opened.digest, "node": platform.node()}
+        turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
+        results = []
+        for result in opened.station.carry_out(replace(block, turns=turns)):
+            results.append(result)
+            if self._ended:
+                break
+        return Done(
+            results=results,
+            node=platform.node(),
+            digest=opened.digest,
+            environment=opened.environment,
+        )
+
+    def _opened(self) -> _Open:
+        for path in self._plugins:
+            if not path.is_file():
+                raise InputError(
+                    f"{platform.node()}: no plug-in {path}; "
+                    "expected the same files under the same paths on every node"
+                )
+        environment = capture_in(ONE_THREAD, self._plugins)
+        if self._sharing > 1:
+            environment["machine"]["shared_by_workers"] = self._sharing
+        with ExitStack() as stack:
+            cpu = _own_cpu(stack)
+            folder = TemporaryDirectory(prefix="mortarbench-")
+            scratch = Path(stack.enter_context(folder))
+            station = Station(self._here(self._commands), scratch, scratch / "cases")
+            stack.enter_context(station)
+            return _Open(
+                station=station,
+                cpu=cpu,
+                environment=environment,
+                digest=digest(environment),
+                stack=stack.pop_all(),
+            )
+
+    def _here(self, commands: Commands) -> Commands:
+        """Start processes with the Python that runs the Dask worker."""
+
+        def here(command: list[str]) -> list[str]:
+            return [sys.executable if w == self._python else w for w in command]
+
+        return Commands(
+            solvers={label: here(c) for label, c in commands.solvers.items()},
+            generator=here(commands.generator),
+        )
+
+
+def carry_out(name: str, block: Block) -> Done:
+    """Have the node plug-in of that name measure a block; runs in a Dask worker.
+
+    Raises
+    ------
+    InputError
+        When this Dask worker is not fit to measure on.
+
+    """
+    worker = get_worker()
+    if worker.state.nthreads != 1:
+        raise InputError(
+            f"the Dask worker {worker.name} on {platform.node()} takes "
+            f"{worker.state.nthreads} blocks at a time, so that they would disturb "
+            "each other; start it with --nthreads 1"
+        )
+    return cast(Node, worker.plugins[name]).carry_out(block)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Open:
+    station: Station
+    cpu: int
+    environment: dict[str, Any]
+    digest: str
+    stack: ExitStack
+
+
+def _own_cpu(stack: ExitStack) -> int:
+    """Take a CPU that no other station on this machine has; the kernel gives it back.
+
+    Raises
+    ------
+    InputError
+        When there is none left.
+
+    """
+    usable = sorted(os.sched_getaffinity(os.getpid()), reverse=True)
+    for cpu in usable:
+        lock = Path(gettempdir()) / f"mortarbench-{os.getuid()}-cpu{cpu}.lock"
+        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(fd)
+            continue
+        stack.callback(os.close, fd)
+        return cpu
+    raise InputError(
+        f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
+        "measure there already; start fewer"
+    )

@@ -1,0 +1,202 @@
+"""Where blocks are carried out: the processes of a run on one machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from math import inf
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from harness.block import Block, Commands, Result, Unbuilt
+from harness.cases import Entry, entry
+from harness.judge import has_point, noted
+from harness.measure import SAMPLE_SECONDS
+from harness.names import CaseName
+from harness.qp import QP
+from harness.qpfile import load_qp
+from harness.record import Record, Verdict
+from harness.remote import measured
+from harness.solution import Solution
+from harness.store import point_arrays, read_arrays
+from harness.supervisor import WorkerProcess
+
+
+class Station:
+    """Carries out blocks one after the other, with one worker process per solver.
+
+    scratch : for files that last as long as the station, of this station alone
+    cases : folder of built cases, see `harness.cases`; several stations may share it
+    """
+
+    def __init__(self, commands: Commands, scratch: Path, cases: Path) -> None:
+        self._commands = commands
+        self._scratch = scratch
+        self._cases = cases
+        self._generator = WorkerProcess(commands.generator, scratch / "generator.log")
+        self._workers: dict[str, WorkerProcess] = {}
+        self._loaded: dict[str, QP] = {}  # by digest, those of the last block
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for process in (*self._workers.values(), self._generator):
+            process.close()
+
+    def carry_out(self, block: Block) -> Iterator[Result | Unbuilt]:
+        """Measure a block; each result comes as soon as it is there."""
+        entries = []
+        for name in block.cases:
+            try:
+                entries.append(self._entry(name, block))
+            except _UnbuiltError as e:
+                yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
+                return
+        self._loaded = {e.digest: self._qp(e) for e in entries}
+        for turn in block.turns:
+            yield from self._turn(block, turn, entries)
+
+    def _turn(
+        self, block: Block, turn: tuple[Record, ...], entries: list[Entry]
+    ) -> Iterator[Result]:
+        worker = self._worker(turn[0].solver)
+        for step, (name, record, at) in enumerate(
+            zip(block.cases, turn, entries, strict=True)
+        ):
+            request = {
+                "qp": str(at.qp),
+                "digest": at.digest,
+                "out": str(self._point),
+                "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
+                **({"step": step} if block.is_sequence else {}),
+            }
+            record, solution = measured(
+                worker,
+                self._qp(at),
+                record.but(
+                    qp=at.meta.get("qp"),
+                    build_seconds=at.meta.get("build_seconds"),
+                    dualise_seconds=at.meta.get("dualise_seconds"),
+                ),
+                request,
+                time_limit=block.time_limit,
+                memory_limit=block.memory_limit,
+            )
+            yield self._described(block, name, record, solution)
+            stopped = record.status is not Verdict.DECLINED and (
+                solution is None or not has_point(solution)
+            )
+            if block.is_sequence and stopped:  # what it carried is lost
+                yield from _broken(turn[step + 1 :], record)
+                return
+
+    def _described(
+        self, block: Block, name: CaseName, record: Record, solution: Solution | None
+    ) -> Result:
+        """Add what the point means, which the generator knows."""
+        if solution is None or not has_point(solution):
+            return Result(record=record)
+        first = record.status is Verdict.VERIFIED and record.repeat == 0
+        fields = self._scratch / "fields.npz"
+        fields.unlink(missing_ok=True)
+        request = {
+            "describe": _plain(name),
+            "point": str(self._point),
+            "fields": str(fields) if first else None,
+        }
+        notes: list[str]
+        try:
+            answer = self._ask_generator(request, block)
+            notes = answer["notes"]
+            record = record.but(
+                quantities=answer["quantities"], recover_seconds=answer["seconds"]
+            )
+        except _UnbuiltError as e:
+            notes = [f"no quantities: {e.reason}"]
+        stored = read_arrays(fields, ()) if fields.exists() else None
+        return Result(
+            record=noted(record, *notes), point=point_arrays(solution), fields=stored
+        )
+
+    def _entry(self, name: CaseName, block: Block) -> Entry:
+        def make(path: Path) -> Mapping[str, Any]:
+            request = {"build": _plain(name), "qp": str(path)}
+            meta: Mapping[str, Any] = self._ask_generator(request, block)["meta"]
+            return meta
+
+        return entry(self._cases, name, block.turns[0][0].environment, make)
+
+    def _ask_generator(
+        self, request: Mapping[str, Any], block: Block
+    ) -> Mapping[str, Any]:
+        for _ in range(2):  # it may have died of something else
+            reply = self._generator.ask(
+                {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
+            )
+            if reply.answer is not None:
+                break
+        else:
+            case = block.turns[0][0].case
+            raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
+        if "unbuilt" in reply.answer:
+            raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
+        return reply.answer
+
+    def _worker(self, label: str) -> WorkerProcess:
+        if label not in self._workers:
+            log = self._scratch / f"worker-{len(self._workers)}.log"
+            self._workers[label] = WorkerProcess(self._commands.solvers[label], log)
+        return self._workers[label]
+
+    def _qp(self, at: Entry) -> QP:
+        if at.digest not in self._loaded:
+            self._loaded[at.digest] = load_qp(at.qp)[0]
+        return self._loaded[at.digest]
+
+    @property
+    def _point(self) -> Path:
+        return self._scratch / "point.npz"
+
+
+@contextmanager
+def one_by_one(commands: Commands, scratch: Path, cases: Path) -> Iterator[OneByOne]:
+    """Open the engine that carries out one block at a time on this machine."""
+    with Station(commands, scratch, cases) as station:
+        yield OneByOne(station)
+
+
+class OneByOne:
+    """The engine of a run on one machine: a block is made when the last one is done."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Result | Unbuilt]:
+        """Carry out all of `blocks`."""
+        for block in blocks:
+            yield from self._station.carry_out(block)
+
+
+def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
+    """Give the steps that a sequence did not come to, because of how one ended."""
+    for record in rest:
+        reason = f"the sequence ended at {end.case}: {end.message}"
+        yield Result(record=record.but(status=end.status, message=reason))
+
+
+class _UnbuiltError(Exception):
+    def __init__(self, reason: str, trace: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.trace = trace
+
+
+def _plain(name: CaseName) -> dict[str, Any]:
+    return {"family": name.family, "params": dict(name.params), "form": name.form}

@@ -1,0 +1,84 @@
+"""Built cases on disk: found, shared, damaged."""
+
+import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from harness.cases import entry
+from harness.names import CaseName
+
+
+def name(**params):
+    return CaseName(family="f", params=params, form="p")
+
+
+@pytest.fixture
+def get(tmp_path):
+    """Ask for an entry; ``get.made`` lists what had to be built."""
+
+    def get(case, *, environment="here", content=b"content", slowly=0.0):
+        def make(path):
+            get.made.append(case)
+            time.sleep(slowly)
+            path.write_bytes(content)
+            return {"scale": 2.0}
+
+        return entry(tmp_path / "cases", case, environment, make)
+
+    get.made = []
+    return get
+
+
+def test_a_case_is_built_once_and_found_again(get):
+    first, second = get(name(n=1)), get(name(n=1))
+
+    assert first == second
+    assert first.qp.read_bytes() == b"content"
+    assert first.meta == {"scale": 2.0}
+    assert len(get.made) == 1
+
+
+def test_other_params_and_other_code_are_other_cases_of_maybe_equal_content(get):
+    entries = [get(name(n=1)), get(name(n=2)), get(name(n=1), environment="there")]
+
+    assert len(get.made) == 3
+    assert len({e.qp for e in entries}) == 1
+
+
+def test_of_many_that_ask_at_once_one_builds(get):
+    with ThreadPoolExecutor(8) as pool:  # locks are between open files, not processes
+        entries = list(pool.map(lambda _: get(name(n=1), slowly=0.1), range(8)))
+
+    assert len({e.digest for e in entries}) == len(get.made) == 1
+
+
+@pytest.mark.parametrize("damage", ["content", "index", "truncated index", "missing"])
+def test_a_damaged_entry_is_built_again(get, damage):
+    path = get(name(n=1)).qp
+    (index,) = path.parent.glob("*.json")
+    match damage:
+        case "content":
+            path.write_bytes(b"Content")
+        case "index":
+            index.write_text(json.dumps({"digest": 3}))
+        case "truncated index":
+            index.write_text(index.read_text()[:-9])
+        case _:
+            path.unlink()
+
+    assert get(name(n=1)).qp.read_bytes() == b"content"
+    assert len(get.made) == 2
+
+
+def test_a_build_that_fails_leaves_no_entry(get, tmp_path):
+    def fails(path):
+        path.write_bytes(b"half")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        entry(tmp_path / "cases", name(n=1), "here", fails)
+
+    assert {p.suffix for p in (tmp_path / "cases").iterdir()} == {".lock"}
+    assert get(name(n=1)).qp.read_bytes() == b"content"

@@ -1,0 +1,116 @@
+"""Arrays that are mapped, operators that travel as recipes."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness import QP, Status, no_rows
+from harness.measure import measure
+from harness.npz import ALIGNMENT, mapped, write_mappable
+from harness.qpfile import load_qp, save_qp
+from harness.recipe import Recipe
+
+ARRAYS = {
+    "vector": np.arange(5.0),
+    "empty": np.zeros((0, 3)),
+    "scalar": np.array(3.5),
+    "text": np.array("λ ≥ 0"),
+    "matrix": np.arange(12).reshape(3, 4).T,
+    "a name that is λonger": np.ones(7, dtype=np.int32),
+}
+
+
+def test_numpy_reads_what_is_written_and_mapping_gives_the_same(tmp_path):
+    file = tmp_path / "a.npz"
+    write_mappable(file, ARRAYS)
+    views = mapped(file)
+    with np.load(file) as stored:
+        read = {name: stored[name] for name in stored.files}
+
+    assert list(views) == list(read) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        for got in (views[name], read[name]):
+            np.testing.assert_array_equal(got, array)
+            assert (got.dtype, got.shape) == (array.dtype, array.shape)
+    assert views["vector"].ctypes.data % ALIGNMENT == 0
+
+
+def test_writing_to_a_mapped_array_changes_neither_file_nor_other_mappings(tmp_path):
+    file = tmp_path / "a.npz"
+    write_mappable(file, ARRAYS)
+    before = file.read_bytes()
+    views = mapped(file)
+    views["vector"][:] = 99.0
+
+    assert file.read_bytes() == before
+    np.testing.assert_array_equal(mapped(file)["vector"], ARRAYS["vector"])
+
+
+def test_a_file_that_cannot_be_mapped_is_refused(tmp_path):
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, **ARRAYS)
+
+    with pytest.raises(ValueError, match="cannot be mapped"):
+        mapped(file)
+
+
+BUILT = []
+
+
+def diagonal(arrays):
+    """Make the product with the diagonal matrix of an array."""
+    BUILT.append(1)
+    d = arrays["d"]
+    return lambda x: d[:, None] * x if x.ndim == 2 else d * x
+
+
+@pytest.fixture
+def operator_qp(monkeypatch):
+    """A QP whose P is the operator diag(1, 2); BUILT counts how often it was made."""
+    monkeypatch.setattr("harness.recipe.import_module", lambda _: OWN)
+    BUILT.clear()
+    P = Recipe(2, "here:diagonal", {"d": np.array([1.0, 2.0])})
+    return QP(
+        P=P, q=np.array([-1.0, -2.0]), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
+        h=np.zeros(0), lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
+    )  # fmt: skip
+
+
+class OWN:
+    diagonal = staticmethod(diagonal)
+
+
+def test_an_operator_travels_as_its_recipe_and_is_the_same_operator(
+    operator_qp, tmp_path
+):
+    save_qp(tmp_path / "qp.npz", operator_qp, {}, recipe=True)
+    assert BUILT == []  # nothing is multiplied out to write it
+    qp, _ = load_qp(tmp_path / "qp.npz")
+    assert BUILT == []  # nor to read it
+
+    np.testing.assert_array_equal(qp.P @ np.eye(2), np.diag([1.0, 2.0]))
+    assert not qp.is_explicit
+
+
+def test_for_other_peoples_solvers_it_is_multiplied_out(operator_qp, tmp_path):
+    save_qp(tmp_path / "qp.npz", operator_qp, {})
+    qp, _ = load_qp(tmp_path / "qp.npz")
+
+    np.testing.assert_array_equal(csr_array(qp.P).toarray(), np.diag([1.0, 2.0]))
+
+
+def test_putting_an_operator_together_is_charged_to_every_prepare(operator_qp):
+    built_before_prepare = []
+
+    class Looks:
+        def declines(self, qp):
+            return None
+
+        def prepare(self, qp, tol):
+            built_before_prepare.append(len(BUILT))
+            return lambda: None
+
+    for _ in range(2):
+        assert measure(Looks(), operator_qp, 1e-6).solution.status is Status.FAILED
+
+    assert built_before_prepare == [1, 2]

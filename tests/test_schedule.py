@@ -1,0 +1,107 @@
+"""When there are enough blocks, and how sure one is of a ratio of times."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from harness import Verdict
+from harness.names import CaseName
+from harness.pairs import paired_ratio, widest
+from harness.registry import SolverSpec
+from harness.schedule import Schedule
+from harness.suite import Suite
+
+
+@dataclass(frozen=True)
+class Family:
+    name: str = "f"
+    forms: tuple = ("p",)
+
+    @property
+    def defaults(self):
+        return {"n": 1}
+
+
+class Quiet:
+    def __init__(self):
+        self.skipped = 0
+
+    def advance(self, record):
+        self.skipped += 1
+
+    def say(self, text):
+        pass
+
+
+def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
+    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+    suite = Suite(
+        name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
+        solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
+        cases=(CaseName(family="f", params={"n": 1}, form="p"),), text="",
+    )  # fmt: skip
+    progress, rng = Quiet(), np.random.default_rng(seed)
+    schedule = Schedule(
+        suite=replace(suite, **changes), families={"f": Family()},
+        options={"a": {}, "b": {}}, environment="e", progress=progress,
+    )  # fmt: skip
+    made = []
+    for block in schedule.blocks():
+        for (record,) in block.turns:
+            seconds = {"a": 1.0, "b": 2.0}[record.solver]
+            seconds *= float(np.exp(noise * rng.standard_normal()))
+            record = record.but(status=verdict, total_seconds=seconds)
+            schedule.note(record)
+            made.append(record)
+    assert len(made) + progress.skipped == schedule.cells
+    return made
+
+
+def test_without_a_precision_there_are_the_repeats_of_the_suite():
+    assert len(carried_out(0.5)) == 2 * 3
+
+
+def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
+    assert len(carried_out(1e-4, precision=0.05)) == 2 * 3
+
+
+def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked():
+    made = carried_out(0.1, precision=0.05, max_repeats=200)
+    times = {
+        s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in "ab"
+    }
+    before = {s: {k: v for k, v in t.items() if k < max(t)} for s, t in times.items()}
+
+    assert 2 * 3 < len(made) < 2 * 200
+    assert widest(times) <= 0.05 < widest(before)
+
+
+def test_blocks_end_at_the_most_repeats_and_at_the_budget():
+    assert len(carried_out(2.0, precision=0.01, max_repeats=7)) == 2 * 7
+    spent = carried_out(0.1, precision=0.001, max_repeats=99, budget=30.0)
+
+    assert 30 <= sum(r.total_seconds for r in spent) < 36
+
+
+def test_solvers_that_fail_are_no_reason_to_go_on():
+    assert len(carried_out(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
+
+
+def test_the_paired_interval_covers_as_often_as_it_says():
+    rng = np.random.default_rng(314159)
+    hits = 0
+    for _ in range(2000):
+        drift = np.exp(rng.standard_normal(8))  # of the machine: whole blocks
+        a, b = (drift * np.exp(0.1 * rng.standard_normal(8)) * s for s in (3.0, 1.0))
+        r = paired_ratio(dict(enumerate(a)), dict(enumerate(b)))
+        hits += r.low <= 3.0 <= r.high
+
+    assert hits / 2000 == pytest.approx(0.95, abs=0.015)
+
+
+def test_only_blocks_that_both_were_in_are_compared():
+    r = paired_ratio({0: 2.0, 1: 8.0, 5: 1e9}, {0: 1.0, 1: 4.0, 7: 1e-9})
+
+    assert (r.value, r.pairs) == (pytest.approx(2.0), 2)
+    assert paired_ratio({0: 1.0}, {0: 1.0}) is None
