@@ -114,6 +114,9 @@ def _plain(s: Solution) -> Solution:
         iterations=None if s.iterations is None else int(s.iterations),
         counts={str(name): int(count) for name, count in s.counts.items()},
         message=" ".join(str(s.message).split()),
+        reported={
+            str(k): v if isinstance(v, str) else float(v) for k, v in s.reported.items()
+        },
     )
 
 

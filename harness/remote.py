@@ -62,6 +62,7 @@ def measured(
         read_point(point, Status(answer["claimed"])),
         iterations=answer["iterations"],
         counts=answer["counts"],
+        reported={k: v for k, v in answer["reported"].items() if v is not None},
         message=answer["message"],
     )
     seconds = {name: answer[name] for name in _MEASURED}

@@ -30,6 +30,7 @@ from harness.measure import Measurement, measure
 from harness.plugin import Solver
 from harness.qp import QP, no_rows
 from harness.qpfile import load_qp
+from harness.record import finite
 from harness.store import write_point
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
@@ -63,6 +64,7 @@ def _answer(solver: Solver, request: dict[str, Any], replies: TextIO) -> None:
         message=s.message,
         iterations=s.iterations,
         counts=s.counts,
+        reported=finite(dict(s.reported)),
         prepare_seconds=measurement.prepare_seconds,
         solve_seconds=measurement.solve_seconds,
         total_seconds=measurement.total_seconds,

@@ -8,18 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
-import numpy as np
-from scipy.sparse import eye_array, triu, vstack
+from scipy.sparse import triu
 
-from harness import QP, Solution, Status
+from harness import QP, About, Solution, Status
 from solvers.conversion import (
     NEGLIGIBLE,
     csc,
+    from_two_sided,
     needs_matrices,
-    on_present_bounds,
     positive,
+    to_two_sided,
+    two_sided,
 )
+from solvers.sequence import Session, in_sequence
 
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
@@ -42,7 +45,21 @@ class OSQP:
     """
 
     max_iter: int = 1_000_000
-    polishing: bool = False
+    polishing: bool = False  #: solve once more with the active rows as equalities
+
+    about: ClassVar[About] = About(
+        title="OSQP",
+        method="operator splitting (ADMM)",
+        licence="Apache-2.0",
+        package="osqp",
+        linear_solver="QDLDL (sparse LDLᵀ), one factorisation per change of ρ",
+        phases="preparing scales and factorises; solving iterates, and polishes",
+        sequence="`update` of vectors keeps the factor; starts from the last point",
+        limits=(
+            "Polishing may make the residuals worse: it is kept only if OSQP's own "
+            "residuals improve.",
+        ),
+    )
 
     def __post_init__(self) -> None:
         positive(max_iter=self.max_iter)
@@ -51,17 +68,18 @@ class OSQP:
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
         import osqp
 
-        m, p, n = qp.b.size, qp.h.size, qp.q.size
-        boxed = np.isfinite(qp.lb) | np.isfinite(qp.ub)
-        rows = vstack([csc(qp.A), csc(qp.G), eye_array(n, format="csr")[boxed]])
+        rows, low, high = two_sided(qp)
         solver = osqp.OSQP(algebra="builtin")
         solver.setup(
-            csc(triu(csc(qp.P))), qp.q,
-            csc(rows),
-            np.concatenate([qp.b, np.full(p, -np.inf), qp.lb[boxed]]),
-            np.concatenate([qp.b, qp.h, qp.ub[boxed]]),
+            csc(triu(csc(qp.P))), qp.q, rows, low, high,
             eps_abs=NEGLIGIBLE, eps_rel=tol, check_dualgap=True,
             max_iter=self.max_iter, polishing=self.polishing, verbose=False,
         )  # fmt: skip
@@ -72,13 +90,23 @@ class OSQP:
             status = CLAIMS.get(name, Status.FAILED)
             if status is Status.INFEASIBLE:
                 return Solution.without_point(qp, status, r.info.status)
-            z_box = np.zeros(n)
-            z_box[boxed] = r.y[m + p :]
             return Solution(
-                status=status,
-                x=r.x, y=r.y[:m], z=r.y[m : m + p], z_box=on_present_bounds(qp, z_box),
-                iterations=r.info.iter, counts={"rho_updates": r.info.rho_updates},
-                message=r.info.status,
+                status=status, x=r.x, **from_two_sided(qp, r.y),
+                iterations=r.info.iter, message=r.info.status,
+                counts={"rho_updates": r.info.rho_updates},
+                reported={
+                    "linear_solver": "qdldl",
+                    "setup_seconds": r.info.setup_time,
+                    "solve_seconds": r.info.solve_time,
+                    "polish_seconds": r.info.polish_time,
+                },
             )  # fmt: skip
 
-        return solve
+        def update(new: QP) -> None:
+            _, low, high = two_sided(new)
+            solver.update(q=new.q, l=low, u=high)
+
+        def start(s: Solution) -> None:
+            solver.warm_start(x=s.x, y=to_two_sided(qp, s))
+
+        return Session(solve, update, start)
