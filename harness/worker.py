@@ -8,6 +8,8 @@ It answers one line of JSON with one or more on another pipe:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: it loads the QP, says
   ``{"event": "start"}``, measures, writes the point to `out` and says
   ``{"event": "done", "claimed": …, "message": …, …}``
+* ``{"check": NAME}``: it runs one of `harness.conformance.CHECKS`, and says "start" and
+  ``{"event": "done", "grade": …, "message": …}``
 
 and ends when its requests do. Every measurement loads its QP afresh, so that nothing
 that a solver did to the last one is left.
@@ -26,6 +28,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from harness.conformance import run_check
 from harness.measure import Measurement, measure
 from harness.plugin import Solver
 from harness.qp import QP, no_rows
@@ -43,7 +46,9 @@ def serve(solver: Solver, request_fd: int, reply_fd: int) -> None:
         _send(replies, event="ready")
         for line in requests:
             request = json.loads(line)
-            if "warm_up" in request:
+            if "check" in request:
+                _examine(solver, request["check"], replies)
+            elif "warm_up" in request:
                 _warm_up(solver)
                 _send(replies, event="warm")
             else:
@@ -70,6 +75,12 @@ def _answer(solver: Solver, request: dict[str, Any], replies: TextIO) -> None:
         total_seconds=measurement.total_seconds,
         peak_mib=measurement.peak_mib,
     )
+
+
+def _examine(solver: Solver, check: str, replies: TextIO) -> None:
+    _send(replies, event="start")
+    result = run_check(check, solver)
+    _send(replies, event="done", **result._asdict())
 
 
 def _measured_here(solver: Solver, qp: QP, tol: float) -> Measurement:

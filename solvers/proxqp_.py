@@ -130,7 +130,9 @@ class ProxQP:
             settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT
             solver.update(g=new.q, b=new.b, **form.sides(new))
 
-        return Session(solve, update, warm.append)
+        # the dense backend takes no multipliers of bounds to start from
+        no_start = isinstance(form, _Dense) and form.boxed
+        return Session(solve, update, None if no_start else warm.append)
 
 
 class _Dense:
