@@ -8,8 +8,28 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+
+from solvers.conversion import OBJECTIVE_SIZE
+
+
+@dataclass(frozen=True)
+class Call:
+    """How one backend of a library of solvers is called for a tolerance."""
+
+    tolerances: tuple[str, ...] = ()  #: keywords that get max(tighter·tol, floor)
+    fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords
+    size: float = OBJECTIVE_SIZE  #: ‖q‖∞ that the objective is multiplied to
+    tighter: float = 1.0
+    floor: float = 0.0
+
+    def options(self, tol: float) -> dict[str, Any]:
+        """All keywords with their values."""
+        value = max(self.tighter * tol, self.floor)
+        return {**dict.fromkeys(self.tolerances, value), **self.fixed}
 
 
 def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:

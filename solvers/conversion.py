@@ -11,6 +11,7 @@ from scipy.sparse import csc_matrix, eye_array, vstack
 from harness import QP, Matrix, Solution, Vector, too_large
 
 NEGLIGIBLE = 1e-14  #: an absolute tolerance where a solver's test adds it to a relative
+DIVERGED = 1e12  #: an ‖x‖∞ beyond which relative residuals mean nothing
 OBJECTIVE_SIZE = 1e4  #: ‖q‖∞ as handed to solvers that compare with max(1, objective)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from harness import QP, About, Solution, Status
 from solvers.conversion import (
+    DIVERGED,
     NEGLIGIBLE,
     csc,
     from_one_sided,
@@ -28,7 +29,6 @@ CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
     "QOCO_MAX_ITER": Status.ITERATION_LIMIT,
 }  #: anything else (QOCO_SOLVED_INACCURATE, …) is FAILED
-DIVERGED = 1e12  #: an ‖x‖∞ beyond which relative residuals mean nothing
 
 
 @dataclass(frozen=True)
