@@ -122,7 +122,9 @@ class QPSolvers:
                 try:
                     found = qpsolvers.solve_problem(problem, self.backend, **options)
                 except qpsolvers.exceptions.QPError as e:
-                    return Solution.without_point(qp, Status.FAILED, str(e))
+                    definite = "not positive definite" in str(e)
+                    status = Status.DECLINED if definite else Status.FAILED
+                    return Solution.without_point(qp, status, str(e))
             return _solution(qp, found, scale)
 
         return solve
