@@ -19,10 +19,19 @@ from scipy.sparse.linalg import aslinearoperator
 
 from harness.kkt import VERIFIED_FACTOR, kkt_residuals
 from harness.measure import measure
-from harness.planted import SHAPES, infeasible, one_of_each, planted, unbounded
+from harness.planted import (
+    SHAPES,
+    infeasible,
+    membrane,
+    one_of_each,
+    planted,
+    unbounded,
+)
 from harness.plugin import Solver
 from harness.qp import QP, Vector
 from harness.solution import Solution, Status
+
+ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
 
 
 class Grade(StrEnum):
@@ -124,8 +133,7 @@ def _repeats_are_cold_and_alike(solver: Solver) -> None:
     for s in others:
         if s.iterations != first.iterations:
             raise BrokenError(f"iterations: {first.iterations}, then {s.iterations}")
-        if not np.array_equal(s.x, first.x):
-            raise BrokenError("the same QP gave another x the second time")
+        _near("x of a repeat", s.x, first.x, ROUNDING)
 
 
 def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
@@ -161,8 +169,8 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Catch an optimum claimed at the start, as by HiGHS from 324 variables on."""
-    _solved(solver, planted("bounds", n=400)[0], 1e-6, VERIFIED_FACTOR)
+    """Catch an optimum claimed at the start, as HiGHS does without any rows."""
+    _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
@@ -239,7 +247,7 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
         for tol in (1e-3, 1e-6):
             name = f"reaches the tolerance {tol:g}: {shape}"
             yield name, partial(_reaches_the_tolerance, shape, tol)
-    yield "finds the optimum of 400 bounded variables", _many_bounds_and_no_rows
+    yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
     yield "gives multipliers our signs", _multipliers_have_our_signs
     yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
     yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike

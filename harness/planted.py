@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, eye_array, kron
 
 from harness.qp import QP, Matrix, Vector, no_rows
 from harness.solution import Solution, Status
@@ -84,6 +84,26 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
     )  # fmt: skip
     vectors = dict(x=[1.0, -1, 1, 1], y=[4.0], z=[2.0], z_box=[2.0, -3, 0, 0])
     return qp, {name: np.array(v) for name, v in vectors.items()}
+
+
+def membrane(k: int) -> QP:
+    """Press a membrane of k·k nodes, fixed at its rim, onto a paraboloid.
+
+    Bounds only; its solution is not known beforehand, its KKT conditions are.
+    """
+    second = diags_array(
+        [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]
+    )
+    eye = eye_array(k)
+    x, y = np.meshgrid(*2 * [np.arange(1, k + 1) / (k + 1)])
+    n = k * k
+    return QP(
+        P=csr_array(kron(second, eye) + kron(eye, second)),
+        q=np.full(n, 8 / (k + 1) ** 2),
+        A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
+        lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
+        ub=np.full(n, np.inf),
+    )  # fmt: skip
 
 
 def infeasible() -> QP:

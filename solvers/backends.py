@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,12 @@ def why_not(library: str, backend: str, files: Mapping[str, Path]) -> str | None
 
 def _not_installed(adapter: Path) -> list[str]:
     """List the top-level packages that an adapter's file imports and we lack."""
+    return [root for root in _imported(adapter) if find_spec(root) is None]
+
+
+@cache
+def _imported(adapter: Path) -> tuple[str, ...]:
+    """List the top-level packages that an adapter's file imports."""
     roots: dict[str, None] = {}
     for node in ast.walk(ast.parse(adapter.read_text(encoding="utf-8"))):
         match node:
@@ -77,4 +84,4 @@ def _not_installed(adapter: Path) -> list[str]:
                 roots |= dict.fromkeys(n.name.partition(".")[0] for n in names)
             case ast.ImportFrom(module=str(name), level=0):
                 roots[name.partition(".")[0]] = None
-    return [root for root in roots if find_spec(root) is None]
+    return tuple(roots)

@@ -112,6 +112,8 @@ class QPSolvers:
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)
         convert = dense if as_dense or self.backend in DENSE_ONLY else csc
         problem = qpsolvers.Problem(**_arguments(qp, convert, scale))
+        if self.backend == "sip":  # it refuses what is not symmetric in the last bit
+            problem.P = csc((problem.P + problem.P.T) / 2)
         if self.backend == "highs" and not qp.b.size + qp.h.size:
             # with bounds only, HiGHS claims optima after 0 iterations
             problem.G, problem.h = convert(np.eye(1, qp.q.size)), np.array([np.inf])
