@@ -98,6 +98,9 @@ def _parser() -> argparse.ArgumentParser:
 
     command = add("list", help="what there is", allow_abbrev=False)
     command.add_argument("what", choices=("problems", "solvers", "suites"))
+    command.add_argument(
+        "--markdown", action="store_true", help="solvers: all about them, as in docs/"
+    )
     _add_plugin(command)
     _add_json(command)
     command.set_defaults(run=commands.list_, parser=command)

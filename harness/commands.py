@@ -13,6 +13,7 @@ from typing import Any
 
 from harness import show
 from harness.build import build, unbuilt
+from harness.describe import in_a_line, solvers_page
 from harness.doctor import QUIET_LOAD, advice, noise_floor, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
@@ -35,6 +36,11 @@ from harness.worker import serve
 def list_(workbench: Workbench, options: Namespace) -> int:
     """List what there is, one line each or as one JSON array."""
     workbench = workbench.with_files(options.plugin)
+    if options.markdown:
+        if options.what != "solvers":
+            raise InputError("--markdown is for list solvers only")
+        print(solvers_page(workbench.solvers), end="")
+        return 0
     rows: list[dict[str, Any]]
     match options.what:
         case "problems":
@@ -51,7 +57,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
             rows = [
                 {
                     "name": name,
-                    "description": show.first_sentence(solver),
+                    "description": in_a_line(solver),
                     "options": options_of(solver),
                 }
                 for name, solver in workbench.solvers.items()

@@ -46,8 +46,9 @@ class HiGHS:
 
     Three habits of HiGHS are worked around: qpasm claims an optimum after 0 iterations
     on QPs with bounds only, so these get a row that binds nothing; a hidden 1e-7 on
-    the Hessian's diagonal (qp_regularization_value) is set to 0; and entries below 1e-9
-    would be dropped (small_matrix_value), which is lowered to 1e-12.
+    the Hessian's diagonal (qp_regularization_value) is set to 0, without which a
+    singular QP of order one is left with residuals of 1e-6 at any tolerance; and
+    entries below 1e-9 would be dropped (small_matrix_value), which is lowered to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)

@@ -14,6 +14,7 @@ from harness.registry import options_of
 from solvers import SOLVERS
 from solvers.conversion import csc, on_present_bounds
 from solvers.cvxpy_ import REFUSED
+from solvers.sequence import only_vectors_differ
 
 
 def _module(name):
@@ -33,7 +34,7 @@ SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
     "cvxopt",
 )  # fmt: skip
-NATIVE = [name for name, s in SOLVERS.items() if getattr(s, "about", None)]
+NATIVE = [n for n, s in SOLVERS.items() if hasattr(s, "about") and "*" not in n]
 LIBRARIES = {name: _module(name) for name in NATIVE} | {
     "qpsolvers:clarabel": "qpsolvers",
     "cvxpy:OSQP": "cvxpy",
@@ -223,3 +224,76 @@ def test_a_converted_matrix_shares_nothing_with_the_problem():
     M.data.flags.writeable = False
     assert csc(M).data.flags.writeable
     assert not np.shares_memory(csc(M).data, M.data)
+
+
+def test_a_vector_update_costs_a_sequence_fewer_iterations(planted):
+    # the second QP differs from the first in vectors only, and by little
+    qp, _ = planted("everything", n=40)
+    moved = replace(qp, q=qp.q * (1 + 1e-4))
+    for name in ("osqp", "scs", "qpalm", "daqp"):
+        prepare = SOLVERS[name].chain(1e-6)
+        first, warm = (prepare(each)().iterations for each in (qp, moved))
+        assert warm < SOLVERS[name].prepare(moved, 1e-6)().iterations <= 2 * first
+
+
+@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse"])
+def test_a_rebuilt_session_starts_where_the_last_one_ended(planted, name):
+    qp, _ = planted("everything", n=40)
+    other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
+    prepare = SOLVERS[name].chain(1e-6)
+    first, again = prepare(qp)(), prepare(other)()
+    assert again.iterations < first.iterations
+    assert kkt_residuals(other, again).worst <= 1e-5
+
+
+def test_sequences_do_not_know_each_other(planted):
+    qp, _ = planted("everything")
+    one, two = (SOLVERS["osqp"].chain(1e-6)(qp)().iterations for _ in range(2))
+    assert one == two == SOLVERS["osqp"].prepare(qp, 1e-6)().iterations
+
+
+def test_matrices_that_differ_are_not_updated(planted):
+    qp, _ = planted("everything")
+    assert only_vectors_differ(qp, replace(qp, q=qp.q + 1, h=qp.h + 1, lb=qp.lb - 1))
+    assert not only_vectors_differ(qp, replace(qp, P=qp.P * 2))
+    assert not only_vectors_differ(qp, replace(qp, G=qp.G * 2))
+    assert not only_vectors_differ(qp, replace(qp, A=qp.A * 2))
+    assert not only_vectors_differ(qp, replace(qp, ub=np.full(20, np.inf)))
+
+
+@pytest.mark.parametrize("name", ["daqp", "quadprog", "piqp-dense", "proxqp-dense"])
+def test_a_dense_solver_declines_what_does_not_fit(planted, monkeypatch, name):
+    qp, _ = planted("bounds", n=400)  # 1.2 MiB a matrix
+    assert SOLVERS[name].declines(qp) is None
+    monkeypatch.setenv("MORTARBENCH_MEMORY_MIB", "2")
+    reason = SOLVERS[name].declines(qp)
+    assert reason.startswith("needs ")
+    assert reason.endswith(" MiB for dense matrices of 400 rows; the limit is 2 MiB")
+
+
+def test_a_solver_tells_its_linear_solver(planted):
+    qp, _ = planted("box")
+    for name in NATIVE:
+        assert solve(name, qp, 1e-6).reported["linear_solver"]
+
+
+def test_highs_has_no_hidden_regularisation(planted):
+    # 1e-7 on the Hessian's diagonal would show in the ninth digit and before
+    qp, _ = planted("singular")
+    small = replace(qp, P=qp.P * 1e-4, q=qp.q * 1e-4)
+    for name in ("highs", "highs-hipo"):
+        solution = solve(name, small)
+        assert kkt_residuals(small, solution).worst <= 1e-9
+
+
+def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(planted):
+    qp, _ = planted("singular")
+    solution = SOLVERS["quadprog"].prepare(qp, 1e-6)()
+    assert solution.status is Status.DECLINED
+    assert solution.message == "P is not positive definite"
+
+
+def test_qoco_is_not_believed_where_its_iterates_diverge():
+    solution = solve("qoco", unbounded())
+    assert solution.status is Status.FAILED
+    assert solution.message == "diverged"
