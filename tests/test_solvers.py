@@ -11,9 +11,11 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 from harness import QP, Status, kkt_residuals
 from harness.planted import infeasible, one_of_each, unbounded
 from harness.registry import options_of
+from problems.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.conversion import csc, on_present_bounds
 from solvers.cvxpy_ import REFUSED
+from solvers.reference import reference_solution
 from solvers.sequence import only_vectors_differ
 
 
@@ -284,6 +286,17 @@ def test_highs_has_no_hidden_regularisation(planted):
     for name in ("highs", "highs-hipo"):
         solution = solve(name, small)
         assert kkt_residuals(small, solution).worst <= 1e-9
+
+
+@pytest.mark.parametrize("name", ["highs", "highs-hipo"])
+def test_highs_drops_no_small_entries(name):
+    # a flexibility matrix in large units of force; entries below 1e-9 matter
+    family = BeamRing()
+    params = family.complete({"Nr": 4, "Nh": 3, "steps": 1})
+    qp = family.build("dual", params, reference_solution).qp
+    unit = 1e-5
+    small = replace(qp, P=qp.P * unit, b=qp.b / unit)
+    assert kkt_residuals(small, solve(name, small)).worst <= 1e-8
 
 
 def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(planted):
