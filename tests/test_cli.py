@@ -665,7 +665,7 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     )
 
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        "demo", "scaling", "smoke"
+        "demo", "fleet", "scaling", "smoke"
     ]  # fmt: skip
 
 
