@@ -31,6 +31,7 @@ from harness.plugin import Solver
 from harness.qp import QP, Vector
 from harness.solution import Solution, Status
 
+FINDS = "finds the planted solution"  #: how the checks begin that need an answer
 ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
 
 
@@ -241,7 +242,7 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     for shape in SHAPES:
         for dense in (False, True):
             stored = "dense" if dense else "sparse"
-            name = f"finds the planted solution: {shape}, {stored}"
+            name = f"{FINDS}: {shape}, {stored}"
             yield name, partial(_finds_the_planted_solution, shape, dense)
     for shape in SHAPES:
         for tol in (1e-3, 1e-6):

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from harness import show
-from harness.conformance import CHECKS, Grade, Result
+from harness.conformance import CHECKS, FINDS, Grade, Result
 from harness.registry import SolverSpec, resolve
 from harness.supervisor import WorkerProcess
 from harness.workbench import Workbench
@@ -21,7 +21,7 @@ MEMORY_LIMIT = 4096.0  #: MiB per check
 
 
 def test_solver(workbench: Workbench, options: Namespace) -> int:
-    """Run every check; 1 if one fails, or if the solver declines them all."""
+    """Run every check; 1 if one fails, or if the solver solved nothing at all."""
     workbench = workbench.with_files(options.plugin)
     spec = SolverSpec(name=options.solver, label=options.solver)
     resolve(spec, workbench.solvers)
@@ -35,7 +35,10 @@ def test_solver(workbench: Workbench, options: Namespace) -> int:
         print(show.aligned([r.grade, name, r.message] for name, r in results.items()))
         counted = ", ".join(f"{grades[g]} {g}" for g in Grade)
         print(f"{options.solver}: {counted}")
-    return 0 if grades[Grade.PASS] and not grades[Grade.FAIL] else 1
+    solved = any(
+        r.grade is Grade.PASS and name.startswith(FINDS) for name, r in results.items()
+    )
+    return 0 if solved and not grades[Grade.FAIL] else 1
 
 
 def examined(

@@ -303,6 +303,11 @@ def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):
     assert "SIGSEGV" in signs
 
 
+def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
+    assert command("test-solver", "declines", "--plugin", plugin) == 1
+    assert "never on a Monday" in capsys.readouterr().out
+
+
 def test_an_unknown_solver_is_wrong_input(capsys):
     assert command("test-solver", "nobody") == 2
     assert "nobody" in capsys.readouterr().err
