@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron
 from harness.qp import QP, Matrix, Vector, no_rows
 from harness.solution import Solution, Status
 
-#: m equality and p inequality rows, which bounds, fixed variables, rank of P
+#: m equality (redundant?) and p inequality rows, which bounds, fixed variables, rank of P
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
@@ -21,6 +21,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     "some bounds": dict(m=3, some=True, upper=False),
     "everything": dict(m=5, p=8, some=True),
     "singular": dict(m=3, p=4, rank=12),
+    "redundant": dict(m=4, redundant=True, upper=False),
     "fixed": dict(m=2, p=3, fixed=True),
     "unconstrained": dict(lower=False, upper=False),
 }
@@ -50,6 +51,8 @@ def _plant(
     M = rng.standard_normal((n, rank))
     P = M @ M.T / rank + (0.1 * np.eye(n) if rank == n else 0.0)
     A, G = rng.standard_normal((m, n)), rng.standard_normal((p, n))
+    if shape.get("redundant"):
+        A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)

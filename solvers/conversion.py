@@ -28,6 +28,17 @@ def needs_dense(qp: QP, copies: float) -> str | None:
     return needs_matrices(qp) or too_large(qp.q.size, copies)
 
 
+def needs_independent_rows(qp: QP) -> str | None:
+    """Give the reason to decline a `qp` with dependent equality rows, else None.
+
+    By the rank of AAᵀ, so rows that are dependent to half of the digits count.
+    """
+    gram = dense(csc(qp.A) @ csc(qp.A).T)
+    if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
+        return None
+    return "the equality rows depend on each other"
+
+
 def csc(M: Matrix) -> csc_matrix:
     """Copy a dense or sparse matrix to a writable CSC matrix with sorted indices.
 

@@ -17,6 +17,7 @@ from solvers.conversion import (
     csc,
     dense,
     from_one_sided,
+    needs_independent_rows,
     needs_matrices,
     objective_factor,
     one_sided,
@@ -45,8 +46,8 @@ class CVXOPT:
         "per iteration",
         phases="preparing converts only; solving does everything else",
         limits=(
-            "Equality rows that depend on each other, and KKT matrices that are "
-            "singular to rounding, end in an error or as 'unknown'.",
+            "Equality rows that depend on each other end in an error or as 'unknown' "
+            "(conformance, shape 'redundant'): declined.",
         ),
     )
 
@@ -54,7 +55,7 @@ class CVXOPT:
         positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
+        return needs_matrices(qp) or needs_independent_rows(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxopt

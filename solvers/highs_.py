@@ -63,6 +63,10 @@ class HiGHS:
         "its own multifrontal LDLᵀ",
         phases="preparing passes the model; solving does everything else",
         limits=(
+            "qpasm takes longer than 20 s on the 4420 unknowns of "
+            "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
+            "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
+            "residuals of 5e-12.",
             "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
             "entries 1e6 times larger (tests/test_solvers.py).",
             "On QPs with bounds only and without the free row, HiGHS 1.15.1 claims an "

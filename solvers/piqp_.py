@@ -52,7 +52,6 @@ class PIQP:
         linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
         sequence="`update` of vectors keeps the analysis; it cannot start warm",
-        limits=("The sparse backend fails on dense singular Hessians.",),
     )  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -22,6 +22,7 @@ from solvers.conversion import (
     csc,
     dense,
     needs_dense,
+    needs_independent_rows,
     needs_matrices,
     objective_factor,
     on_present_bounds,
@@ -64,6 +65,7 @@ CALLS: Mapping[str, Call] = {
 DENSE_ONLY = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
 #: backends for which qpsolvers treats QPs without any constraint itself, wrongly
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
+NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
 #: what the words of an unsuccessful status mean, the first that matches
 WORDS = (
@@ -119,6 +121,9 @@ class QPSolvers:
             return "needs a constraint: qpsolvers treats QPs without one itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
+        needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
+        if needs_rank and (reason := needs_independent_rows(qp)):
+            return reason
         dense_only = self.backend in DENSE_ONLY
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 

@@ -55,8 +55,6 @@ class QTQP:
             "Needs an inequality row or a bound: without one it divides by zero.",
             "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
             "Nr=30/Nh=15/primal and ends at its iteration limit, close to the answer.",
-            "With several BLAS threads it is 5 to 6 times slower on 2 cores; the "
-            "harness runs it with one.",
         ),
     )
 

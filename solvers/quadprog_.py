@@ -18,6 +18,7 @@ from solvers.conversion import (
     dense,
     from_one_sided,
     needs_dense,
+    needs_independent_rows,
     objective_factor,
     one_sided,
 )
@@ -33,7 +34,9 @@ class Quadprog:
     where the KKT conditions hold to rounding. tol is not used.
 
     A Hessian that is not positive definite, or whose smallest Cholesky pivot is below
-    1e-12 of the largest, is declined once the factorisation has shown it.
+    1e-12 of the largest, is declined once the factorisation has shown it. So are
+    equality rows that depend on each other, beforehand: quadprog calls them
+    inconsistent.
     """
 
     about: ClassVar[About] = About(
@@ -46,11 +49,13 @@ class Quadprog:
         limits=(
             "Strictly convex QPs only: the dual with Dirichlet rows, whose F is "
             "singular, is declined.",
+            "Consistent equality rows of which one is the sum of others are claimed "
+            "infeasible (conformance, shape 'redundant'): declined.",
         ),
     )
 
     def declines(self, qp: QP) -> str | None:
-        return needs_dense(qp, 4)
+        return needs_dense(qp, 4) or needs_independent_rows(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import quadprog
