@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron
 from harness.qp import QP, Matrix, Vector, no_rows
 from harness.solution import Solution, Status
 
-#: m equality (redundant?) and p inequality rows, which bounds, fixed variables, rank of P
+#: m equality and p inequality rows, which bounds, fixed variables, rank of P, …
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
