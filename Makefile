@@ -5,7 +5,7 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 BIN := .venv/bin
 
-.PHONY: help setup demo test bench size check clean
+.PHONY: help setup demo test bench docs size check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -25,6 +25,9 @@ test: setup check  ## check, then run the tests
 bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
+
+docs: setup  ## write docs/solvers.md anew from the adapters
+	@$(BIN)/mortarbench list solvers --markdown > docs/solvers.md
 
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py

@@ -1,7 +1,9 @@
 """The contract between problems, solvers and reports, and the clock."""
 
+from harness.about import About
 from harness.errors import InputError
 from harness.kkt import Residuals, kkt_residuals, verdict
+from harness.limits import memory_limit_mib, too_large
 from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
@@ -9,6 +11,7 @@ from harness.solution import Solution, Status
 
 __all__ = [
     "QP",
+    "About",
     "Case",
     "Chained",
     "Family",
@@ -26,6 +29,8 @@ __all__ = [
     "Vector",
     "Verdict",
     "kkt_residuals",
+    "memory_limit_mib",
     "no_rows",
+    "too_large",
     "verdict",
 ]

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from harness import commands
+from harness import commands, examine
 from harness.errors import InputError
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
 
     command = add("list", help="what there is", allow_abbrev=False)
     command.add_argument("what", choices=("problems", "solvers", "suites"))
+    command.add_argument(
+        "--markdown", action="store_true", help="solvers: all about them, as in docs/"
+    )
     _add_plugin(command)
     _add_json(command)
     command.set_defaults(run=commands.list_, parser=command)
@@ -146,6 +149,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_plugin(command)
     _add_json(command)
     command.set_defaults(run=commands.replay, parser=command)
+    command = add(
+        "test-solver", help="the conformance suite, on one solver", allow_abbrev=False
+    )
+    command.add_argument("solver", metavar="NAME")
+    _add_plugin(command)
+    _add_json(command)
+    command.set_defaults(run=examine.test_solver, parser=command)
 
     command = add("paper", help="every figure of the paper", allow_abbrev=False)
     command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))

@@ -19,6 +19,7 @@ from harness.block import Opens, Unbuilt
 from harness.build import build, unbuilt
 from harness.capsule import block_of, open_capsule
 from harness.cluster import on_cluster
+from harness.describe import in_a_line, solvers_page
 from harness.doctor import as_json, examine, load_advice, render
 from harness.environment import capture, digest
 from harness.errors import InputError, some, unknown
@@ -49,6 +50,11 @@ from harness.worker import serve
 def list_(workbench: Workbench, options: Namespace) -> int:
     """List what there is, one line each or as one JSON array."""
     workbench = workbench.with_files(options.plugin)
+    if options.markdown:
+        if options.what != "solvers":
+            raise InputError("--markdown is for list solvers only")
+        print(solvers_page(workbench.solvers), end="")
+        return 0
     rows: list[dict[str, Any]]
     match options.what:
         case "problems":
@@ -65,7 +71,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
             rows = [
                 {
                     "name": name,
-                    "description": show.first_sentence(solver),
+                    "description": in_a_line(solver),
                     "options": options_of(solver),
                 }
                 for name, solver in workbench.solvers.items()

@@ -26,7 +26,9 @@ from threadpoolctl import threadpool_info
 
 PACKAGES = (
     "mortarbench", "numpy", "scipy", "scikit-sparse", "qpsolvers", "osqp", "clarabel",
-    "proxsuite", "cvxpy", "pandas", "numba",
+    "proxsuite", "cvxpy", "pandas", "numba", "piqp", "highspy", "highspy-extras", "scs",
+    "daqp", "qpalm", "qoco", "qtqp", "py-mkl-pardiso", "quadprog", "cvxopt",
+    "sip-qp-python",
 )  # fmt: skip
 
 THREAD_VARIABLES = (

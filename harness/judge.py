@@ -75,6 +75,7 @@ def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
         message=s.message,
         iterations=s.iterations,
         counts=s.counts,
+        reported=s.reported,
         prepare_seconds=measurement.prepare_seconds,
         solve_seconds=measurement.solve_seconds,
         total_seconds=measurement.total_seconds,

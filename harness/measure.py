@@ -175,6 +175,9 @@ def _plain(s: Solution) -> Solution:
         counts={str(name): int(count) for name, count in s.counts.items()},
         message=" ".join(message.split()),
         history=history,
+        reported={
+            str(k): v if isinstance(v, str) else float(v) for k, v in s.reported.items()
+        },
     )
 
 

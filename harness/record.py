@@ -58,6 +58,9 @@ class Record:
     message: str = ""  #: its words, the reason it declined, or how it died
     iterations: int | None = None
     counts: Mapping[str, int] = field(default_factory=dict)
+    reported: Mapping[str, Any] = field(
+        default_factory=dict
+    )  #: its linear solver, its own times in seconds
     prepare_seconds: float | None = None
     solve_seconds: float | None = None
     total_seconds: float | None = None  #: prepare + solve

@@ -67,6 +67,7 @@ def measured(
         read_point(Path(request["out"]), Status(answer["claimed"])),
         iterations=answer["iterations"],
         counts=answer["counts"],
+        reported={k: v for k, v in answer["reported"].items() if v is not None},
         message=answer["message"],
     )
     told = {name: answer[name] for name in _MEASURED}

@@ -104,6 +104,7 @@ def outcome(r: Record) -> str:
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),
+        ("it reports", _text(r.reported)),
         ("prepare", _text(r.prepare_seconds, "s (one run)", digits=3)),
         ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),

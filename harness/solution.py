@@ -38,6 +38,9 @@ class Solution:
     iterations: int | None = None  #: None where the solver does not tell
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: the solver's own words, for the record
+    reported: Mapping[str, float | str] = field(
+        default_factory=dict
+    )  #: what it tells besides, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
     history: History = field(
         default_factory=dict
     )  #: columns of one length, a row per iteration; see `harness.history`

@@ -20,6 +20,7 @@ from pathlib import Path
 from select import select
 from typing import Any
 
+from harness import limits
 from harness.measure import memory_mib
 from harness.record import Verdict
 
@@ -141,7 +142,7 @@ class WorkerProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env=os.environ | ONE_THREAD,
+                env=os.environ | ONE_THREAD | {limits.VARIABLE: str(memory_limit)},
                 pass_fds=(their_requests, their_replies),
                 start_new_session=True,
             )

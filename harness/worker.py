@@ -8,6 +8,7 @@ It answers the requests of `harness.serving` with these of its own:
   writes the point to `out`. Optional: ``digest`` of the file, which is checked;
   ``memory_limit`` in MiB; ``sample_seconds``, see `harness.measure`; ``step`` 0,
   1, … of a sequence
+* ``{"check": NAME}``: it runs one of `harness.conformance.CHECKS`
 
 Every measurement loads its QP afresh, so that nothing that a solver did to the last one
 is left.
@@ -28,10 +29,12 @@ import numpy as np
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from harness.cases import content_digest
+from harness.conformance import run_check
 from harness.measure import Measurement, Prepare, measure, memory_mib
 from harness.plugin import Solver
 from harness.qp import QP, no_rows
 from harness.qpfile import load_qp
+from harness.record import finite
 from harness.serving import answer_requests
 from harness.solution import Solution
 from harness.store import write_point
@@ -66,7 +69,10 @@ class _Bench:
     def answer(
         self, request: dict[str, Any], start: Callable[[], None]
     ) -> dict[str, Any]:
-        """Measure once."""
+        """Measure once, or run one check."""
+        if "check" in request:
+            start()
+            return dict(run_check(request["check"], self._solver)._asdict())
         path = Path(request["qp"])
         self._check(path, request.get("digest"))
         qp, _ = load_qp(path)
@@ -88,6 +94,7 @@ class _Bench:
             "message": s.message,
             "iterations": s.iterations,
             "counts": s.counts,
+            "reported": finite(dict(s.reported)),
             "prepare_seconds": m.prepare_seconds,
             "solve_seconds": m.solve_seconds,
             "total_seconds": m.total_seconds,

@@ -22,7 +22,51 @@ def claims(evidence: Evidence) -> Section:
             "the solver said of itself is added where it differs from the verdict; "
             "inaccurate and wrong answers were claimed to be solved.",
         ),
-        tables=(_grid(evidence, "Verdicts and worst residuals.", _verdict),),
+        tables=(
+            _grid(evidence, "Verdicts and worst residuals.", _verdict),
+            *_refuted(evidence),
+        ),
+    )
+
+
+def _refuted(evidence: Evidence) -> list[Table]:
+    """List every claim that our evaluation refutes, with what refutes it."""
+    refuted = [
+        o for o in evidence.flat
+        if o.verdict in (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
+    ]  # fmt: skip
+    if not refuted:
+        return []
+    return [
+        Table(
+            caption="Refuted claims: what the solver said, and the residual that says "
+            "otherwise, with what verification allows.",
+            columns=("case", "solver", "tol", "verdict", "evidence", "its words"),
+            rows=tuple(_refutation(o) for o in refuted),
+            text_columns=2,
+        )
+    ]
+
+
+def _refutation(outcome: Outcome) -> tuple[Cell, ...]:
+    """Make one row of the table of refuted claims."""
+    allowed = min(VERIFIED_FACTOR * outcome.tol, 0.1)
+    values = {name: outcome.largest(name) for name in RESIDUALS}
+    known = {name: v for name, v in values.items() if v is not None}
+    name = max(known, key=lambda n: known[n], default=None)
+    evidence = (
+        "no point"
+        if name is None
+        else f"{name} {power(known[name])} > {power(allowed)}"
+    )
+    case, tol = case_cells(outcome)
+    return (
+        case,
+        Cell(text=clean(outcome.solver, 40)),
+        tol,
+        verdict_cell(outcome),
+        Cell(text=evidence, title=source(outcome)),
+        Cell(text=clean(outcome.first.message, 60)),
     )
 
 

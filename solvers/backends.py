@@ -8,8 +8,29 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
+
+from solvers.conversion import OBJECTIVE_SIZE
+
+
+@dataclass(frozen=True)
+class Call:
+    """How one backend of a library of solvers is called for a tolerance."""
+
+    tolerances: tuple[str, ...] = ()  #: keywords that get max(tighter·tol, floor)
+    fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords
+    size: float = OBJECTIVE_SIZE  #: ‖q‖∞ that the objective is multiplied to
+    tighter: float = 1.0
+    floor: float = 0.0
+
+    def options(self, tol: float) -> dict[str, Any]:
+        """All keywords with their values."""
+        value = max(self.tighter * tol, self.floor)
+        return {**dict.fromkeys(self.tolerances, value), **self.fixed}
 
 
 def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
@@ -50,6 +71,12 @@ def why_not(library: str, backend: str, files: Mapping[str, Path]) -> str | None
 
 def _not_installed(adapter: Path) -> list[str]:
     """List the top-level packages that an adapter's file imports and we lack."""
+    return [root for root in _imported(adapter) if find_spec(root) is None]
+
+
+@cache
+def _imported(adapter: Path) -> tuple[str, ...]:
+    """List the top-level packages that an adapter's file imports."""
     roots: dict[str, None] = {}
     for node in ast.walk(ast.parse(adapter.read_text(encoding="utf-8"))):
         match node:
@@ -57,4 +84,4 @@ def _not_installed(adapter: Path) -> list[str]:
                 roots |= dict.fromkeys(n.name.partition(".")[0] for n in names)
             case ast.ImportFrom(module=str(name), level=0):
                 roots[name.partition(".")[0]] = None
-    return [root for root in roots if find_spec(root) is None]
+    return tuple(roots)

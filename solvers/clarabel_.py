@@ -8,12 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
-from scipy.sparse import eye_array, triu, vstack
+from scipy.sparse import triu
 
-from harness import QP, Solution, Status
-from solvers.conversion import csc, needs_matrices, positive
+from harness import QP, About, Solution, Status
+from solvers.conversion import (
+    csc,
+    from_one_sided,
+    needs_matrices,
+    objective_factor,
+    one_sided,
+    positive,
+)
+from solvers.sequence import Session, in_sequence
 
 CLAIMS = {
     "Solved": Status.SOLVED,
@@ -22,8 +31,6 @@ CLAIMS = {
     "PrimalInfeasible": Status.INFEASIBLE,
     "DualInfeasible": Status.INFEASIBLE,
 }  #: anything else (AlmostSolved, InsufficientProgress, …) is FAILED
-
-OBJECTIVE_SIZE = 1e4  #: ‖q‖∞ as handed to Clarabel
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,17 @@ class Clarabel:
 
     max_iter: int = 200
 
+    about: ClassVar[About] = About(
+        title="Clarabel",
+        method="interior point (homogeneous embedding)",
+        licence="Apache-2.0",
+        package="clarabel",
+        linear_solver="QDLDL or faer (sparse LDLᵀ), as Clarabel chooses; one "
+        "factorisation per iteration",
+        phases="preparing equilibrates and analyses; solving does all factorisations",
+        sequence="`update` of vectors keeps the analysis; it cannot start warm",
+    )
+
     def __post_init__(self) -> None:
         positive(max_iter=self.max_iter)
 
@@ -51,20 +69,24 @@ class Clarabel:
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol, presolve=True).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol, presolve=False))
+
+    def _begin(self, qp: QP, tol: float, *, presolve: bool) -> Session:
         import clarabel
 
-        m, p, n = qp.b.size, qp.h.size, qp.q.size
-        up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
-        eye = eye_array(n, format="csr")
-        rows = csc(vstack([csc(qp.A), csc(qp.G), eye[up], -eye[low]]))
-        rhs = np.concatenate([qp.b, qp.h, qp.ub[up], -qp.lb[low]])
+        m = qp.b.size
+        rows, rhs = one_sided(qp)
         cones = [clarabel.ZeroConeT(m), clarabel.NonnegativeConeT(rhs.size - m)]
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.max_threads = 1
         settings.max_iter = self.max_iter
         settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = tol
-        scale = OBJECTIVE_SIZE / (np.abs(qp.q).max(initial=0.0) or OBJECTIVE_SIZE)
+        settings.presolve_enable = presolve  # a presolved problem takes no updates
+        scale = objective_factor(qp)
         P = csc(triu(csc(qp.P))) * scale
         solver = clarabel.DefaultSolver(P, qp.q * scale, rows, rhs, cones, settings)
 
@@ -73,15 +95,17 @@ class Clarabel:
             status = CLAIMS.get(str(r.status), Status.FAILED)
             if status is Status.INFEASIBLE:
                 return Solution.without_point(qp, status, str(r.status))
-            z = np.array(r.z) / scale
-            z_up, z_low = np.split(z[m + p :], [up.sum()])
-            z_box = np.zeros(n)
-            z_box[up] += z_up
-            z_box[low] -= z_low
             return Solution(
                 status=status,
-                x=np.array(r.x), y=z[:m], z=z[m : m + p], z_box=z_box,
+                x=np.array(r.x), **from_one_sided(qp, np.array(r.z) / scale),
                 iterations=r.iterations, message=str(r.status),
+                reported={
+                    "linear_solver": solver.get_info().linsolver.name,
+                    "solve_seconds": r.solve_time,
+                },
             )  # fmt: skip
 
-        return solve
+        def update(new: QP) -> None:
+            solver.update(q=new.q * scale, b=one_sided(new)[1])
+
+        return Session(solve, update)

@@ -8,21 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import eye_array, vstack
 
-from harness import QP, Solution, Status, Vector
+from harness import QP, About, Solution, Status, Vector
 from solvers.conversion import (
     NEGLIGIBLE,
+    as_stored,
+    boxed,
     csc,
     dense,
+    from_two_sided,
+    needs_dense,
     needs_matrices,
     on_present_bounds,
+    one_of,
     positive,
+    two_sided,
 )
+from solvers.sequence import Session, in_sequence
 
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
@@ -53,82 +58,129 @@ class ProxQP:
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
     max_iter: int = 10_000
 
+    about: ClassVar[About] = About(
+        title="ProxQP",
+        method="proximal augmented Lagrangian",
+        licence="BSD-2-Clause",
+        package="proxsuite",
+        linear_solver="its own LDLᵀ, dense or sparse, updated as rows become active",
+        phases="preparing equilibrates and, in the sparse backend, analyses; solving "
+        "factorises and iterates",
+        sequence="`update` of vectors keeps the equilibration; starts from the last "
+        "point",
+        limits=(
+            "No test looks at the sign of multipliers.",
+            "No time limit of its own, and it keeps Python's lock: only the harness's "
+            "kill ends it.",
+        ),
+    )
+
     def __post_init__(self) -> None:
         positive(max_iter=self.max_iter)
-        if self.backend not in ("auto", "dense", "sparse"):
-            raise ValueError(
-                f"backend = {self.backend!r}; expected 'auto', 'dense' or 'sparse'"
-            )
+        one_of("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
-        return needs_matrices(qp)
+        as_dense = as_stored(self.backend, qp) == "dense"
+        return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
 
-        as_dense = isinstance(qp.P, np.ndarray)
-        if self.backend != "auto":
-            as_dense = self.backend == "dense"
-        solver = (_dense if as_dense else _sparse)(proxqp, qp)
+        backend = as_stored(self.backend, qp)
+        form = _Dense(qp) if backend == "dense" else _Sparse(qp)
+        solver = form.made(proxqp)
         settings = solver.settings
         settings.eps_abs, settings.eps_rel = NEGLIGIBLE, tol
-        settings.check_duality_gap = True
+        settings.check_duality_gap = settings.compute_timings = True
         settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = NEGLIGIBLE, tol
         settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
         settings.initial_guess = proxqp.NO_INITIAL_GUESS
         settings.max_iter = self.max_iter
+        warm: list[Solution] = []
 
         def solve() -> Solution:
-            solver.solve()
+            if warm:
+                settings.initial_guess = proxqp.WARM_START
+                s = warm.pop()
+                solver.solve(s.x, s.y, form.stacked(s))
+            else:
+                solver.solve()
             r = solver.results
             status = CLAIMS.get(r.info.status.name, Status.FAILED)
             if status is Status.INFEASIBLE:
                 return Solution.without_point(qp, status, r.info.status.name)
-            z, z_box = np.split(np.array(r.z), [qp.h.size])
             return Solution(
                 status=status,
-                x=np.array(r.x), y=np.array(r.y), z=z, z_box=_full(qp, z_box),
-                iterations=r.info.iter,
+                x=np.array(r.x), y=np.array(r.y), **form.multipliers(np.array(r.z)),
+                iterations=r.info.iter, message=r.info.status.name,
                 counts={"iter_ext": r.info.iter_ext, "mu_updates": r.info.mu_updates},
-                message=r.info.status.name,
+                reported={
+                    "linear_solver": f"{backend} ldl, updated",
+                    "solve_seconds": r.info.solve_time / 1e6,
+                },
             )  # fmt: skip
 
-        return solve
+        def update(new: QP) -> None:
+            settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT
+            solver.update(g=new.q, b=new.b, **form.sides(new))
+
+        # the dense backend takes no multipliers of bounds to start from
+        no_start = isinstance(form, _Dense) and form.boxed
+        return Session(solve, update, None if no_start else warm.append)
 
 
-def _dense(proxqp: Any, qp: QP) -> Any:
-    """Set up the dense backend, which knows bounds."""
-    boxed = bool(_boxed(qp).any())
-    solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, boxed)
-    box = {"l_box": qp.lb, "u_box": qp.ub} if boxed else {}
-    solver.init(
-        dense(qp.P), qp.q, dense(qp.A), qp.b,
-        dense(qp.G), np.full(qp.h.size, -np.inf), qp.h, **box,
-    )  # fmt: skip
-    return solver
+class _Dense:
+    """The dense backend, which knows bounds: multipliers of all n follow those of G."""
+
+    def __init__(self, qp: QP) -> None:
+        self.qp, self.boxed = qp, bool(boxed(qp).any())
+
+    def made(self, proxqp: Any) -> Any:
+        qp = self.qp
+        solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.boxed)
+        P, A, G = dense(qp.P), dense(qp.A), dense(qp.G)
+        solver.init(P, qp.q, A, qp.b, G, **self.sides(qp))
+        return solver
+
+    def sides(self, qp: QP) -> dict[str, Vector]:
+        box = {"l_box": qp.lb, "u_box": qp.ub} if self.boxed else {}
+        return {"l": np.full(qp.h.size, -np.inf), "u": qp.h, **box}
+
+    def multipliers(self, v: Vector) -> dict[str, Any]:
+        z, z_box = np.split(v, [self.qp.h.size])
+        z_box = z_box if self.boxed else np.zeros(self.qp.q.size)
+        return {"z": z, "z_box": on_present_bounds(self.qp, z_box)}
+
+    def stacked(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box]) if self.boxed else s.z
 
 
-def _sparse(proxqp: Any, qp: QP) -> Any:
-    """Set up the sparse backend, where bounds are rows of the identity."""
-    boxed = _boxed(qp)
-    eye = eye_array(qp.q.size, format="csr")[boxed]
-    rows = csc(vstack([csc(qp.G), eye]))
-    solver = proxqp.sparse.QP(qp.q.size, qp.b.size, rows.shape[0])
-    solver.init(
-        csc(qp.P), qp.q, csc(qp.A), qp.b, rows,
-        np.concatenate([np.full(qp.h.size, -np.inf), qp.lb[boxed]]),
-        np.concatenate([qp.h, qp.ub[boxed]]),
-    )  # fmt: skip
-    return solver
+class _Sparse:
+    """The sparse backend, where bounds are rows of the identity."""
 
+    def __init__(self, qp: QP) -> None:
+        self.qp = qp
 
-def _boxed(qp: QP) -> NDArray[np.bool_]:
-    return np.isfinite(qp.lb) | np.isfinite(qp.ub)
+    def made(self, proxqp: Any) -> Any:
+        qp = self.qp
+        rows = csc(two_sided(qp)[0][qp.b.size :])
+        solver = proxqp.sparse.QP(qp.q.size, qp.b.size, rows.shape[0])
+        solver.init(csc(qp.P), qp.q, csc(qp.A), qp.b, rows, **self.sides(qp))
+        return solver
 
+    def sides(self, qp: QP) -> dict[str, Vector]:
+        _, low, high = two_sided(qp)
+        return {"l": low[qp.b.size :], "u": high[qp.b.size :]}
 
-def _full(qp: QP, z_box: Vector) -> Vector:
-    """Spread multipliers of the bounded variables, or of all (n,), over all."""
-    if z_box.size < qp.q.size:
-        some, z_box = z_box, np.zeros(qp.q.size)
-        z_box[_boxed(qp)] = some
-    return on_present_bounds(qp, z_box)
+    def multipliers(self, v: Vector) -> dict[str, Any]:
+        parts = from_two_sided(self.qp, np.concatenate([np.zeros(self.qp.b.size), v]))
+        return {"z": parts["z"], "z_box": parts["z_box"]}
+
+    def stacked(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box[boxed(self.qp)]])

@@ -679,7 +679,7 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     )
 
     listed = {line.split()[0] for line in done.stdout.splitlines()}
-    assert {"demo", "scaling", "smoke"} <= listed
+    assert {"demo", "fleet", "scaling", "smoke"} <= listed
 
 
 def test_the_workbench_is_not_changed_by_plugins(workbench, tmp_path):

@@ -4,8 +4,10 @@ import re
 from pathlib import Path
 
 from harness import kkt_residuals
+from harness.describe import about, solvers_page
 from harness.registry import load_plugin
 from problems.beam_ring import BeamRing
+from solvers import SOLVERS
 from solvers.reference import reference_solution
 
 ROOT = Path(__file__).parents[1]
@@ -13,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     """In under 30 lines, and right on a dual with bounds only."""
-    (code,) = re.findall(
+    _, code = re.findall(
         r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
     )
     path = tmp_path / "lbfgsb.py"
@@ -30,6 +32,29 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     assert qp.objective(s.x) - qp.objective(reference_solution(qp).x) <= 1e-7 * abs(
         qp.objective(s.x)
     )
+
+
+def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
+    shown, _ = re.findall(
+        r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
+    )
+    assert shown == (ROOT / "solvers/piqp_.py").read_text()
+
+
+def test_the_page_of_solvers_is_up_to_date():
+    """`make docs` writes it."""
+    assert (ROOT / "docs/solvers.md").read_text() == solvers_page(SOLVERS)
+
+
+def test_the_page_of_solvers_tells_the_facts_of_each():
+    page = solvers_page(SOLVERS)
+    for name, solver in SOLVERS.items():
+        assert f"| `{name}` |" in page
+        facts = about(solver)
+        for fact in (facts.licence, facts.phases, *facts.limits) if facts else ():
+            assert fact in page
+    assert "| `max_iter` | 250 | 250 | 250 |  |" in page
+    assert "| `backend` | 'auto' | 'dense' | 'sparse' | auto: as P is stored |" in page
 
 
 def test_every_family_and_suite_that_the_readme_names_exists():

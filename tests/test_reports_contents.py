@@ -325,3 +325,20 @@ def test_a_wide_table_says_that_it_scrolls_and_keeps_its_first_column(
     hint = '<p class="hint" hidden>more columns: scroll sideways →</p>'
     assert len(re.findall(rf'{hint}\s*<div class="scroll"', text)) == tables
     assert re.search(r"\.wide td:first-child \{ position: sticky; left: 0;", text)
+
+
+def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
+    records = [
+        measured("sound"),
+        measured("hasty", status=Verdict.INACCURATE, gap=3e-6, message="Optimal"),
+        measured("blind", status=Verdict.INFEASIBLE_CLAIM, claimed="infeasible",
+                 primal=None, dual=None, complementarity=None, gap=None),
+        measured("modest", status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+    ]  # fmt: skip
+    _, refuted = section(page(records), "verdicts").tables
+    listed = {row["solver"].text: row for row in rows(refuted)}
+    assert listed.keys() == {"hasty", "blind"}
+    assert listed["hasty"]["evidence"].text == "gap 3.0e-6 > 1.0e-7"
+    assert listed["hasty"]["its words"].text == "Optimal"
+    assert listed["blind"]["evidence"].text == "no point"
+    assert len(section(page(records[:1]), "verdicts").tables) == 1

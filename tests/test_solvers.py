@@ -1,4 +1,4 @@
-"""Conformance: every registered solver finds every planted solution it accepts."""
+"""The adapters: what conformance (test_conformance.py) does not ask of every solver."""
 
 import subprocess
 import sys
@@ -7,29 +7,37 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
-from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, Status, kkt_residuals, no_rows
+from harness import QP, Status, kkt_residuals
+from harness.planted import infeasible, one_of_each, unbounded
+from harness.registry import options_of
+from problems.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.conversion import csc, on_present_bounds
+from solvers.cvxpy_ import REFUSED
+from solvers.reference import reference_solution
+from solvers.sequence import only_vectors_differ
 
-SHAPES = [
-    "bounds", "box", "free", "equalities", "inequalities", "some bounds",
-    "everything", "singular",
-]  # fmt: skip
-#: backends that stand for the wildcard entries of the registry
-STAND_INS = {"qpsolvers:*": ("clarabel", "scs"), "cvxpy:*": ("CLARABEL", "OSQP")}
-CONCRETE = {name: s for name, s in SOLVERS.items() if name not in STAND_INS} | {
-    wildcard.replace("*", backend): replace(SOLVERS[wildcard], backend=backend)
-    for wildcard, backends in STAND_INS.items()
-    for backend in backends
+
+def _module(name):
+    about = SOLVERS[name].about
+    return about.module or about.package
+
+
+CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
+    "qpsolvers:clarabel": replace(SOLVERS["qpsolvers:*"], backend="clarabel"),
+    "qpsolvers:scs": replace(SOLVERS["qpsolvers:*"], backend="scs"),
+    "cvxpy:OSQP": replace(SOLVERS["cvxpy:*"], backend="OSQP"),
 }
-FINITE = {"bvls"}  #: ends with the exact active set, whatever the tolerance
-NATIVE = ["osqp", "clarabel", "proxqp"]
-LIBRARIES = {
-    "osqp": "osqp",
-    "clarabel": "clarabel",
-    "proxqp": "proxsuite",
+WILDCARDS = ("qpsolvers:*", "cvxpy:*")
+#: end at a vertex of the active-set search, whatever the tolerance
+EXACT = ("bvls", "daqp", "highs", "quadprog")
+SPARSE = (
+    "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
+    "cvxopt",
+)  # fmt: skip
+NATIVE = [n for n, s in SOLVERS.items() if hasattr(s, "about") and "*" not in n]
+LIBRARIES = {name: _module(name) for name in NATIVE} | {
     "qpsolvers:clarabel": "qpsolvers",
     "cvxpy:OSQP": "cvxpy",
 }
@@ -43,30 +51,6 @@ def solve(name, qp, tol=1e-9):
     if reason := solver.declines(qp):
         pytest.skip(reason)
     return solver.prepare(qp, tol)()
-
-
-def arrays(qp):
-    """Every buffer of a QP."""
-    matrices = (qp.P, qp.A, qp.G)
-    buffers = [getattr(M, "data", M) for M in matrices if not isinstance(M, np.ndarray)]
-    dense = [M for M in matrices if isinstance(M, np.ndarray)]
-    return [*buffers, *dense, qp.q, qp.b, qp.h, qp.lb, qp.ub]
-
-
-@pytest.fixture
-def one_of_each():
-    """Four separate problems min ½x² + qx, one active constraint of each kind.
-
-    x₀ ≤ 1 and x₁ ≥ −1 (bounds), 2x₂ ≤ 2 (row), 2x₃ = 2; all multipliers follow by hand.
-    """
-    inf = np.inf
-    qp = QP(
-        P=csr_array(np.eye(4)), q=np.array([-3.0, 4.0, -5.0, -9.0]),
-        A=csr_array([[0.0, 0, 0, 2]]), b=np.array([2.0]),
-        G=csr_array([[0.0, 0, 2, 0]]), h=np.array([2.0]),
-        lb=np.array([-inf, -1, -inf, -inf]), ub=np.array([1, inf, inf, inf]),
-    )  # fmt: skip
-    return qp, dict(x=[1, -1, 1, 1], y=[4], z=[2], z_box=[2, -3, 0, 0])
 
 
 @pytest.fixture
@@ -88,60 +72,11 @@ def membrane():
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-@pytest.mark.parametrize("shape", SHAPES)
-def test_a_planted_point_is_a_solution(planted, shape, dense):
-    qp, expected = planted(shape, seed=314159, dense=dense)
-    assert kkt_residuals(qp, expected).worst < 1e-13
-
-
-@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-@pytest.mark.parametrize("shape", SHAPES)
-@every_solver
-def test_a_solver_finds_the_planted_solution(planted, name, shape, dense):
-    qp, expected = planted(shape, dense=dense)
-
-    solution = solve(name, qp, tol=1e-9)
-
-    assert solution.status is Status.SOLVED
-    assert solution.mismatch(qp) is None
-    assert kkt_residuals(qp, solution).worst <= 1e-8
-    assert qp.objective(solution.x) == pytest.approx(qp.objective(expected.x), rel=1e-6)
-    if shape != "singular":
-        np.testing.assert_allclose(solution.x, expected.x, atol=1e-6)
-
-
-@every_solver
-def test_multipliers_follow_the_sign_convention(one_of_each, name):
-    qp, expected = one_of_each
-    solution = solve(name, qp)
-    for vector, value in expected.items():
-        np.testing.assert_allclose(getattr(solution, vector), value, atol=1e-6)
-
-
-@every_solver
-def test_a_multiplier_on_an_absent_bound_is_exactly_zero(planted, name):
-    qp, _ = planted("some bounds")
-    solution = solve(name, qp, tol=1e-3)
-    assert (solution.z_box[np.isinf(qp.lb)] >= 0).all()
-    assert (solution.z_box[np.isinf(qp.ub)] <= 0).all()
-
-
-@pytest.mark.parametrize("tol", [1e-3, 1e-6])
-@pytest.mark.parametrize("shape", SHAPES)
-@every_solver
-def test_the_tolerance_asked_for_is_reached(planted, name, shape, tol):
-    qp, _ = planted(shape, seed=161803)
-    assert kkt_residuals(qp, solve(name, qp, tol)).worst <= 10 * tol
-
-
-@every_solver
+@pytest.mark.parametrize("name", sorted(CONCRETE.keys() - EXACT))
 def test_more_digits_take_more_iterations(planted, name):
     qp, _ = planted("bounds", seed=57721, n=60)
     few, many = (solve(name, qp, tol) for tol in (1e-2, 1e-10))
-    if name in FINITE:
-        assert kkt_residuals(qp, few).worst < 1e-12
-    elif few.iterations is None:
+    if few.iterations is None:
         assert kkt_residuals(qp, many).worst < kkt_residuals(qp, few).worst
     else:
         assert few.iterations < many.iterations
@@ -157,12 +92,15 @@ def test_accuracy_does_not_depend_on_the_units(planted, name, energy, length):
         b=qp.b * length, h=qp.h * length, lb=qp.lb * length, ub=qp.ub * length,
     )  # fmt: skip
     solution = solve(name, scaled, tol=1e-6)
+    if name == "highs" and length != 1:  # a known limit, in docs/solvers.md
+        assert solution.message == "kSolveError"
+        return
     assert solution.status is Status.SOLVED
     assert kkt_residuals(scaled, solution).worst <= 1e-5
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-6])
-@every_native_solver
+@pytest.mark.parametrize("name", SPARSE)
 def test_a_membrane_in_contact_is_solved_to_the_tolerance(membrane, name, tol):
     # at 1e-3 ProxQP's default first guess passes its own test with negative multipliers
     solution = solve(name, membrane, tol)
@@ -170,32 +108,9 @@ def test_a_membrane_in_contact_is_solved_to_the_tolerance(membrane, name, tol):
     assert kkt_residuals(membrane, solution).worst <= 10 * tol
 
 
-@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-@every_solver
-def test_the_problem_is_left_as_it_was(planted, name, dense):
-    qp, _ = planted("everything", dense=dense)
-    before = [array.copy() for array in arrays(qp)]
-    solve(name, qp)
-    for array, copy in zip(arrays(qp), before, strict=True):
-        assert not array.flags.writeable
-        np.testing.assert_array_equal(array, copy)
-
-
-@every_solver
-def test_repeats_are_cold(planted, name):
-    qp, _ = planted("bounds", n=60)
-    first, second = solve(name, qp), solve(name, qp)
-    assert first.iterations == second.iterations
-    np.testing.assert_array_equal(first.x, second.x)
-
-
-@every_solver
-def test_a_misspelt_option_is_rejected(name):
-    with pytest.raises(TypeError, match="max_itre"):
-        type(CONCRETE[name])(max_itre=5)
-
-
-@every_native_solver
+@pytest.mark.parametrize(
+    "name", [n for n in NATIVE if "max_iter" in options_of(SOLVERS[n])]
+)
 def test_an_iteration_limit_is_reported_as_one(planted, name):
     qp, _ = planted("everything")
     solution = replace(CONCRETE[name], max_iter=1).prepare(qp, 1e-9)()
@@ -203,44 +118,13 @@ def test_an_iteration_limit_is_reported_as_one(planted, name):
     assert solution.iterations <= 2  # ProxQP counts inner ones too
 
 
-@pytest.fixture
-def infeasible(planted):
-    """x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
-    qp, _ = planted("inequalities")
-    rows = csr_array(np.eye(2, 20) - np.eye(2, 20)[::-1])
-    return replace(qp, G=rows, h=np.array([-1.0, -1.0]))
-
-
-@pytest.fixture
-def unbounded(planted):
-    """No curvature and no upper bound along x₀, and a slope."""
-    qp, _ = planted("bounds")
-    return replace(qp, P=csr_array(np.diag([0.0] + [1.0] * 19)), q=-np.ones(20))
-
-
-@pytest.mark.parametrize("problem", ["infeasible", "unbounded"])
-@every_solver
-def test_a_problem_without_solution_is_not_reported_as_solved(request, name, problem):
-    solution = solve(name, request.getfixturevalue(problem))
-    assert solution.status is not Status.SOLVED
-    assert solution.message
-
-
-@pytest.mark.parametrize("problem", ["infeasible", "unbounded"])
+@pytest.mark.parametrize("problem", [infeasible, unbounded])
 @pytest.mark.parametrize("name", ["osqp", "clarabel", "qpsolvers:scs", "cvxpy:OSQP"])
-def test_a_certificate_is_not_passed_off_as_a_point(request, name, problem):
-    solution = solve(name, request.getfixturevalue(problem))
+def test_a_certificate_is_not_passed_off_as_a_point(name, problem):
+    solution = solve(name, problem())
     assert solution.status is Status.INFEASIBLE
     assert np.isnan(solution.x).all()
     assert np.isnan(solution.z).all()
-
-
-@every_solver
-def test_an_operator_is_declined_with_a_reason(planted, name):
-    qp, _ = planted("everything")
-    if name in LIBRARIES or name in CONCRETE.keys() - SOLVERS.keys():
-        reason = CONCRETE[name].declines(replace(qp, P=aslinearoperator(qp.P)))
-        assert reason == "needs explicit matrices"
 
 
 @pytest.mark.parametrize(("name", "library"), LIBRARIES.items())
@@ -265,7 +149,7 @@ def test_proxqp_backends_agree(planted):
         np.testing.assert_allclose(solution.x, expected.x, atol=1e-6)
 
 
-@pytest.mark.parametrize("wildcard", STAND_INS)
+@pytest.mark.parametrize("wildcard", WILDCARDS)
 def test_the_backends_that_decline_are_those_not_installed(planted, wildcard):
     import cvxpy
     import qpsolvers
@@ -280,11 +164,13 @@ def test_the_backends_that_decline_are_those_not_installed(planted, wildcard):
         for backend in SOLVERS[wildcard].backends()
     }
 
-    assert {b for b, reason in reasons.items() if not reason} == set(installed)
-    assert all(r.startswith("not installed: ") for r in reasons.values() if r)
+    able = {b for b, reason in reasons.items() if not reason}
+    assert able == set(installed) - REFUSED.keys()
+    lacking = [r for b, r in reasons.items() if b not in installed]
+    assert all(r.startswith("not installed: ") for r in lacking)
 
 
-@pytest.mark.parametrize("wildcard", STAND_INS)
+@pytest.mark.parametrize("wildcard", WILDCARDS)
 def test_an_unknown_backend_is_declined_with_those_there_are(planted, wildcard):
     qp, _ = planted("box")
     solver = replace(SOLVERS[wildcard], backend="foo")
@@ -328,17 +214,8 @@ def test_qpsolvers_claims_no_success_it_was_not_given(planted, monkeypatch, back
     assert solution.status is Status.FAILED
 
 
-def test_an_unconstrained_problem_needs_no_rows(planted):
-    qp, _ = planted("box")
-    inf = np.full(20, np.inf)
-    free = replace(qp, A=no_rows(20), G=no_rows(20), lb=-inf, ub=inf)
-    for name in NATIVE:
-        solution = solve(name, free)
-        np.testing.assert_allclose(free.P @ solution.x, -free.q, atol=1e-7)
-
-
-def test_round_off_on_absent_bounds_is_dropped_and_the_rest_is_kept(one_of_each):
-    qp, _ = one_of_each
+def test_round_off_on_absent_bounds_is_dropped_and_the_rest_is_kept():
+    qp, _ = one_of_each()
     z_box = np.array([-1e-9, 1e-9, 1e-9, -1e-9]), np.array([2.0, -3.0, 0.0, 0.0])
     np.testing.assert_array_equal(on_present_bounds(qp, z_box[0]), np.zeros(4))
     np.testing.assert_array_equal(on_present_bounds(qp, z_box[1]), z_box[1])
@@ -349,3 +226,87 @@ def test_a_converted_matrix_shares_nothing_with_the_problem():
     M.data.flags.writeable = False
     assert csc(M).data.flags.writeable
     assert not np.shares_memory(csc(M).data, M.data)
+
+
+def test_a_vector_update_costs_a_sequence_fewer_iterations(planted):
+    # the second QP differs from the first in vectors only, and by little
+    qp, _ = planted("everything", n=40)
+    moved = replace(qp, q=qp.q * (1 + 1e-4))
+    for name in ("osqp", "scs", "qpalm", "daqp"):
+        prepare = SOLVERS[name].chain(1e-6)
+        first, warm = (prepare(each)().iterations for each in (qp, moved))
+        assert warm < SOLVERS[name].prepare(moved, 1e-6)().iterations <= 2 * first
+
+
+@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse"])
+def test_a_rebuilt_session_starts_where_the_last_one_ended(planted, name):
+    qp, _ = planted("everything", n=40)
+    other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
+    prepare = SOLVERS[name].chain(1e-6)
+    first, again = prepare(qp)(), prepare(other)()
+    assert again.iterations < first.iterations
+    assert kkt_residuals(other, again).worst <= 1e-5
+
+
+def test_sequences_do_not_know_each_other(planted):
+    qp, _ = planted("everything")
+    one, two = (SOLVERS["osqp"].chain(1e-6)(qp)().iterations for _ in range(2))
+    assert one == two == SOLVERS["osqp"].prepare(qp, 1e-6)().iterations
+
+
+def test_matrices_that_differ_are_not_updated(planted):
+    qp, _ = planted("everything")
+    assert only_vectors_differ(qp, replace(qp, q=qp.q + 1, h=qp.h + 1, lb=qp.lb - 1))
+    assert not only_vectors_differ(qp, replace(qp, P=qp.P * 2))
+    assert not only_vectors_differ(qp, replace(qp, G=qp.G * 2))
+    assert not only_vectors_differ(qp, replace(qp, A=qp.A * 2))
+    assert not only_vectors_differ(qp, replace(qp, ub=np.full(20, np.inf)))
+
+
+@pytest.mark.parametrize("name", ["daqp", "quadprog", "piqp-dense", "proxqp-dense"])
+def test_a_dense_solver_declines_what_does_not_fit(planted, monkeypatch, name):
+    qp, _ = planted("bounds", n=400)  # 1.2 MiB a matrix
+    assert SOLVERS[name].declines(qp) is None
+    monkeypatch.setenv("MORTARBENCH_MEMORY_MIB", "2")
+    reason = SOLVERS[name].declines(qp)
+    assert reason.startswith("needs ")
+    assert reason.endswith(" MiB for dense matrices of 400 rows; the limit is 2 MiB")
+
+
+def test_a_solver_tells_its_linear_solver(planted):
+    qp, _ = planted("box")
+    for name in NATIVE:
+        assert solve(name, qp, 1e-6).reported["linear_solver"]
+
+
+def test_highs_has_no_hidden_regularisation(planted):
+    # 1e-7 on the Hessian's diagonal would show in the ninth digit and before
+    qp, _ = planted("singular")
+    small = replace(qp, P=qp.P * 1e-4, q=qp.q * 1e-4)
+    for name in ("highs", "highs-hipo"):
+        solution = solve(name, small)
+        assert kkt_residuals(small, solution).worst <= 1e-9
+
+
+@pytest.mark.parametrize("name", ["highs", "highs-hipo"])
+def test_highs_drops_no_small_entries(name):
+    # a flexibility matrix in large units of force; entries below 1e-9 matter
+    family = BeamRing()
+    params = family.complete({"Nr": 4, "Nh": 3, "steps": 1})
+    qp = family.build("dual", params, reference_solution).qp
+    unit = 1e-5
+    small = replace(qp, P=qp.P * unit, b=qp.b / unit)
+    assert kkt_residuals(small, solve(name, small)).worst <= 1e-8
+
+
+def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(planted):
+    qp, _ = planted("singular")
+    solution = SOLVERS["quadprog"].prepare(qp, 1e-6)()
+    assert solution.status is Status.DECLINED
+    assert solution.message == "P is not positive definite"
+
+
+def test_qoco_is_not_believed_where_its_iterates_diverge():
+    solution = solve("qoco", unbounded())
+    assert solution.status is Status.FAILED
+    assert solution.message == "diverged"

@@ -51,4 +51,4 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
 # The variables pin what wheels are built with, too (new pip reads the second).
 echo "setup: installing Python packages into .venv"
 export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_BUILD_CONSTRAINT="$PWD/constraints.txt"
-.venv/bin/python -m pip install -q --disable-pip-version-check -e '.[dev]'
+.venv/bin/python -m pip install -q --disable-pip-version-check -e '.[fleet,dev]'

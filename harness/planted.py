@@ -1,0 +1,128 @@
+"""QPs whose solution is known by construction: what solvers are examined on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array, eye_array, kron
+
+from harness.qp import QP, Matrix, Vector, no_rows
+from harness.solution import Solution, Status
+
+#: m equality and p inequality rows, which bounds, fixed variables, rank of P, …
+SHAPES: Mapping[str, Mapping[str, Any]] = {
+    "bounds": dict(upper=False),
+    "box": dict(),
+    "free": dict(m=4, p=6, lower=False, upper=False),
+    "equalities": dict(m=5, lower=False, upper=False),
+    "inequalities": dict(p=8, lower=False, upper=False),
+    "some bounds": dict(m=3, some=True, upper=False),
+    "everything": dict(m=5, p=8, some=True),
+    "singular": dict(m=3, p=4, rank=12),
+    "redundant": dict(m=4, redundant=True, upper=False),
+    "fixed": dict(m=2, p=3, fixed=True),
+    "unconstrained": dict(lower=False, upper=False),
+}
+
+
+def planted(
+    shape: str, *, seed: int = 271828, dense: bool = False, n: int = 20
+) -> tuple[QP, Solution]:
+    """Draw x*, multipliers and an active set; solve stationarity for q.
+
+    Give a QP and a KKT point of it. It has matrices of order one, active constraints of
+    every kind that the shape (a key of `SHAPES`) names and, but for "singular", one
+    minimiser.
+    """
+    store: Callable[[Matrix], Matrix] = np.asarray if dense else csr_array
+    return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])
+
+
+def _plant(
+    rng: np.random.Generator,
+    n: int,
+    store: Callable[[Matrix], Matrix],
+    shape: Mapping[str, Any],
+) -> tuple[QP, Solution]:
+    m, p, rank = (shape.get(k, v) for k, v in (("m", 0), ("p", 0), ("rank", n)))
+    lower, upper = shape.get("lower", True), shape.get("upper", True)
+    M = rng.standard_normal((n, rank))
+    P = M @ M.T / rank + (0.1 * np.eye(n) if rank == n else 0.0)
+    A, G = rng.standard_normal((m, n)), rng.standard_normal((p, n))
+    if shape.get("redundant"):
+        A[-1] = A[:-1].sum(axis=0)
+    x = rng.standard_normal(n)
+    y = rng.standard_normal(m)
+    z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
+    # of four variables one is at its lower, one at its upper bound, two are inside
+    at_lb = lower & (np.arange(n) % 4 == 0)
+    at_ub = upper & (np.arange(n) % 4 == 1)
+    bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
+    z_box = (0.5 + rng.exponential(size=n)) * (at_ub * 1.0 - at_lb)
+    fixed = at_lb if shape.get("fixed") else np.full(n, False)
+    lb = np.where(lower & bounded, np.where(at_lb, x, x - 1), -np.inf)
+    ub = np.where(upper & bounded, np.where(at_ub, x, x + 1), np.inf)
+    qp = QP(
+        P=store(P), q=-(P @ x + A.T @ y + G.T @ z + z_box),
+        A=store(A), b=A @ x,
+        G=store(G), h=G @ x + np.where(z > 0, 0.0, 1.0),
+        lb=lb, ub=np.where(fixed, lb, ub),
+    )  # fmt: skip
+    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+
+
+def one_of_each() -> tuple[QP, dict[str, Vector]]:
+    """Four separate problems min ½x² + qx, one active constraint of each kind.
+
+    x₀ ≤ 1 and x₁ ≥ −1 (bounds), 2x₂ ≤ 2 (row), 2x₃ = 2; all multipliers follow by hand.
+    """
+    inf = np.inf
+    qp = QP(
+        P=csr_array(np.eye(4)), q=np.array([-3.0, 4.0, -5.0, -9.0]),
+        A=csr_array([[0.0, 0, 0, 2]]), b=np.array([2.0]),
+        G=csr_array([[0.0, 0, 2, 0]]), h=np.array([2.0]),
+        lb=np.array([-inf, -1, -inf, -inf]), ub=np.array([1, inf, inf, inf]),
+    )  # fmt: skip
+    vectors = dict(x=[1.0, -1, 1, 1], y=[4.0], z=[2.0], z_box=[2.0, -3, 0, 0])
+    return qp, {name: np.array(v) for name, v in vectors.items()}
+
+
+def membrane(k: int) -> QP:
+    """Press a membrane of k·k nodes, fixed at its rim, onto a paraboloid.
+
+    Bounds only; its solution is not known beforehand, its KKT conditions are.
+    """
+    second = diags_array(
+        [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]
+    )
+    eye = eye_array(k)
+    x, y = np.meshgrid(*2 * [np.arange(1, k + 1) / (k + 1)])
+    n = k * k
+    return QP(
+        P=csr_array(kron(second, eye) + kron(eye, second)),
+        q=np.full(n, 8 / (k + 1) ** 2),
+        A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
+        lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
+        ub=np.full(n, np.inf),
+    )  # fmt: skip
+
+
+def infeasible() -> QP:
+    """Ask for x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
+    rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
+    return QP(
+        P=csr_array(np.eye(20)), q=np.ones(20), A=no_rows(20), b=np.zeros(0),
+        G=csr_array(rows), h=-np.ones(2),
+        lb=np.full(20, -np.inf), ub=np.full(20, np.inf),
+    )  # fmt: skip
+
+
+def unbounded() -> QP:
+    """Leave no curvature and no upper bound along x₀, but a slope."""
+    return QP(
+        P=csr_array(np.diag([0.0] + [1.0] * 19)), q=-np.ones(20),
+        A=no_rows(20), b=np.zeros(0), G=no_rows(20), h=np.zeros(0),
+        lb=np.full(20, -1.0), ub=np.full(20, np.inf),
+    )  # fmt: skip
