@@ -110,9 +110,16 @@ def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> lis
     return [*lines, ""]
 
 
-@cache
 def _meanings(kind: type) -> dict[str, str]:
-    """Read the `#:` comments behind the fields of a dataclass."""
+    """Read the `#:` comments behind the fields of a dataclass and of its bases."""
+    known: dict[str, str] = {}
+    for base in kind.__mro__:
+        known = {**_own_meanings(base), **known}
+    return known
+
+
+@cache
+def _own_meanings(kind: type) -> dict[str, str]:
     try:
         source = dedent(inspect.getsource(kind))
     except (OSError, TypeError):  # not from a file

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
-from harness import QP, Solution, Status, Vector, kkt_residuals
+from harness import QP, About, Solution, Status, Vector, kkt_residuals
 from solvers.conversion import dense, needs_matrices, positive
 
 LARGEST = 5_000  #: components; P is made dense
@@ -32,6 +33,14 @@ class BVLS:
     """
 
     max_iter: int = 10_000
+
+    about: ClassVar[About] = About(
+        title="Bounded least squares (scipy)", licence="BSD-3-Clause",
+        method="active set: `nnls` and `lsq_linear` on a Cholesky factor",
+        linear_solver="LAPACK, within scipy",
+        phases="preparing factorises P",
+        limits=("`nnls` does not tell its iterations",),
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         positive(max_iter=self.max_iter)

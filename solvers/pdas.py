@@ -31,12 +31,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-from harness import QP, Solution, Status, Vector, kkt_residuals
+from harness import QP, About, Solution, Status, Vector, kkt_residuals
 from solvers.active_set import (
     DELTA,
     KAPPA,
@@ -80,6 +80,20 @@ class PDAS:
     """
 
     max_iter: int = 5_000
+
+    about: ClassVar[About] = About(
+        title="PDAS (ours)", licence="BSD-3-Clause",
+        method="primal-dual active set, in a proximal method of multipliers",
+        linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
+        phases="preparing forms the penalised matrix; solving factorises every face",
+        sequence="active set and point",
+        limits=(
+            "on one-dimensional obstacles the front moves a node a step: 323 solves "
+            "for 1000 nodes",
+            "sparse faces are analysed anew each time: 97 ms a factor at Nr = 30, Nh = "
+            "15 where 60 ms would do",
+        ),
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         positive(max_iter=self.max_iter)

@@ -17,11 +17,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from harness import QP, Solution, Status, Vector, kkt_residuals
+from harness import QP, About, Solution, Status, Vector, kkt_residuals
 from solvers.certificate import descends
 from solvers.conversion import positive
 
@@ -42,6 +42,14 @@ class ProjectedGradient:
 
     memory: int = 10  #: M of the line search; 1 is monotone
     max_iter: int = 50_000
+
+    about: ClassVar[About] = About(
+        title="Spectral projected gradient (ours)", licence="BSD-3-Clause",
+        method="projected gradient with Barzilai-Borwein steps",
+        linear_solver="none: products with P",
+        phases="everything happens in solving",
+        limits=("irregular: 45 to 546 products over the load steps of the benchmark",),
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         positive(memory=self.memory, max_iter=self.max_iter)

@@ -20,8 +20,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
-from harness import QP, Solution
+from harness import QP, About, Solution
 from solvers.certify import Carry, prepared
 from solvers.options import Options
 from solvers.preconditioner import lacking
@@ -34,6 +35,19 @@ class SMALBE(Options):
     `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. A point is claimed
     solved only if its KKT residuals on the original problem are within 5·tol as well.
     """
+
+    about: ClassVar[About] = About(
+        title="SMALBE (ours)", licence="BSD-3-Clause",
+        method="augmented Lagrangian with an active-set method inside (MPRGP)",
+        linear_solver="none: products with P, and small dense systems of the model of P",
+        phases="preparing orthonormalises rows and runs the Lanczos process",
+        sequence="point, multipliers, Ritz pairs, factor of the free block",
+        limits=(
+            "inequality rows are declined: dualise first",
+            "of 2400 hostile random QPs (ill-conditioned, degenerate, with nearly "
+            "parallel rows, tolerances to 1e-12) 43 ended as `iteration_limit`",
+        ),
+    )  # fmt: skip
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
