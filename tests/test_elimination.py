@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import bsr_array, coo_array, dia_array
 
 from harness import QP, Status, kkt_residuals, no_rows
 from solvers.elimination import eliminate_free
@@ -108,3 +109,29 @@ def test_on_bounds_only_it_agrees_with_the_reference(dual):
 
     x = SMALBE(eliminate="always").prepare(qp, 1e-10)().x
     assert x == pytest.approx(reference_solution(qp).x, abs=1e-8)
+
+
+def test_factorised_columns_count_as_products(dual):
+    """12 of them; 12 Lanczos steps; start; steps; two checks."""
+    qp = dual(271828, r=0)
+    c = SMALBE(eliminate="always").prepare(qp, 1e-6)().counts
+    steps = c.get("cg", 0) + c.get("proportioning", 0) + 2 * c.get("expansion", 0)
+
+    assert c["P_products"] == 12 + 12 + 1 + steps + 2
+
+
+@pytest.mark.parametrize("store", [coo_array, dia_array, bsr_array])
+def test_any_storage_of_P_is_taken(dual, store):
+    qp = dual(271828)
+    s = SMALBE(eliminate="always").prepare(replace(qp, P=store(qp.P)), 1e-8)()
+
+    assert s.status is Status.SOLVED
+    assert s.counts["factorised_columns"] == 12
+
+
+def test_rows_that_hardly_meet_the_free_variables_are_not_eliminated(dual):
+    qp = dual(271828)
+    A = qp.A.copy()
+    A[0, :12] *= 1e-5
+
+    assert eliminate_free(replace(qp, A=A)) is None

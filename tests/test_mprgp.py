@@ -309,3 +309,52 @@ def test_the_observer_sees_every_step():
     assert "".join(letter for letter, _, _ in seen) == run.trace
     assert (seen[-1][1].x == run.x).all()
     assert (seen[-1][2].phi == np.where(run.x > lower, run.g, 0)).all()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(seed):
+    """A flat spectrum of [1, 50] with B = I/20: some 27 products; 40 where τ stays."""
+    rng = np.random.default_rng(seed)
+    V = np.linalg.qr(rng.standard_normal((60, 60)))[0]
+    H, b = V * np.linspace(1, 50, 60) @ V.T, 10 * rng.standard_normal(60)
+    run, products = minimise(
+        H, b, np.zeros(60), np.ones(60), B=Model.of_norm(0.05, 60), rules=Rules(),
+        tol=1e-8,
+    )  # fmt: skip
+
+    assert run.stopped
+    assert products <= 32
+
+
+def test_an_expansion_by_the_model_begins_with_the_half_step():
+    """By hand: to x₁ = 0 along the CG step, then the model's minimum from there."""
+    A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
+    B = Model.of_norm(np.linalg.norm(A, 2), 2)
+    rules = Rules(proportioning="cg")
+    before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1, B=B, rules=rules)
+    after, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=2, B=B, rules=rules)
+    p = before.x - np.array([-1.0, 0.0])
+    half = before.x - before.x[0] / p[0] * p
+    g = A @ half - b
+    s = np.maximum(half - g / B.tau, lower) - half
+    step = max(1.0, -(g @ s) / (s @ A @ s))
+
+    assert after.trace == "ce"
+    assert after.x == pytest.approx(half + step * s)
+
+
+def test_a_half_step_that_is_the_solution_is_kept():
+    """min ½x² + x over x ≥ −½ from 0: CG leads to −1, the bound is the solution."""
+    run, products = minimise([[1.0]], [-1.0], [-0.5], rules=Rules())
+
+    assert run.stopped
+    assert (run.trace, products) == ("e", 1)
+    assert run.x == pytest.approx([-0.5])
+
+
+def test_a_rounded_model_is_never_lowered():
+    U = np.array([[1.0, 0.0]])
+    B = Model(1.0, U, np.array([4.0]))
+    s = np.array([0.0, 1.0])
+
+    assert B.raised(s, 0.5).tau == 1.0

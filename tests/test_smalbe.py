@@ -454,3 +454,92 @@ def test_few_products_with_bounds_alone():
 
     assert kkt_residuals(qp, s).worst <= 1e-7
     assert s.counts["P_products"] <= 50
+
+
+@pytest.mark.parametrize("tol", [1e-2, 1e-4, 1e-6])
+def test_a_claim_keeps_half_of_what_the_harness_allows(dual, tol):
+    """The residuals of the QP as given decide, not those of the projected problem."""
+    for seed in range(2000, 2060):
+        qp = dual(seed)
+        for name in ("smalbe", "smalbe-permon"):
+            s = SOLVERS[name].prepare(qp, tol)()
+
+            assert s.status is Status.SOLVED
+            assert kkt_residuals(qp, s).worst <= 5 * tol
+
+
+def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
+    """On free components what is left of Fx − d + Gᵀy is orthogonal to the rows."""
+    qp = dual(271828)
+    s = SMALBE().prepare(qp, 1e-3)()
+    free = s.x > qp.lb
+    left = (qp.P @ s.x + qp.q + qp.A.T @ s.y)[free]
+    size = np.linalg.norm(left)
+
+    assert size > 1e-8
+    assert np.linalg.norm(qp.A[:, free] @ left) <= 1e-9 * size
+
+
+def test_an_inner_run_ends_at_eta_at_the_latest(dual):
+    """With M so large that only η stops it."""
+    problem = projected(dual(271828))
+    loose, tight = (
+        outer_loop(problem, M=1e9, eta=eta).outer[0].trace for eta in (0.5, 1e-4)
+    )
+
+    assert len(loose) < len(tight)
+
+
+def test_every_combination_of_steps_and_outer_iterations_counts_for_the_limit(dual):
+    s = SMALBE(max_steps=30, rho=1e-3).prepare(dual(271828), 1e-10)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.iterations + s.counts["outer"] <= 31
+    assert s.message == "step limit"
+
+
+def mixed(P, q, lb, ub, A, b):
+    return bounded(P, q, A, b, lb=np.asarray(lb), ub=np.asarray(ub))
+
+
+@pytest.mark.parametrize("name", INHOUSE)
+@pytest.mark.parametrize(
+    "qp",
+    [
+        mixed(np.diag([7e-4, 2e-3, 37, 405]), [-0.25, 1.37, -0.61, 1.79], 0.0, np.inf,
+              [[8.9, 1166, 0, 0.53], [26, 150, 0.015, 3.3]], [0, 0]),
+        mixed(np.diag([5.5, 0.77, 0.054]), [-0.955, 0.604, -6.2e-4], 0.0, np.inf,
+              [[0.007, 0.69, 0.082]], [0]),
+        mixed(np.diag([1, 1e-5]), [0, 0], -np.inf, np.inf, [[1, 1]], [1]),
+        mixed(np.eye(3), [1, -1, 1], [0, 0, -np.inf], np.inf, [[1, 1, 1e-6]], [1]),
+        mixed(np.diag([0.4, 5.8]), [-1, -0.8], 0.0, np.inf,
+              [[1.04, -0.06], [-1.25, 0.75]], [0.4298, -0.32]),
+    ],
+    ids=["x = 0 is the answer", "x = 0, positive row", "a first residual of 1e-2",
+         "an entry of 1e-6 for the free variable", "as many rows as variables"],
+)  # fmt: skip
+def test_what_once_failed(qp, name):
+    s = SOLVERS[name].prepare(qp, 1e-6)()
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 1e-5
+    assert s.counts["P_products"] <= 100
+
+
+def test_two_distinct_eigenvalues_are_known_after_two_lanczos_steps():
+    """The large one must not be left to the tail of the model."""
+    rng = np.random.default_rng(28)
+    v, A, x = rng.standard_normal(8), rng.standard_normal((1, 8)), rng.random(8)
+    P = np.eye(8) + 1e6 * np.outer(v, v) / (v @ v)
+    s = SMALBE().prepare(bounded(P, rng.standard_normal(8), A, A @ x, lb=0.0), 1e-8)()
+
+    assert s.status is Status.SOLVED
+    assert s.counts["P_products"] <= 40
+
+
+@pytest.mark.parametrize("name", INHOUSE)
+def test_a_large_box_with_a_far_feasible_point_is_not_called_infeasible(name):
+    """(0, 10⁷) meets x₁ + 10⁻⁷x₂ = 1, x₁ ≤ ½."""
+    qp = mixed(np.eye(2), [0, 0], 0.0, [0.5, 2e7], [[1, 1e-7]], [1])
+
+    assert SOLVERS[name].prepare(qp, 1e-8)().status is not Status.INFEASIBLE
