@@ -36,7 +36,7 @@ SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
     "cvxopt",
 )  # fmt: skip
-NATIVE = [n for n, s in SOLVERS.items() if hasattr(s, "about") and "*" not in n]
+NATIVE = [n for n, s in SOLVERS.items() if s.about.package and "*" not in n]
 LIBRARIES = {name: _module(name) for name in NATIVE} | {
     "qpsolvers:clarabel": "qpsolvers",
     "cvxpy:OSQP": "cvxpy",
