@@ -118,6 +118,7 @@ def _scales(
         *(
             _ratio(abs(M) @ np.abs(x) + np.abs(rhs), _row_sums(M))
             for M, rhs in ((qp.A, qp.b), (qp.G, qp.h))
+            if rhs.size
         ),
     )
     return _Scales(X, S, max(_sup(energies), floor_E, key=_nan_first))
@@ -170,6 +171,8 @@ def _ratio(error: Vector, scale: Vector | float) -> float:
 
 def _row_scale(M: Matrix, x: Vector, rhs: Vector, X: float) -> Vector:
     """Per row, the larger of |aᵢ|·|x| + |bᵢ| and ‖aᵢ‖₁X."""
+    if not rhs.size:  # sparse matrices take long over nothing
+        return rhs
     own = abs(M) @ np.abs(x) + np.abs(rhs)
     return np.asarray(np.maximum(own, _row_sums(M) * X))
 
