@@ -55,13 +55,21 @@ class _Bench:
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
 
     def warm_up(self) -> dict[str, Any]:
-        """Solve a QP with bounds and one with rows; how that ends will show later."""
-        eye, ones = np.eye(2), np.ones(2)
-        bounds: dict[str, Any] = dict(q=-ones, lb=np.zeros(2), ub=np.full(2, np.inf))
-        no_row = dict(A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0))
-        one_row_each = dict(A=ones[None], b=ones[:1], G=eye[:1], h=ones[:1])
+        """Solve a QP with bounds and one with rows; how that ends will show later.
+
+        A chain of springs, long enough for every branch of a solver to be taken once:
+        what is compiled, or loaded, at its first use must not be timed.
+        """
+        n = 32
+        P = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+        pull: dict[str, Any] = dict(
+            q=np.cos(np.arange(n)), lb=np.zeros(n), ub=np.full(n, np.inf)
+        )
+        one, ones = np.eye(n)[:1], np.ones((1, n))
+        no_row = dict(A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0))
+        one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
         for rows in (no_row, one_row_each):
-            _measured_here(self._solver, QP(P=eye, **bounds, **rows), 1e-6)
+            _measured_here(self._solver, QP(P=P, **pull, **rows), 1e-6)
         canary_seconds()
         gc.freeze()  # the modules that are loaded by now need no further collecting
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}

@@ -12,11 +12,13 @@ import numpy as np
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
 from solvers.elimination import Eliminated, FreeBlock, eliminate_free
+from solvers.facerun import face_run
 from solvers.history import History
-from solvers.mprgp import Rules
+from solvers.mprgp import FaceRun, Rules
 from solvers.options import Options
-from solvers.outer import Constants, Inner, Iterate, first_iterate, smalbe
+from solvers.outer import Constants, Inner, Iterate, Until, first_iterate, smalbe
 from solvers.preconditioner import face_preconditioner
+from solvers.products import dense_rows
 from solvers.projected import (
     Projected,
     Rows,
@@ -128,15 +130,28 @@ def _means(
     problem: Projected, qp: QP, options: Options, history: History | None
 ) -> Inner:
     """Choose what the inner problems are solved with."""
+    rules = Rules(
+        options.Gamma, options.expansion, options.proportioning, options.reduced
+    )
     plain = partial(problem.plain_model, alpha=options.alpha)
     return Inner(
-        rules=Rules(
-            options.Gamma, options.expansion, options.proportioning, options.reduced
-        ),
+        rules=rules,
         model=problem.model if options.expansion == "model" else plain,
         precondition=face_preconditioner(problem, qp, options.preconditioner),
         watch=None if history is None else partial(history.watch, problem),
+        run=None if history is not None else _compiled(problem, qp, options, rules),
     )
+
+
+def _compiled(
+    problem: Projected, qp: QP, options: Options, rules: Rules
+) -> Callable[[float, Until], FaceRun] | None:
+    """Take CG steps compiled where F is dense and the preconditioner allows it."""
+    F = dense_rows(qp.P)
+    if F is None or options.preconditioner not in WITHOUT_P:
+        return None
+    with_model = options.preconditioner == "model"
+    return face_run(F, problem, rules, problem.model if with_model else None)
 
 
 def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from harness import Vector
 
 Mask = NDArray[np.bool_]
+ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations
 
 
 @njit(cache=True)
@@ -40,10 +41,20 @@ def moved(
     x: Vector, g: Vector, alpha: float, p: Vector, Hp: Vector,
     lower: Vector, upper: Vector,
 ) -> tuple[Vector, Vector]:  # fmt: skip
-    """Return x − αp, kept within the bounds against rounding, and its gradient."""
+    """Return x − αp and its gradient.
+
+    What is beyond a bound, or nearer to it than rounding can tell, is on the bound: a
+    step as far as it is feasible must not stop short of the face.
+    """
     new_x, new_g = np.empty_like(x), np.empty_like(g)
     for i in range(x.size):
-        new_x[i] = min(max(x[i] - alpha * p[i], lower[i]), upper[i])
+        step = alpha * p[i]
+        new, noise = x[i] - step, ROUNDING * (abs(x[i]) + abs(step))
+        if new - lower[i] <= noise and step >= 0:
+            new = lower[i]
+        elif upper[i] - new <= noise and step <= 0:
+            new = upper[i]
+        new_x[i] = new
         new_g[i] = g[i] - alpha * Hp[i]
     return new_x, new_g
 

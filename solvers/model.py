@@ -89,11 +89,17 @@ class Model:
         w = self.w + self.tau - tau
         return Model(tau, self.U[w > 0], w[w > 0])
 
+    def core_in(self, free: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return U_F, zero off the face F, and N with B_FF⁻¹ = (I − U_FᵀNU_F)/τ.
+
+        N = (τW⁻¹ + U_F U_Fᵀ)⁻¹ by Sherman, Morrison and Woodbury.
+        """
+        U_f, root = self.U * free, np.sqrt(self.w)
+        return U_f, root[:, None] * np.linalg.inv(_core(U_f, root, self.tau)) * root
+
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
-        """Return v → B_FF⁻¹v_F, zero off the face F (Sherman, Morrison, Woodbury)."""
-        U_f = self.U * free
-        root = np.sqrt(self.w)
-        core = root[:, None] * np.linalg.inv(_core(U_f, root, self.tau)) * root
+        """Return v → B_FF⁻¹v_F, zero off the face F."""
+        U_f, core = self.core_in(free)
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)

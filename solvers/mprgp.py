@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -90,6 +90,23 @@ Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, whe
 Step = tuple[str, Point, Model] | None
 
 
+class FaceRun(Protocol):
+    """Takes CG steps in a face, as many as `mprgp` would take one after the other.
+
+    alpha : ᾱ of the reduced free gradient
+    most : steps to take
+    """
+
+    def __call__(
+        self, at: Point, p: Vector, face: Face, alpha: float, most: int
+    ) -> tuple[Point, Vector, Vector | None, int]:
+        """Return where it ended, the next direction, and the number of steps.
+
+        Third is Hp if the next CG step would leave the box, None if it is to be asked
+        again whether to stop or to proportion. Then at least one step was taken.
+        """
+
+
 class _Task(NamedTuple):
     H: Operator
     b: Vector
@@ -108,6 +125,7 @@ def mprgp(
     rules: Rules,
     precondition: Precondition | None = None,
     watch: Watch | None = None,
+    run: FaceRun | None = None,
     max_steps: int = 10_000,
 ) -> Minimum:
     """Minimise ½xᵀHx − bᵀx over l ≤ x ≤ u.
@@ -121,6 +139,7 @@ def mprgp(
     stop : says from x and ‖g^P‖₂ whether to stop; asked before every step
     precondition : makes the preconditioner of the CG steps in a face
     watch : told the letter of each step, the new point and its face
+    run : takes the CG steps, faster than one by one; `watch` is not told of them
 
     """
     task = _Task(H, b, bounds, rules)
@@ -129,11 +148,18 @@ def mprgp(
     face = split(at, bounds)
     z_of = precondition(face.free)
     p = z_of(face.phi)
+    Hp: Vector | None
     while not (done := stop(at.x, face.projected_norm)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
             step = _proportion(task, at, face, B)
         else:
-            Hp = H(p)
+            if run is None:
+                Hp = H(p)
+            else:
+                at, p, Hp, steps = run(at, p, face, 1 / B.tau, max_steps - len(trace))
+                face, trace = split(at, bounds), trace + "c" * steps
+                if Hp is None:
+                    continue
             step = _minimise_or_expand(task, at, p, Hp, B)
         if step is None:
             break

@@ -27,7 +27,14 @@ import numpy as np
 
 from harness import Status, Vector
 from solvers.model import Model
-from solvers.mprgp import Minimum, Precondition, Rules, Watch, mprgp
+from solvers.mprgp import (
+    FaceRun,
+    Minimum,
+    Precondition,
+    Rules,
+    Watch,
+    mprgp,
+)
 from solvers.projected import Projected
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
@@ -46,6 +53,14 @@ class Constants:
     max_steps: int
 
 
+class Until(NamedTuple):
+    """When an inner run may end."""
+
+    small: float  #: ‖g^P‖ ≤ small
+    coarse: float  #: … or ‖g^P‖ < coarse and ‖g^P‖ < M‖Cν‖
+    M: float
+
+
 @dataclass(frozen=True, eq=False)
 class Inner:
     """How the inner problems are solved, for each ρ."""
@@ -55,6 +70,7 @@ class Inner:
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
     """Makes the observer of outer iteration k with that right-hand side."""
+    run: Callable[[float, Until], FaceRun] | None = None  #: compiled CG steps
 
 
 class Outer(NamedTuple):
@@ -107,13 +123,13 @@ def smalbe(
     b_size = _norm(b) or _norm(at.g)
     left = constants.max_steps - len(at.steps) - len(at.outer)
     lagrangian = -np.inf
+    until = Until(tol * b_size, constants.eta * b_size, at.M)
 
     def small(nu: Vector, projected: float) -> bool:
-        return projected <= tol * b_size and problem.rows.met(nu, tol, b_size)
+        return projected <= until.small and problem.rows.met(nu, tol, b_size)
 
     def precise(nu: Vector, projected: float) -> bool:
-        bound = constants.eta * b_size
-        if len(C) and projected < bound and projected < at.M * _norm(C @ nu):
+        if len(C) and projected < until.coarse and projected < at.M * _norm(C @ nu):
             return True
         return small(nu, projected)
 
@@ -124,6 +140,7 @@ def smalbe(
             B=inner.model(at.rho), stop=precise, rules=inner.rules,
             precondition=inner.precondition(at.rho),
             watch=inner.watch and inner.watch(len(at.outer), rhs),
+            run=inner.run and inner.run(at.rho, until._replace(M=at.M)),
             max_steps=max(left, 0),
         )  # fmt: skip
         left -= len(run.trace) + 1
