@@ -103,7 +103,10 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     rank = int((size >= GOOD).sum())
     meets, others = left[:, :rank], left[:, rank:]
     G, N, Cx = meets.T @ rows.C, others.T @ rows.C, rows.C @ rows.x_tilde
-    solve = _saddle(block, G[:, free])
+    try:
+        solve = _saddle(block, G[:, free])
+    except LinAlgError:  # rows that P_EE⁻¹ makes nearly parallel
+        return None
     G_I, P_EI = G[:, ~free], _block(qp.P, free, ~free)
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
     reduced = QP(

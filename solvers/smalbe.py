@@ -44,8 +44,8 @@ class SMALBE(Options):
         sequence="point, multipliers, Ritz pairs, factor of the free block",
         limits=(
             "inequality rows are declined: dualise first",
-            "of 2400 hostile random QPs (ill-conditioned, degenerate, with nearly "
-            "parallel rows, tolerances to 1e-12) 43 ended as `iteration_limit`",
+            "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
+            "parallel rows, tolerances to 1e-12) 36 ended as `iteration_limit`",
         ),
     )  # fmt: skip
 
