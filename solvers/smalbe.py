@@ -39,7 +39,7 @@ class SMALBE(Options):
     about: ClassVar[About] = About(
         title="SMALBE (ours)", licence="BSD-3-Clause",
         method="augmented Lagrangian with an active-set method inside (MPRGP)",
-        linear_solver="none: products with P, and small dense systems of the model of P",
+        linear_solver="none: products with P, small dense systems of the model of P",
         phases="preparing orthonormalises rows and runs the Lanczos process",
         sequence="point, multipliers, Ritz pairs, factor of the free block",
         limits=(
