@@ -11,8 +11,9 @@ import problems
 import solvers
 from harness import InputError
 from harness.names import canonical
+from harness.overrides import with_overrides
 from harness.registry import SolverSpec
-from harness.suite import load_suite, with_overrides
+from harness.suite import load_suite
 
 
 @dataclass(frozen=True)
