@@ -35,7 +35,7 @@ from harness.cases import content_digest
 from harness.conformance import run_check
 from harness.measure import Measurement, Prepare, measure, memory_mib
 from harness.plugin import Solver
-from harness.qp import QP, no_rows
+from harness.qp import QP, Vector, no_rows
 from harness.qpfile import load_qp
 from harness.record import finite
 from harness.serving import answer_requests
@@ -155,7 +155,7 @@ class _Bench:
 
 def canary_seconds() -> float:
     """Time a fixed small kernel, the median of five: a drift of it is the machine's."""
-    matrix, vector = np.ones((128, 128)), np.ones(128)
+    matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
     times = []
     for _ in range(5):
         start = perf_counter()
@@ -163,6 +163,13 @@ def canary_seconds() -> float:
             matrix @ vector
         times.append(perf_counter() - start)
     return median(times)
+
+
+def _aligned(count: int) -> Vector:
+    """Make ones that begin with a cache line, so that chance does not move them."""
+    room = np.ones(count + 8)
+    start = -room.ctypes.data % 64 // 8
+    return room[start : start + count]
 
 
 def _one_thread() -> int:
