@@ -357,7 +357,7 @@ def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
 
 @pytest.mark.parametrize(
     ("name", "cases"),
-    [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6), ("crossval", 22)],
+    [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6), ("crossval", 42)],
 )
 def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
     path = Path(__file__).parents[1] / "suites" / f"{name}.toml"
