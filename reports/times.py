@@ -59,7 +59,8 @@ def _charged(row: Mapping[str, Outcome], solvers: Sequence[str]) -> tuple[Cell, 
     """Make one row of the table of totals with dualising."""
     own = next(o.dualising for o in row.values() if o.dualising is not None)
     totals = {s: o.with_dualising for s, o in row.items() if o.verified}
-    best = min(t.value for t in totals.values() if t is not None)
+    ranked = [t for s, t in totals.items() if t is not None and not row[s].first.arm]
+    best = min((t.value for t in ranked), default=None)
     cells = []
     for solver in solvers:
         total = totals.get(solver)
@@ -114,10 +115,7 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
         return Cell(
             text=seconds(interval), after=words, kind="void", title=source(outcome)
         )
-    rivals = [o.seconds("total") for o in row.values() if o.verified]
-    fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
-    overlaps = interval.low <= fastest.high and interval.samples > 1
-    kind = "best" if interval == fastest else "tied" if overlaps else ""
+    kind = "" if outcome.first.arm else _rank(interval, row)
     return Cell(
         text=seconds(interval),
         symbol="≈" if kind == "tied" else "",
@@ -125,3 +123,13 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
         title=source(outcome),
         value=interval.value,
     )
+
+
+def _rank(interval: Interval, row: Mapping[str, Outcome]) -> str:
+    """Rank among the verified answers of a row; null arms do not compete."""
+    rivals = [
+        o.seconds("total") for o in row.values() if o.verified and not o.first.arm
+    ]
+    fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
+    overlaps = interval.low <= fastest.high and interval.samples > 1
+    return "best" if interval == fastest else "tied" if overlaps else ""

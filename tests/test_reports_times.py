@@ -80,6 +80,15 @@ def test_a_null_arm_is_paired_with_its_solver(record, section, factor, held):
     assert re.search(r"Here [01] of 1 interval", found.prose[0])
 
 
+def test_a_null_arm_does_not_win(record, section):
+    records = [record(), record("b", total_seconds=0.02)]
+    null = record("a (A/A)", arm="null", total_seconds=0.009, dualise_seconds=0.1)
+    records = [r.but(dualise_seconds=0.1) for r in records]
+    for table in section([*records, null], "times").tables:
+        (row,) = rows(table)
+        assert [row[s].kind for s in ("a", "b", "a (A/A)")] == ["best", "", ""]
+
+
 def test_a_null_arm_that_drove_a_sequence_is_paired_with_one_that_did(record, section):
     records = [
         record(f"a{arm} (sequence)", i, arm="null" if arm else "", mode="sequence")
