@@ -11,14 +11,16 @@ import io
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from harness import commands, examine
+from harness import commands, examine, one, processes
 from harness.errors import InputError
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
+
+_Run = Callable[[Workbench, argparse.Namespace], int]  #: returns the exit code
 
 
 class _Parser(argparse.ArgumentParser):
@@ -58,9 +60,9 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
 def _run(workbench: Workbench, argv: Sequence[str]) -> int:
     workbench = workbench.extended(entry_point_plugins())
     if argv[:1] == ["worker"]:  # how runs start their processes; not for users
-        return commands.worker(workbench, argv[1:])
+        return processes.worker(workbench, argv[1:])
     if argv[:1] == ["generator"]:
-        return commands.generator(workbench, argv[1:])
+        return processes.generator(workbench, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
@@ -94,24 +96,39 @@ def _parser() -> argparse.ArgumentParser:
         description="Compare QP solvers on elastic contact problems.",
         allow_abbrev=False,
     )
-    add = parser.add_subparsers(
+    found = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_Parser
-    ).add_parser
+    )
 
-    command = add("list", help="what there is", allow_abbrev=False)
+    def add(name: str, what: str, run: _Run) -> _Parser:
+        command: _Parser = found.add_parser(name, help=what, allow_abbrev=False)
+        command.set_defaults(run=run, parser=command)
+        return command
+
+    _add_list_options(add("list", "what there is", commands.list_))
+    _add_run_options(add("run", "measure a suite; continues a run", commands.run))
+    _add_solve_options(add("solve", "one solver on one case, once", one.solve))
+    _add_export_options(add("export", "one QP as a file", one.export))
+    _add_report_options(add("report", "report on a result folder", commands.report))
+    _add_replay_options(add("replay", "one measurement again", commands.replay))
+    _add_test_options(
+        add("test-solver", "the conformance suite, on one solver", examine.test_solver)
+    )
+    _add_paper_options(add("paper", "every figure of the paper", commands.paper))
+    _add_json(add("doctor", "is this machine fit to measure", commands.doctor))
+    return parser
+
+
+def _add_list_options(command: _Parser) -> None:
     command.add_argument("what", choices=("problems", "solvers", "suites"))
     command.add_argument(
         "--markdown", action="store_true", help="solvers: all about them, as in docs/"
     )
     _add_plugin(command)
     _add_json(command)
-    command.set_defaults(run=commands.list_, parser=command)
 
-    command = add("run", help="measure a suite; continues a run", allow_abbrev=False)
-    _add_run_options(command)
-    command.set_defaults(run=commands.run, parser=command)
 
-    command = add("solve", help="one solver on one case, once", allow_abbrev=False)
+def _add_solve_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE", help="FAMILY/key=value/…/FORM")
     command.add_argument("--solver", metavar="NAME", required=True)
     command.add_argument("--tol", metavar="T", type=float, default=1e-8)
@@ -126,51 +143,44 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_plugin(command)
     _add_json(command)
-    command.set_defaults(run=commands.solve, parser=command)
 
-    command = add("export", help="one QP as a file", allow_abbrev=False)
+
+def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE")
     command.add_argument("file", metavar="FILE.npz|mat", type=Path)
     _add_plugin(command)
-    command.set_defaults(run=commands.export, parser=command)
 
-    command = add("report", help="report on a result folder", allow_abbrev=False)
+
+def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
     )
-    command.set_defaults(run=commands.report, parser=command)
 
-    command = add("replay", help="one measurement again", allow_abbrev=False)
+
+def _add_replay_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
         "run_id", metavar="RUN_ID", help="of a journal line, or its first digits"
     )
     _add_plugin(command)
     _add_json(command)
-    command.set_defaults(run=commands.replay, parser=command)
-    command = add(
-        "test-solver", help="the conformance suite, on one solver", allow_abbrev=False
-    )
+
+
+def _add_test_options(command: _Parser) -> None:
     command.add_argument("solver", metavar="NAME")
     _add_plugin(command)
     _add_json(command)
-    command.set_defaults(run=examine.test_solver, parser=command)
 
-    command = add("paper", help="every figure of the paper", allow_abbrev=False)
+
+def _add_paper_options(command: _Parser) -> None:
     command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))
     command.add_argument(
         "--quick", action="store_true", help="fewer sizes and repeats: a minute or so"
     )
-    command.set_defaults(run=commands.paper, parser=command)
-
-    command = add("doctor", help="is this machine fit to measure", allow_abbrev=False)
-    _add_json(command)
-    command.set_defaults(run=commands.doctor, parser=command)
-    return parser
 
 
-def _add_run_options(command: argparse.ArgumentParser) -> None:
+def _add_run_options(command: _Parser) -> None:
     command.add_argument("suite", metavar="SUITE.toml", help="or the name of a suite")
     command.add_argument(
         "--out", metavar="DIR", type=_folder, help="default: out/NAME-OF-SUITE"
@@ -201,7 +211,7 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-def _add_plugin(command: argparse.ArgumentParser) -> None:
+def _add_plugin(command: _Parser) -> None:
     command.add_argument(
         "--plugin",
         metavar="FILE.py",
@@ -212,5 +222,5 @@ def _add_plugin(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_json(command: argparse.ArgumentParser) -> None:
+def _add_json(command: _Parser) -> None:
     command.add_argument("--json", action="store_true", help="for machines")

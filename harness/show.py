@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -200,3 +202,9 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
         case _:
             text = str(value)
     return f"{text} {unit}".rstrip()
+
+
+def say(text: str) -> None:
+    """Say something on stderr, beside the results."""
+    with suppress(BrokenPipeError):  # nobody listens: no reason to stop
+        print(f"mortarbench: {text}", file=sys.stderr)

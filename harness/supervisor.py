@@ -179,6 +179,8 @@ class WorkerProcess:
 
     def _read(self, timeout: float) -> None:
         """Take in what the worker has replied, waiting at most `timeout` seconds."""
+        if b"\n" in self._unread:  # two replies came at once
+            return
         if not select([self._replies], [], [], timeout)[0]:
             return
         chunk = os.read(self._replies, 2**16)

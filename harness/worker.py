@@ -16,10 +16,13 @@ is left.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
+import random
 import resource
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -32,12 +35,14 @@ from harness.cases import content_digest
 from harness.conformance import run_check
 from harness.measure import Measurement, Prepare, measure, memory_mib
 from harness.plugin import Solver
-from harness.qp import QP, no_rows
+from harness.qp import QP, Vector, no_rows
 from harness.qpfile import load_qp
 from harness.record import finite
 from harness.serving import answer_requests
 from harness.solution import Solution
 from harness.store import write_point
+
+_MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
 
 def serve(solver: Solver, request_fd: int, reply_fd: int) -> None:
@@ -53,6 +58,7 @@ class _Bench:
         self._solver = solver
         self._chain: Prepare | None = None
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
+        self._ballast = np.empty(0)
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds and one with rows; how that ends will show later.
@@ -82,6 +88,7 @@ class _Bench:
             start()
             return dict(run_check(request["check"], self._solver)._asdict())
         path = Path(request["qp"])
+        self._shift_heap()
         self._check(path, request.get("digest"))
         qp, _ = load_qp(path)
         canary = canary_seconds()
@@ -113,6 +120,19 @@ class _Bench:
             "canary_seconds": canary,
         }
 
+    def _shift_heap(self) -> None:
+        """Have arrays lie elsewhere than they did during the last measurement.
+
+        Where they begin relative to a cache line is chance, but would be the same for
+        as long as the process lives: two processes of one solver then differ by 10 %
+        and more, however often they are measured (Mytkowicz et al., ASPLOS 2009).
+        Varied, it is scatter, which intervals know.
+        """
+        self._ballast = np.empty(0)
+        with suppress(AttributeError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
+        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
+
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Begin a sequence at its first step, and go on with it at the others."""
         step = request.get("step")
@@ -143,7 +163,7 @@ class _Bench:
 
 def canary_seconds() -> float:
     """Time a fixed small kernel, the median of five: a drift of it is the machine's."""
-    matrix, vector = np.ones((128, 128)), np.ones(128)
+    matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
     times = []
     for _ in range(5):
         start = perf_counter()
@@ -151,6 +171,13 @@ def canary_seconds() -> float:
             matrix @ vector
         times.append(perf_counter() - start)
     return median(times)
+
+
+def _aligned(count: int) -> Vector:
+    """Make ones that begin with a cache line, so that chance does not move them."""
+    room = np.ones(count + 8)
+    start = -room.ctypes.data % 64 // 8
+    return room[start : start + count]
 
 
 def _one_thread() -> int:

@@ -102,6 +102,25 @@ class Outcome:
         return median_interval(times) if times else None
 
     @cached_property
+    def dualising(self) -> Interval | None:
+        """Median time of dualising over the builds of the case; None for primal ones.
+
+        All measurements of one build have the same.
+        """
+        values = {r.dualise_seconds for r in self.records if r.dualise_seconds}
+        return median_interval(sorted(values)) if values else None
+
+    @cached_property
+    def with_dualising(self) -> Interval | None:
+        """Median total time, that of dualising included; None for primal forms."""
+        times = [
+            r.total_seconds + r.dualise_seconds
+            for r in self.records
+            if r.total_seconds is not None and r.dualise_seconds
+        ]
+        return median_interval(times) if times else None
+
+    @cached_property
     def iterations(self) -> tuple[int, int] | None:
         """Fewest and most iterations over the repeats."""
         its = [r.iterations for r in self.records if r.iterations is not None]

@@ -20,11 +20,14 @@ from reports.markdown import markdown
 from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
 from reports.page import html
 from reports.physics import agreement, physics
-from reports.results import claims, errors, iterations, times
+from reports.precision import precision
+from reports.results import claims, errors, iterations
 from reports.scaling import Ladder, ladders, scaling
 from reports.setting import definitions, environment
 from reports.sheets import sheets
 from reports.summary import dateline, summary
+from reports.sweeps import accuracy
+from reports.times import times
 from reports.wording import TIMED, clean, tolerance
 
 FORMATS = ("html", "md", "tex", "csv")
@@ -77,6 +80,8 @@ def compose(evidence: Evidence) -> Page:
         cases(evidence),
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
+        precision(evidence),
+        accuracy(evidence),
         iterations(evidence),
         convergence(evidence),
         errors(evidence),

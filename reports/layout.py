@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from reports.data import Outcome
+from reports.data import Evidence, Outcome
 from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
 
 
@@ -105,3 +105,23 @@ def name_cell(name: str) -> Cell:
     """Show a name that may be long; all of it appears when pointed at."""
     shown = clean(name)
     return Cell(text=shown, title="" if shown == name else clean(name, 2000))
+
+
+def grid(
+    evidence: Evidence,
+    caption: str,
+    show: Callable[[Outcome, Mapping[str, Outcome]], Cell],
+) -> Table:
+    """Make a table with a row per (case, tol) and a column per solver."""
+    rows = []
+    for row in evidence.outcomes.values():
+        cells = [
+            show(row[s], row) if s in row else Cell(text=ABSENT, title="not run")
+            for s in evidence.solvers
+        ]
+        rows.append((*case_cells(row), *cells))
+    return Table(
+        caption=caption,
+        columns=("case", "tol", *(clean(s, 40) for s in evidence.solvers)),
+        rows=tuple(rows),
+    )

@@ -1,15 +1,22 @@
-"""Verdicts, times, iterations and residuals of every case and solver."""
+"""Verdicts, iterations and residuals of every case and solver."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from harness import Verdict
 from harness.kkt import VERIFIED_FACTOR
 from reports.data import RESIDUALS, Evidence, Outcome
-from reports.intervals import COVERAGE, Interval
-from reports.layout import Cell, Section, Table, case_cells, source, verdict_cell
-from reports.wording import ABSENT, TIMED, VERDICTS, clean, power, seconds, span
+from reports.layout import (
+    Cell,
+    Section,
+    Table,
+    case_cells,
+    grid,
+    source,
+    verdict_cell,
+)
+from reports.wording import clean, power, span
 
 
 def claims(evidence: Evidence) -> Section:
@@ -23,7 +30,7 @@ def claims(evidence: Evidence) -> Section:
             "inaccurate and wrong answers were claimed to be solved.",
         ),
         tables=(
-            _grid(evidence, "Verdicts and worst residuals.", _verdict),
+            grid(evidence, "Verdicts and worst residuals.", _verdict),
             *_refuted(evidence),
         ),
     )
@@ -82,78 +89,6 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
     return Cell(**{**vars(cell), "title": f"{message} · {cell.title}".lstrip(" ·")})
 
 
-def times(evidence: Evidence) -> Section:
-    """Compare the total times of verified answers."""
-    intervals = [o.seconds("total") for o in evidence.flat]
-    return Section(
-        name="times",
-        title="Times",
-        prose=(
-            "Median of prepare + solve over the repeats, each prepared afresh, and in "
-            "brackets an interval for the median.",
-            _coverage(intervals),
-            "Bold: the fastest verified answer of its row; ≈: verified, and its "
-            "interval overlaps that of the fastest, so that this run does not tell "
-            f"them apart.{_weakness(intervals)} Struck out: the answer was not "
-            "verified, so its time is no result.",
-        ),
-        tables=(_grid(evidence, f"Total time, median and interval. {TIMED}", _time),),
-    )
-
-
-def _coverage(intervals: list[Interval | None]) -> str:
-    """State what the brackets mean for each number of repeats that occurs."""
-    known = {i.samples: i.coverage for i in intervals if i is not None}
-    stated = ", ".join(
-        f"{coverage:.3g} for {n} repeats"
-        for n, coverage in sorted(known.items())
-        if n > 1
-    )
-    if not stated:
-        return "A single run says nothing of its uncertainty."
-    return (
-        "The interval runs between order statistics (below six repeats: the smallest "
-        "and the largest) and holds the true median, whatever the distribution, with "
-        f"probability {stated}; this presumes repeats that are independent and "
-        "identically distributed, which those on a busy machine are not."
-    )
-
-
-def _weakness(intervals: list[Interval | None]) -> str:
-    """Say how little an order of times means where an interval covers too rarely."""
-    known = [i for i in intervals if i is not None and i.samples > 1]
-    weakest = min(known, key=lambda i: i.coverage, default=None)
-    if weakest is None or weakest.coverage >= COVERAGE:
-        return ""
-    return (
-        f" That is a weak test: with {weakest.samples} repeats an interval misses the "
-        f"true median once in {1 / (1 - weakest.coverage):.0f} (it covers with "
-        f"{100 * weakest.coverage:.3g} %), so an order that rests on it may be chance."
-    )
-
-
-def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
-    interval = outcome.seconds("total")
-    if interval is None or not outcome.verified:
-        symbol, words = VERDICTS[outcome.verdict]
-        if interval is None:
-            return Cell(text=words, symbol=symbol, kind="quiet", title=source(outcome))
-        return Cell(
-            text=seconds(interval), after=words, kind="void", title=source(outcome)
-        )
-    rivals = [o.seconds("total") for o in row.values() if o.verified]
-    fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
-    overlaps = interval.low <= fastest.high and interval.samples > 1
-    kind = "best" if interval == fastest else "tied" if overlaps else ""
-    return Cell(
-        text=seconds(interval),
-        symbol="≈" if kind == "tied" else "",
-        kind=kind,
-        title=source(outcome),
-        value=interval.value,
-    )
-
-
 def iterations(evidence: Evidence) -> Section:
     """Show iterations, and whatever else the solvers count."""
     return Section(
@@ -164,7 +99,7 @@ def iterations(evidence: Evidence) -> Section:
             "they are made of. In parentheses: the answer was not verified.",
         ),
         tables=(
-            _grid(evidence, "Iterations, as each solver counts them.", _iterations),
+            grid(evidence, "Iterations, as each solver counts them.", _iterations),
             *_counts(evidence),
         ),
     )
@@ -260,23 +195,3 @@ def _residuals(outcome: Outcome, measures: tuple[str, ...]) -> tuple[Cell, ...]:
     case, tol = case_cells(outcome)
     solver = Cell(text=clean(outcome.solver, 40))
     return (case, solver, tol, verdict_cell(outcome), *cells)
-
-
-def _grid(
-    evidence: Evidence,
-    caption: str,
-    show: Callable[[Outcome, Mapping[str, Outcome]], Cell],
-) -> Table:
-    """Make a table with a row per (case, tol) and a column per solver."""
-    rows = []
-    for row in evidence.outcomes.values():
-        cells = [
-            show(row[s], row) if s in row else Cell(text=ABSENT, title="not run")
-            for s in evidence.solvers
-        ]
-        rows.append((*case_cells(row), *cells))
-    return Table(
-        caption=caption,
-        columns=("case", "tol", *(clean(s, 40) for s in evidence.solvers)),
-        rows=tuple(rows),
-    )

@@ -4,6 +4,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from select import select
 
 import pytest
 
@@ -244,3 +245,28 @@ def test_want_of_memory_is_told_from_the_peak_and_from_the_words(
     message, peak, expected
 ):
     assert out_of_memory(message, peak, 100.0) is expected
+
+
+def test_replies_that_come_together_are_not_waited_for(tmp_path, monkeypatch):
+    both = SHOWS.replace('    reply(event="start")\n', "").replace(
+        "    reply(\n        event=\"done\",",
+        '    os.write(replies, b\'{"event": "start"}\\n{"event": "done"}\\n\')\n'
+        '    dict(',
+    )  # fmt: skip
+    worker = WorkerProcess([sys.executable, "-c", both], tmp_path / "log")
+    limits = dict(time_limit=60, memory_limit=2000)
+    waited = []
+
+    def watched(*args):
+        found = select(*args)
+        waited.append(found[0] == [])
+        return found
+
+    try:
+        assert worker.ask({}, **limits).answer == {"event": "done"}
+        monkeypatch.setattr(supervisor, "POLL_SECONDS", 5.0)
+        monkeypatch.setattr(supervisor, "select", watched)
+        assert worker.ask({}, **limits).answer == {"event": "done"}
+    finally:
+        worker.close()
+    assert waited == [False]

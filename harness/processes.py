@@ -1,0 +1,38 @@
+"""The processes that runs start: a worker per solver, and a generator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from harness.generator import Generator
+from harness.generator import serve as serve_cases
+from harness.registry import SolverSpec, resolve
+from harness.workbench import Workbench
+from harness.worker import serve
+
+
+def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
+    """Be the worker that `Workbench.worker_command` starts."""
+    text, request_fd, reply_fd = arguments
+    request = json.loads(text)
+    workbench = workbench.with_files([Path(file) for file in request["plugins"]])
+    spec = SolverSpec(
+        name=request["name"], label=request["name"], options=request["options"]
+    )
+    serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
+    return 0
+
+
+def generator(workbench: Workbench, arguments: Sequence[str]) -> int:
+    """Be the generator that `Workbench.commands` starts."""
+    text, request_fd, reply_fd = arguments
+    files = [Path(file) for file in json.loads(text)["plugins"]]
+    workbench = workbench.with_files(files)
+    serve_cases(
+        Generator(workbench.families, workbench.reference),
+        int(request_fd),
+        int(reply_fd),
+    )
+    return 0
