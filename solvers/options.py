@@ -30,6 +30,7 @@ class Options:
     alpha: float = 1.9  #: ᾱ‖H‖ of plain gradient projection steps
     norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖
     lanczos_steps: int = 12  #: products spent on it
+    # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
     history: bool = False  #: keep a row per step
     max_steps: int = 20_000  #: of MPRGP and outer iterations, in total
