@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from io import StringIO
+from math import lcm
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
 }
+LEGEND_LINE = 0.21  #: height of a line of a legend, inches
 _METADATA: dict[str, dict[str, Any]] = {
     ".pdf": {"CreationDate": None},
     ".svg": {"Date": None},
@@ -104,9 +106,10 @@ def legible(label: str) -> str:
 
 def look(index: int, *, line: bool = True) -> dict[str, Any]:
     """Colour, marker and dashes of the index-th solver; distinct in grey print too."""
+    rounds = index // lcm(len(COLOURS), len(MARKERS))  # of all pairs that come in turn
     return {
         "color": COLOURS[index % len(COLOURS)],
-        "marker": MARKERS[index % len(MARKERS)],
+        "marker": MARKERS[(index + rounds) % len(MARKERS)],
         "linestyle": DASHES[index % len(DASHES)] if line else "none",
     }
 
@@ -114,7 +117,8 @@ def look(index: int, *, line: bool = True) -> dict[str, Any]:
 def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
     """Draw total time and iterations against n on logarithmic axes."""
     with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.1))
+        entries = -(-len(ladder.solvers) // 2)  # lines of the legend
+        figure = Figure(figsize=(6.9, 2.4 + LEGEND_LINE * max(entries, 3)))
         left, right = figure.subplots(1, 2)
         for solver in ladder.solvers:
             style = look(solvers.index(solver))
@@ -187,7 +191,8 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
     if not shown:
         return None
     with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.2))
+        names = list(dict.fromkeys(o.solver for o in shown))
+        figure = Figure(figsize=(6.9, max(3.2, 0.5 + LEGEND_LINE * len(names))))
         axes = figure.subplots()
         for index, solver in enumerate(evidence.solvers):
             mine = [o for o in shown if o.solver == solver]
@@ -207,7 +212,6 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
             fontsize=8.5,
         )
         log_log(axes, "median total time in s", "worst residual / tolerance")
-        names = list(dict.fromkeys(o.solver for o in shown))
         keys = [
             Line2D([], [], **look(evidence.solvers.index(s), line=False)) for s in names
         ]

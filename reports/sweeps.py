@@ -12,10 +12,11 @@ from matplotlib.lines import Line2D
 from harness import Verdict
 from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
-from reports.figures import INK, STYLE, legible, log_log, look
+from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_log, look
 from reports.layout import Cell, Picture, Section, Table, name_cell, source
 from reports.wording import ABSENT, TIMED, clean, seconds, tolerance
 
+LEGEND_COLUMNS = 4
 _PANELS = 4  #: cases that are drawn; all are tabulated
 _LEAST = 1e-17  #: residuals below, zero among them, are drawn there
 
@@ -110,8 +111,10 @@ def _figure(
 ) -> Figure:
     columns = min(len(swept), 2)
     lines = -(-len(swept) // columns)
+    names = [s for s in solvers if any(s in row for row in swept.values())]
     with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 0.5 + 2.6 * lines))
+        legend = LEGEND_LINE * -(-len(names) // LEGEND_COLUMNS)
+        figure = Figure(figsize=(6.9, 0.3 + legend + 2.6 * lines))
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
         for axes, ((case, at), row) in zip(grid, swept.items(), strict=False):
             for solver, outcomes in row.items():
@@ -121,10 +124,9 @@ def _figure(
             log_log(axes, "median total time in s", "worst residual")
         for axes in grid[len(swept) :]:
             axes.set_axis_off()
-        names = [s for s in solvers if any(s in row for row in swept.values())]
         keys = [Line2D([], [], **look(solvers.index(s))) for s in names]
         labels = [legible(s) for s in names]
-        figure.legend(keys, labels, loc="outside lower center", ncols=4)
+        figure.legend(keys, labels, loc="outside lower center", ncols=LEGEND_COLUMNS)
     return figure
 
 

@@ -8,11 +8,13 @@ from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
 from reports.data import Evidence, arrange
+from reports.figures import scaling_figure
 from reports.folder import compose
 from reports.intervals import PowerLaw, median_interval
 from reports.latex import latex
 from reports.layout import Cell, Table
 from reports.markdown import markdown
+from reports.scaling import ladders
 from reports.wording import TIMED, exponent, power, seconds, significant
 
 ELASTIC = {
@@ -342,3 +344,18 @@ def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
     assert listed["hasty"]["its words"].text == "Optimal"
     assert listed["blind"]["evidence"].text == "no point"
     assert len(section(page(records[:1]), "verdicts").tables) == 1
+
+
+def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
+    """Thirty solvers leave the axes as high as three do."""
+
+    def height(count):
+        names = [f"solver-{i}" for i in range(count)]
+        records = [r for name in names for r in grown(measured, solver=name)]
+        evidence = Evidence(directory=tmp_path, records=arrange(records))
+        (ladder,) = ladders(evidence)
+        figure = scaling_figure(ladder, evidence.solvers)
+        figure.draw_without_rendering()
+        return figure.axes[0].get_position().height * figure.get_figheight()
+
+    assert height(30) >= 0.8 * height(3)

@@ -8,6 +8,7 @@ from matplotlib.collections import TriMesh
 from matplotlib.quiver import Quiver
 
 from harness import Fields, InputError
+from reports.figures import look
 from reports.mechanics import deformed_figure, draw_deformed, outlines
 
 LOWER, UPPER = 3, 6  # columns of cells
@@ -178,3 +179,9 @@ def test_bodies_without_extent_are_not_drawn(bodies, tmp_path):
 
     with pytest.raises(InputError, match="no width or no height"):
         draw_deformed(flat, tmp_path / "a.png")
+
+
+def test_fifty_solvers_look_different_from_each_other():
+    looks = {(look(i)["color"], look(i)["marker"]) for i in range(50)}
+
+    assert len(looks) == 50
