@@ -11,7 +11,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -250,9 +250,14 @@ def _scheduler_there(client: Any, address: str) -> Iterator[None]:
 
 
 def _end(client: Any, name: str) -> None:
-    """Have workers end the processes of this run, unless the scheduler is gone."""
-    if client.status == "running":
-        client.unregister_worker_plugin(name)
+    """Have workers end the processes of this run, unless the scheduler is gone.
+
+    It may go while it is asked, as a local one does at Ctrl-C (CommClosedError is an
+    OSError), or not know of us yet (KeyError); then nothing is lost.
+    """
+    with suppress(OSError, KeyError):
+        if client.status == "running":
+            client.unregister_worker_plugin(name)
 
 
 def _sharing(client: Any) -> int:

@@ -12,6 +12,7 @@ from typing import Any
 
 from harness import InputError, Record, Verdict
 from harness.journal import read_journal
+from harness.kkt import VERIFIED_FACTOR
 from reports.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
@@ -56,6 +57,12 @@ class Outcome:
     def tol(self) -> float:
         """The accuracy asked for."""
         return self.first.tol
+
+    @property
+    def allowed(self) -> float:
+        """The largest residual that verification allows, as `harness.kkt.verdict`."""
+        at = self.first.tol if self.first.accuracy is None else self.first.accuracy
+        return min(VERIFIED_FACTOR * at, 0.1)
 
     @property
     def solver(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from harness import Verdict
-from harness.kkt import VERIFIED_FACTOR
 from reports.data import RESIDUALS, Evidence, Outcome
 from reports.layout import (
     Cell,
@@ -57,14 +56,13 @@ def _refuted(evidence: Evidence) -> list[Table]:
 
 def _refutation(outcome: Outcome) -> tuple[Cell, ...]:
     """Make one row of the table of refuted claims."""
-    allowed = min(VERIFIED_FACTOR * outcome.tol, 0.1)
     values = {name: outcome.largest(name) for name in RESIDUALS}
     known = {name: v for name, v in values.items() if v is not None}
     name = max(known, key=lambda n: known[n], default=None)
     evidence = (
         "no point"
         if name is None
-        else f"{name} {power(known[name])} > {power(allowed)}"
+        else f"{name} {power(known[name])} > {power(outcome.allowed)}"
     )
     case, tol = case_cells(outcome)
     return (
@@ -179,11 +177,10 @@ def errors(evidence: Evidence) -> Section:
 
 def _residuals(outcome: Outcome, measures: tuple[str, ...]) -> tuple[Cell, ...]:
     """Make one row of the table of errors."""
-    allowed = min(VERIFIED_FACTOR * outcome.tol, 0.1)
     cells = []
     for name in measures:
         value = outcome.largest(name)
-        over = value is not None and value > allowed and name in RESIDUALS
+        over = value is not None and value > outcome.allowed and name in RESIDUALS
         cells.append(
             Cell(
                 text=power(value),

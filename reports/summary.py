@@ -72,7 +72,7 @@ def _made(evidence: Evidence) -> str:
     made = sum(r.status is not Verdict.DECLINED for r in evidence.records)
     repeats = _repeats(evidence)
     declined = sum(o.verdict is Verdict.DECLINED for o in evidence.flat)
-    cells = len(evidence.outcomes) * len(evidence.solvers)
+    cells = _cells(evidence)
     taken = sum(
         max(repeats, len(o.records))
         for o in evidence.flat
@@ -87,6 +87,18 @@ def _made(evidence: Evidence) -> str:
         text += f", {declined * repeats} not made because a solver declined"
     missing = total - made - declined * repeats
     return f"{text}, {missing} not made yet" if missing else text
+
+
+def _cells(evidence: Evidence) -> int:
+    """Count what can be measured: cold solvers on cold cases, sequences on theirs."""
+    modes = {r.solver: r.mode for r in evidence.records}
+    rows = evidence.outcomes.values()
+    present = [{o.first.mode for o in row.values()} for row in rows]
+    return sum(
+        modes.get(solver, "cold") in of_case
+        for of_case in present
+        for solver in evidence.solvers
+    )
 
 
 def _repeats(evidence: Evidence) -> int:

@@ -144,7 +144,7 @@ def one_of(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
 
 
 def positive(**options: float) -> None:
-    """Raise ValueError unless every option of a solver is positive."""
+    """Raise ValueError unless every option of a solver is positive and finite."""
     for name, value in options.items():
-        if not value > 0:
-            raise ValueError(f"{name} = {value}; expected a positive number")
+        if not 0 < value < np.inf:
+            raise ValueError(f"{name} = {value}; expected a finite positive number")

@@ -359,3 +359,28 @@ def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
         return figure.axes[0].get_position().height * figure.get_figheight()
 
     assert height(30) >= 0.8 * height(3)
+
+
+def test_what_an_accuracy_allows_is_what_the_table_of_refuted_claims_says(
+    measured, page
+):
+    """Asked for 1e-4, judged at 1e-6: a residual of 5e-5 is above 1e-5."""
+    record = measured(
+        tol=1e-4, accuracy=1e-6, gap=5e-5, status=Verdict.INACCURATE, primal=0.0
+    )
+    tables = [table for part in page([record]).sections for table in part.tables]
+    (row,) = (r for table in tables for r in rows(table) if "evidence" in r)
+
+    assert row["evidence"].text == "gap 5.0e-5 > 1.0e-5"
+
+
+def test_a_suite_of_cold_solves_and_sequences_misses_nothing(measured, page):
+    cold = [measured(physical="beam-ring/n=1")]
+    steps = [
+        measured("a (sequence)", physical=f"beam-ring/n={n}", mode="sequence")
+        for n in (2, 3)
+    ]
+    text = markdown(page([*cold, *steps]))
+
+    assert "3 measurements" in text
+    assert "not made yet" not in text
