@@ -307,14 +307,14 @@ def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(dual)
     assert True in cut
 
 
-@pytest.mark.parametrize("growth", [1.0, 4.0])
-def test_the_carried_gradient_is_the_gradient(dual, growth):
+@pytest.mark.parametrize(("growth", "rounding"), [(1.0, 1e-13), (4.0, 1e-12)])
+def test_the_carried_gradient_is_the_gradient(dual, growth, rounding):
     problem = projected(dual(271828))
     end = outer_loop(problem, M=10.0, growth=growth, tol=1e-6)
     C = problem.rows.C
 
     fresh = problem.H(end.nu, end.rho) - problem.b + C.T @ end.mu
-    assert end.g == pytest.approx(fresh, abs=1e-12)
+    assert end.g == pytest.approx(fresh, abs=rounding)
 
 
 def test_the_projected_problem_is_normalised_and_projected(dual):
