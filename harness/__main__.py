@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from harness import QP, Solution, cli
 from harness.environment import capture
 from harness.experiment import save_experiment
+from harness.kkt import VERIFIED_FACTOR
 from harness.plugin import Fields
 from harness.supervisor import ONE_THREAD
 from harness.workbench import Workbench
@@ -37,10 +38,12 @@ def main() -> None:
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
 
-def _report(folder: Path, formats: Sequence[str]) -> list[Path]:
+def _report(
+    folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
+) -> list[Path]:
     from reports import write_report  # late: workers must not carry matplotlib
 
-    return write_report(folder, formats)
+    return write_report(folder, formats, factor)
 
 
 def _plot(fields: Fields, path: Path) -> None:

@@ -17,6 +17,7 @@ from typing import NoReturn
 
 from harness import commands, examine, one, processes
 from harness.errors import InputError
+from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
 
@@ -155,6 +156,13 @@ def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
+    )
+    command.add_argument(
+        "--factor",
+        metavar="F",
+        type=float,
+        default=VERIFIED_FACTOR,
+        help="verified: every residual within F times the tolerance; default: 10",
     )
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from harness import show
 from harness.block import Opens, Unbuilt
 from harness.capsule import block_of, open_capsule
+from harness.checked import positive
 from harness.cluster import on_cluster
 from harness.describe import in_a_line, solvers_page
 from harness.doctor import as_json, examine, load_advice, render
@@ -141,7 +142,8 @@ def report(workbench: Workbench, options: Namespace) -> int:
     for form in formats:
         if form not in FORMATS:
             raise unknown("format", form, FORMATS, where="--format")
-    for file in workbench.report(options.folder, formats):
+    factor = positive("--factor", options.factor)
+    for file in workbench.report(options.folder, formats, factor=factor):
         print(file)
     return 0
 

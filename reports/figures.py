@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
 from reports.scaling import Ladder
 from reports.wording import clean, exponent
@@ -200,10 +199,10 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
             _scatter(axes, [o for o in mine if o.verified], style=style)
             refuted = {**style, "markerfacecolor": "none"}
             _scatter(axes, [o for o in mine if not o.verified], style=refuted)
-        axes.axhline(VERIFIED_FACTOR, color=INK, linewidth=0.8)
+        axes.axhline(evidence.factor, color=INK, linewidth=0.8)
         axes.annotate(
             "verified below",
-            (0.995, VERIFIED_FACTOR),
+            (0.995, evidence.factor),
             xycoords=("axes fraction", "data"),
             xytext=(0, -3),
             textcoords="offset points",

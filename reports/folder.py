@@ -9,6 +9,8 @@ from pathlib import Path
 
 from harness import Fields, InputError
 from harness.errors import unknown
+from harness.journal import read_journal
+from harness.kkt import VERIFIED_FACTOR
 from harness.store import load_fields
 from reports.cases import cases
 from reports.courses import convergence
@@ -19,6 +21,7 @@ from reports.layout import Page, Picture, Section
 from reports.markdown import markdown
 from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
 from reports.page import html
+from reports.parquet import write_records
 from reports.physics import agreement, physics
 from reports.precision import precision
 from reports.results import claims, errors, iterations
@@ -30,14 +33,18 @@ from reports.sweeps import accuracy
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
 
-FORMATS = ("html", "md", "tex", "csv")
+FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 
-def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
+def write_report(
+    directory: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
+) -> list[Path]:
     """Write DIR/report from DIR's journal; the same journal gives the same bytes.
 
     html: index.html. md: report.md. tex, csv: tables/. Figures (pdf, svg, png) go to
-    figures/ along with html, md or tex.
+    figures/ along with html, md or tex. parquet: records.parquet, the journal.
+
+    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
 
     Raises
     ------
@@ -48,7 +55,7 @@ def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
     for name in formats:
         if name not in FORMATS:
             raise unknown("report format", name, FORMATS)
-    evidence = read_evidence(directory)
+    evidence = read_evidence(directory, factor)
     target = directory / "report"
     written: list[Path] = []
     if {"html", "md", "tex"} & set(formats):
@@ -69,6 +76,9 @@ def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
             _write(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
             for name, frame in sheets(evidence).items()
         ]
+    if "parquet" in formats:
+        records = read_journal(directory)
+        written.append(write_records(target / "records.parquet", records))
     return written
 
 
@@ -90,7 +100,7 @@ def compose(evidence: Evidence) -> Page:
         physics(evidence),
         deformed(evidence),
         environment(evidence),
-        definitions(),
+        definitions(evidence.factor),
     )
     return Page(
         title=clean(evidence.name),

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from harness import Verdict
+from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell
 from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
@@ -52,7 +53,9 @@ def summary(evidence: Evidence) -> Section:
             f"Warning: the measurements come from {len(digests)} different "
             f"environments ({listing(digests)}); their times are not comparable."
         )
-    notes = (_judged(evidence), _busy(evidence), _unequal(evidence))
+    notes = (
+        _judged(evidence), _at_factor(evidence), _busy(evidence), _unequal(evidence),
+    )  # fmt: skip
     prose += [text for text in notes if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
     return Section(
@@ -116,6 +119,17 @@ def _judged(evidence: Evidence) -> str:
     return (
         f"The tolerances are what the solvers were asked for; verified means accurate "
         f"to {listing([tolerance(a) for a in at])} whatever was asked for."
+    )
+
+
+def _at_factor(evidence: Evidence) -> str:
+    """Say so if verdicts are not those that the journal holds."""
+    if evidence.factor == VERIFIED_FACTOR:
+        return ""
+    return (
+        f"Verdicts here are those at {evidence.factor:g} × tolerance, recomputed from "
+        f"the stored claims and residuals; the journal holds those at "
+        f"{VERIFIED_FACTOR:g} × tolerance."
     )
 
 

@@ -24,6 +24,11 @@ SOLVERS = load_plugin(WELLS).solvers
 FAMILIES = load_plugin(WELLS).problems
 
 
+def report(folder, formats, *, factor=10.0):
+    name = "index" if factor == 10 else f"index-{factor:g}"
+    return [folder / f"{name}.{f}" for f in formats]
+
+
 def paper(out, quick, say):
     say("Figure 1")
     return [out / f"index-{quick}.html", out / "figure1.pdf"]
@@ -41,7 +46,7 @@ def workbench(tmp_path):
         families=FAMILIES,
         solvers=SOLVERS,
         reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
-        report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
+        report=report,
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),
         series=lambda states, path: path.write_bytes(b"series"),
@@ -188,8 +193,25 @@ def test_an_exported_qp_is_the_emitted_one_and_says_whose_it_is(cli, tmp_path):
 def test_report_names_the_files_that_it_wrote(cli):
     code, out, _ = cli("report", "folder", "--format", "md,tex")
 
-    assert (code, out.splitlines()) == (0, ["folder/index.md", "folder/index.tex"])
-    assert len(cli("report", "folder")[1].splitlines()) == 4
+    assert (code, out.splitlines()) == (
+        0,
+        ["folder/index.md", "folder/index.tex"],
+    )
+    assert len(cli("report", "folder")[1].splitlines()) == 5
+
+
+def test_report_judges_at_the_factor_that_is_asked_for(cli):
+    assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
+        0, "folder/index-2.5.md\n", "",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
+def test_a_factor_that_is_not_positive_is_refused(cli, factor):
+    code, out, err = cli("report", "folder", "--factor", factor)
+
+    assert (code, out) == (2, "")
+    assert f"--factor = {float(factor)}; expected a positive number" in err
 
 
 def test_doctor_describes_the_machine(cli):
@@ -310,7 +332,7 @@ def test_a_terminal_of_few_characters_is_enough(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_named(workbench, capsys):
-    def report(folder, formats):
+    def report(folder, formats, **_):
         raise PermissionError(13, "Permission denied", str(folder / "index.html"))
 
     assert main(replace(workbench, report=report), ["report", "here"]) == 2
@@ -403,8 +425,8 @@ WRONG = {
         "well/dual has no bodies to draw; leave out --plot",
     ),
     "export format": (
-        ("export", "well/dual", "a.parquet"),
-        "'.parquet'; expected .npz or .mat",
+        ("export", "well/dual", "a.csv"),
+        "'.csv'; expected .npz or .mat or .parquet",
     ),
     "report format": (
         ("report", "folder", "--format", "md,htm"),
