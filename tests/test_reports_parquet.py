@@ -18,7 +18,7 @@ NESTED = {"params", "sizes", "options", "counts", "reported", "quantities"}
 def record(repeat=0, **changes):
     defaults = dict(
         run_id=f"r{repeat}", case="box/dual", family="box", params={"Nr": 4},
-        form="dual", sizes={"variables": 3}, solver="a", options={"eps": 1e-3}, tol=1e-6,
+        form="dual", sizes={"variables": 3}, solver="a", options={"e": 1.0}, tol=1e-6,
         repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
         iterations=7, total_seconds=0.25, quantities={"tip": [0.1, -0.2], "σ": 1.5},
     )  # fmt: skip
