@@ -30,6 +30,7 @@ def main() -> None:
         solvers=SOLVERS,
         reference=reference_solution,
         report=_report,
+        compare=_compare,
         plot=_plot,
         vtu=_vtu,
         series=_series,
@@ -44,6 +45,14 @@ def _report(
     from reports import write_report  # late: workers must not carry matplotlib
 
     return write_report(folder, formats, factor)
+
+
+def _compare(
+    before: Path, after: Path, formats: Sequence[str], *, factor: float
+) -> tuple[list[str], list[Path]]:
+    from reports import write_comparison
+
+    return write_comparison(before, after, formats, factor)
 
 
 def _plot(fields: Fields, path: Path) -> None:

@@ -155,6 +155,13 @@ def _add_export_options(command: _Parser) -> None:
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
+        "other",
+        metavar="DIR2",
+        type=Path,
+        nargs="?",
+        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+    )
+    command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
     )
     command.add_argument(

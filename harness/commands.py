@@ -137,14 +137,21 @@ def _engine(
 
 
 def report(workbench: Workbench, options: Namespace) -> int:
-    """Write the report on a result folder."""
+    """Write the report on a result folder, or what changed between two."""
     formats = options.format.split(",")
     for form in formats:
         if form not in FORMATS:
             raise unknown("format", form, FORMATS, where="--format")
     factor = positive("--factor", options.factor)
-    for file in workbench.report(options.folder, formats, factor=factor):
-        print(file)
+    if options.other is None:
+        for file in workbench.report(options.folder, formats, factor=factor):
+            print(file)
+        return 0
+    said, written = workbench.compare(
+        options.folder, options.other, formats, factor=factor
+    )
+    pages = [file for file in written if file.suffix == ".html"]
+    print(*said, *(pages or written), sep="\n")
     return 0
 
 

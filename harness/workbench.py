@@ -27,6 +27,15 @@ class Reporter(Protocol):
         """Report; verdicts are those at factor·tol."""
 
 
+class Comparer(Protocol):
+    """Writes what changed between two folders; returns a verdict and the files."""
+
+    def __call__(
+        self, before: Path, after: Path, formats: Sequence[str], *, factor: float
+    ) -> tuple[list[str], list[Path]]:
+        """Compare; verdicts are those at factor·tol."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Workbench:
     """What can be measured, and what to measure and show it with."""
@@ -35,6 +44,7 @@ class Workbench:
     solvers: Mapping[str, Solver]
     reference: Reference
     report: Reporter
+    compare: Comparer
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
     series: Callable[[Sequence[tuple[float, Fields]], Path], object]  #: of load steps

@@ -15,12 +15,9 @@ from harness.store import load_fields
 from reports.cases import cases
 from reports.courses import convergence
 from reports.data import Evidence, Outcome, read_evidence
-from reports.figures import accuracy_figure, save, scaling_figure
-from reports.latex import latex
+from reports.figures import accuracy_figure, scaling_figure
 from reports.layout import Page, Picture, Section
-from reports.markdown import markdown
 from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
-from reports.page import html
 from reports.parquet import write_records
 from reports.physics import agreement, physics
 from reports.precision import precision
@@ -32,6 +29,7 @@ from reports.summary import dateline, summary
 from reports.sweeps import accuracy
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
+from reports.writing import RENDERED, write_page, write_text
 
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 
@@ -57,23 +55,11 @@ def write_report(
             raise unknown("report format", name, FORMATS)
     evidence = read_evidence(directory, factor)
     target = directory / "report"
-    written: list[Path] = []
-    if {"html", "md", "tex"} & set(formats):
-        page = compose(evidence)
-        if "html" in formats:
-            written.append(_write(target / "index.html", html(page)))
-        if "md" in formats:
-            written.append(_write(target / "report.md", markdown(page)))
-        if "tex" in formats:
-            written += [
-                _write(target / "tables" / f"{s.name}.tex", latex(s.tables))
-                for s in page.sections
-                if s.tables
-            ]
-        written += _figures(page, target / "figures")
+    rendered = RENDERED & set(formats)
+    written = write_page(compose(evidence), target, formats) if rendered else []
     if "csv" in formats:
         written += [
-            _write(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
+            write_text(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
             for name, frame in sheets(evidence).items()
         ]
     if "parquet" in formats:
@@ -179,19 +165,3 @@ def _caption(outcome: Outcome, fields: Fields) -> str:
         f"({limits[0] / 1e9:.3g} GPa), since stresses may be singular at clamped and "
         f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
     )
-
-
-def _figures(page: Page, folder: Path) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = [p for section in page.sections for p in section.pictures]
-    return [
-        save(p.figure, folder / f"{p.name}.{ending}")
-        for p in pictures
-        for ending in ("pdf", "svg", "png")
-    ]
-
-
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
-    return path
