@@ -183,6 +183,26 @@ def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
     return mean_of(logs, [str(_key(p.after)) for p in timed])
 
 
+def relative_ratio(c: Comparison, solver: str) -> Mean | None:
+    """Average how much more a solver's time changed than that of the others.
+
+    Per case and tolerance its ratio is divided by the geometric mean of theirs: what
+    slows a whole run down cancels. None where no other solver has times on its cells.
+    """
+    others: dict[tuple[str, float], list[float]] = {}
+    for p in c.pairs:
+        if p.logs and p.after.solver != solver and not p.after.first.arm:
+            key = (p.after.case, p.after.tol)
+            others.setdefault(key, []).append(float(np.mean(p.logs)))
+    logs, names = [], []
+    for p in c.of(solver):
+        rivals = others.get((p.after.case, p.after.tol))
+        if p.logs and rivals:
+            logs.append(float(np.mean(p.logs)) - float(np.mean(rivals)))
+            names.append(str(_key(p.after)))
+    return mean_of(logs, names)
+
+
 def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:
     """Average the same of the canary, which is no solver: what the machine did."""
     logs, names = [], []

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.changes import Comparison, Mean, Pair, canary_ratio, mean_ratio, side
+from reports.changes import (
+    Comparison,
+    Mean,
+    Pair,
+    canary_ratio,
+    mean_ratio,
+    relative_ratio,
+    side,
+)
 from reports.comparison_figure import ratios_figure
 from reports.comparison_words import CHANGES, cell_name, named, ratio_text, sentences
 from reports.conditions import Difference, environments, options, settings
@@ -37,8 +45,9 @@ from reports.wording import (
 
 def compose(c: Comparison) -> Page:
     """Put the page together: conditions that differ first, then what changed."""
+    names = [clean(e.directory.resolve().name, 40) for e in (c.before, c.after)]
     return Page(
-        title=f"{clean(c.after.name)}: what changed",
+        title=f"{clean(c.after.name)}: what changed from {names[0]} to {names[1]}",
         dateline=f"before: {dateline(c.before)} — after: {dateline(c.after)}",
         sections=(
             _summary(c), _times(c), _verdicts(c), _iterations(c), _answers(c),
@@ -54,7 +63,7 @@ def _summary(c: Comparison) -> Section:
     rows = [_solver_row(c, solver) for solver in c.solvers]
     everything = mean_ratio(c.pairs)
     rows += [
-        (Cell(text=name, kind="total"), *_mean_cells(mean, "total"))
+        (Cell(text=name, kind="total"), *_mean_cells(mean, "total"), Cell(kind="total"))
         for name, mean in (("all", everything), ("canary", canary_ratio(c.pairs)))
         if mean is not None
     ]
@@ -68,8 +77,16 @@ def _summary(c: Comparison) -> Section:
                 caption="Time after over time before, geometric mean over the cells "
                 "that both folders hold verified, each cell once; in brackets the "
                 f"{COVERAGE:.0%} bootstrap interval over cells. The canary is a fixed "
-                "kernel: where it moved, or all solvers alike, the machine did.",
-                columns=("solver", "cells", "ratio", "change"),
+                "kernel: where it moved, or all solvers alike, the machine did. "
+                "Relative: the same, divided by the mean of the other solvers on the "
+                "cell, so that what slowed a whole run cancels.",
+                columns=(
+                    "solver",
+                    "cells",
+                    "ratio",
+                    "change",
+                    "relative to the others",
+                ),
                 rows=tuple(rows),
             ),
         ),
@@ -77,7 +94,12 @@ def _summary(c: Comparison) -> Section:
 
 
 def _solver_row(c: Comparison, solver: str) -> tuple[Cell, ...]:
-    return (name_cell(solver), *_mean_cells(mean_ratio(c.of(solver))))
+    relative = relative_ratio(c, solver)
+    return (
+        name_cell(solver),
+        *_mean_cells(mean_ratio(c.of(solver))),
+        Cell(text=ratio_text(relative), value=relative.value) if relative else Cell(),
+    )
 
 
 def _mean_cells(mean: Mean | None, kind: str = "") -> tuple[Cell, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from reports.changes import Comparison, Pair, mean_ratio
 from reports.figures import INK, STYLE, legible, look
@@ -66,4 +66,4 @@ def _ticks(axes: Axes) -> None:
     few = MaxNLocator(6, steps=[1, 2, 2.5, 5, 10])
     axes.xaxis.set_major_locator(few if narrow else LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.minorticks_off()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from harness.kkt import VERIFIED_FACTOR
 from harness.pairs import Ratio
-from reports.changes import Comparison, Mean, Pair, mean_ratio, side
+from reports.changes import Comparison, Mean, Pair, mean_ratio, relative_ratio, side
 from reports.conditions import environments, machines_differ
 from reports.intervals import COVERAGE
+from reports.summary import busy_with
 from reports.wording import VERDICTS, clean, plural, power, tolerance
 
 NAMED = 8  #: changes that are named; tables have all
@@ -15,7 +16,7 @@ CHANGES = {1: "slower", 0: "no change", -1: "faster"}
 
 def verdict_lines(c: Comparison) -> list[str]:
     """Say in a few lines of plain text how the comparison ended."""
-    lines = [_environments(c), _counted_times(c)]
+    lines = [*filter(None, (_environments(c), _busy(c))), _counted_times(c)]
     means = [(s, mean_ratio(c.of(s))) for s in c.solvers]
     lines += [
         f"  {s}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
@@ -23,14 +24,15 @@ def verdict_lines(c: Comparison) -> list[str]:
         for s, mean in means
         if mean is not None
     ]
-    lines += [_counted_verdicts(c), _counted_others(c)]
+    lines += [*filter(None, [_shared(c)]), _counted_verdicts(c), _counted_others(c)]
     return lines + [f"  {point}" for point in named(c)]
 
 
 def sentences(c: Comparison) -> tuple[str, ...]:
     """Say how the conditions compare, and count what changed."""
     counted = f"{_counted_verdicts(c)} {_counted_others(c)}"
-    return _environments(c), _counted_times(c), counted
+    said = (_environments(c), _busy(c), _counted_times(c), _shared(c), counted)
+    return tuple(filter(None, said))
 
 
 def _environments(c: Comparison) -> str:
@@ -63,6 +65,35 @@ def _counted_times(c: Comparison) -> str:
         f"Times: {slower} slower, {faster} faster, {len(timed) - slower - faster} "
         f"without a change, of {plural(len(timed), 'cell')}; of intervals that hold "
         f"{COVERAGE:.0%}, {chance:.1f} would show a change by chance."
+    )
+
+
+def _busy(c: Comparison) -> str:
+    """Warn of a machine that other programs used when one of the runs began."""
+    loads = [busy_with(e) for e in (c.before, c.after)]
+    named = [
+        f"{load:.2f} {when}"
+        for load, when in zip(loads, ("before", "after"), strict=True)
+        if load is not None
+    ]
+    if not named:
+        return ""
+    return (
+        f"Warning: the machine was not idle when measuring began (load average "
+        f"{', '.join(named)}): a change below may be its own."
+    )
+
+
+def _shared(c: Comparison) -> str:
+    """Warn of a change that no solver has more of than the others."""
+    everything = mean_ratio(c.pairs)
+    relative = [relative_ratio(c, s) for s in c.solvers]
+    apart = None in relative or any(map(side, relative))
+    if everything is None or not side(everything) or apart:
+        return ""
+    return (
+        f"All solvers changed alike, together {ratio_text(everything)}: rather the "
+        "machine than a solver."
     )
 
 

@@ -135,15 +135,21 @@ def _at_factor(evidence: Evidence) -> str:
 
 def _busy(evidence: Evidence) -> str:
     """Warn of a machine that other programs used when the measurements began."""
-    now = evidence.environment.get("now")
-    load = now.get("load") if isinstance(now, Mapping) else None
-    if not isinstance(load, int | float) or load <= QUIET_LOAD:
+    load = busy_with(evidence)
+    if load is None:
         return ""
     return (
         f"Warning: the machine was not idle when the measurements began (load average "
         f"{load:.2f}; quiet is at most {QUIET_LOAD}): times may be too long, and their "
         "scatter is not that of the solvers alone."
     )
+
+
+def busy_with(evidence: Evidence) -> float | None:
+    """Load average when the measurements began; None if low, or not known."""
+    now = evidence.environment.get("now")
+    load = now.get("load") if isinstance(now, Mapping) else None
+    return load if isinstance(load, int | float) and load > QUIET_LOAD else None
 
 
 def _unequal(evidence: Evidence) -> str:

@@ -11,7 +11,7 @@ import pytest
 from harness import InputError, Record, Verdict
 from harness.journal import Journal
 from reports import write_comparison
-from reports.changes import compare, mean_of, mean_ratio, side
+from reports.changes import compare, mean_of, mean_ratio, relative_ratio, side
 from reports.comparison import compose
 from reports.comparison_words import verdict_lines
 from reports.data import Evidence, arrange
@@ -82,6 +82,9 @@ def test_a_planted_regression_is_found_in_the_solver_that_has_it(changed):
     assert sum(p.after.solver == "two" for p in slower) >= 11
     assert sum(p.after.solver != "two" for p in slower) <= 2
     assert any(re.search("two on box/n=.* times as long", n) for n in verdict_lines(c))
+    relative = {s: relative_ratio(c, s) for s in SOLVERS}
+    assert relative["two"].low < 1.2 < relative["two"].high
+    assert relative["one"].value == pytest.approx(1.2**-0.5, rel=0.05)  # of two others
 
 
 def test_the_other_way_round_it_is_an_improvement(changed):
@@ -364,8 +367,25 @@ def test_a_canary_that_moved_says_that_the_machine_did(changed):
         replace(r, canary_seconds=1.1 * r.canary_seconds)
         for r in suite(2, one=1.1, two=1.1, three=1.1)
     ]
-    (table,) = compose(changed(before, after)).sections[0].tables
+    c = changed(before, after)
+    (table,) = compose(c).sections[0].tables
     rows = {row[0].text: row for row in table.rows}
 
     assert rows["canary"][2].value == pytest.approx(1.1, rel=0.01)
     assert rows["canary"][3].text == rows["all"][3].text == "slower"
+    assert any(
+        line.startswith("All solvers changed alike") for line in verdict_lines(c)
+    )
+    assert all(side(relative_ratio(c, s)) == 0 for s in SOLVERS)
+
+
+def test_a_change_of_one_solver_is_not_blamed_on_the_machine(changed):
+    c = changed(suite(1), suite(2, two=1.5))
+    assert not any("changed alike" in line for line in verdict_lines(c))
+
+
+def test_a_busy_machine_is_warned_of(folders):
+    busy = HERE | {"now": {"load": 3.0}}
+    said, _ = write_comparison(*folders(HERE, busy), ["csv"])
+    assert said[1].startswith("Warning: the machine was not idle")
+    assert "3.00 after" in said[1]
