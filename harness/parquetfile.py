@@ -89,7 +89,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 
     try:
         with path.open("rb") as file:  # threads of arrow's may abort Python at its end
-            table = pq.read_table(file, use_threads=False, pre_buffer=False)
+            table = pq.ParquetFile(file, pre_buffer=False).read(use_threads=False)
     except (OSError, pa.ArrowException) as e:
         why = f"{e.strerror}" if isinstance(e, OSError) and e.strerror else "malformed"
         raise InputError(f"{path}: {why}; expected a Parquet file") from None
