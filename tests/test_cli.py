@@ -46,7 +46,6 @@ def workbench(tmp_path):
         families=FAMILIES,
         solvers=SOLVERS,
         reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
-        compare=None,
         report=report,
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),

@@ -101,7 +101,6 @@ def cli(capsys, monkeypatch, tmp_path):
     workbench = Workbench(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        compare=None,
         report=lambda folder, formats: [],
         start=(sys.executable, "-P", str(WELLS)),
         **nothing,
@@ -258,8 +257,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
         "from harness.cli import main; from harness.workbench import Workbench; "
         "nothing = dict.fromkeys(('reference', 'plot', 'vtu', 'series', 'paper')); "
         "main(Workbench(families=wells.PROBLEMS, solvers=wells.SOLVERS, "
-        "compare=None, report=lambda *_: [], "
-        "start=(sys.executable, '-P', wells.__file__), "
+        "report=lambda *_: [], start=(sys.executable, '-P', wells.__file__), "
         "**nothing), sys.argv[2:])"
     )
     command = [sys.executable, "-c", program, str(WELLS.parent), "run", "wells.toml"]

@@ -22,7 +22,7 @@ CASES = [
 def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsys):
     workbench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        compare=None, report=None, plot=None, vtu=None, series=None, paper=None,
+        report=None, plot=None, vtu=None, series=None, paper=None,
     )  # fmt: skip
     declined = SOLVERS["smalbe"].declines(
         PROBLEMS[name].build(form, _defaults(name), reference_solution).qp

@@ -357,7 +357,7 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        compare=None, report=lambda out, formats: [], plot=lambda fields, path: None,
+        report=lambda out, formats: [], plot=lambda fields, path: None,
         vtu=lambda fields, path: None, series=None, paper=None,
     )  # fmt: skip
 

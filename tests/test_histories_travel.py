@@ -40,7 +40,6 @@ def cli(capsys, monkeypatch, tmp_path):
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
     workbench = Workbench(
         families=wells.problems, solvers=wells.solvers,
-        compare=None,
         report=lambda folder, formats: [], start=(sys.executable, "-P", str(WELLS)),
         **nothing,
     )  # fmt: skip

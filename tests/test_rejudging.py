@@ -150,7 +150,6 @@ def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        compare=None,
         report=lambda out, formats: [], plot=None, vtu=None, series=None, paper=None,
     )  # fmt: skip
     (tmp_path / "s.toml").write_text(

@@ -42,7 +42,6 @@ def workbench():
     return Workbench(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        compare=None,
         report=no_report,
         start=(sys.executable, "-P", str(WELLS)),
         **nothing,

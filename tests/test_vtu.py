@@ -93,7 +93,6 @@ def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""
     bench = Workbench(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        compare=None,
         report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
         series=write_series,
         paper=None,
