@@ -74,19 +74,38 @@ def _nearest(
 ) -> Callable[[Vector], Vector]:
     """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t."""
     B_V = csr_array(mechanics.primal.G)[np.flatnonzero(rows)]
-    inverse, R = mechanics.inverse, mechanics.inverse.kernel
+    inverse, solve = mechanics.inverse, closing(mechanics, rows)
+
+    def step(t: Vector) -> Vector:
+        mu, alpha = solve(t, np.zeros(inverse.kernel.shape[1]))
+        return np.asarray(inverse.kernel @ alpha - inverse(B_V.T @ mu))
+
+    return step
+
+
+def closing(
+    mechanics: Mechanics, rows: NDArray[np.bool_]
+) -> Callable[[Vector, Vector], tuple[Vector, Vector]]:
+    """Return the solve for the multipliers that close the rows V, and rigid motions.
+
+    ::
+
+        F_VV μ − B_V R α = t,    RᵀB_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ
+
+    for excesses t (v,) and loads e (r,) that are to be balanced.
+    """
+    B_V = csr_array(mechanics.primal.G)[np.flatnonzero(rows)]
     F = _compliance(mechanics, B_V)
-    G = np.asarray(B_V @ R)
+    G = np.asarray(B_V @ mechanics.inverse.kernel)
     FG = np.stack([F(g) for g in G.T], axis=1) if G.size else G
     S = np.linalg.pinv(G.T @ FG)
 
-    def step(t: Vector) -> Vector:
+    def solve(t: Vector, e: Vector) -> tuple[Vector, Vector]:
         Ft = F(t)
-        alpha = -S @ (G.T @ Ft)
-        mu = Ft + FG @ alpha
-        return np.asarray(R @ alpha - inverse(B_V.T @ mu))
+        alpha = S @ (e - G.T @ Ft)
+        return Ft + FG @ alpha, alpha
 
-    return step
+    return solve
 
 
 def _compliance(mechanics: Mechanics, B_V: Any) -> Callable[[Vector], Vector]:

@@ -124,18 +124,18 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate]:
     u = claimed.copy()
     u[exact.held] = 0
     multipliers = np.maximum(s.z.astype(Real), 0)
-    own = _proof(mechanics, claimed, u, multipliers, np.zeros(s.z.size, dtype=bool))
+    own = proof(mechanics, claimed, u, multipliers, np.zeros(s.z.size, dtype=bool))
     if own is not None:
         yield own
         if own.work <= 0.05 * own.distance**2:
             return
     closed = multipliers * exact.loose > exact.c - exact.B @ u
     tidied = np.where(closed, multipliers, 0)
-    if (other := _proof(mechanics, claimed, u, tidied, closed)) is not None:
+    if (other := proof(mechanics, claimed, u, tidied, closed)) is not None:
         yield other
 
 
-def _proof(
+def proof(
     mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
     closed: Any,
 ) -> Certificate | None:  # fmt: skip
@@ -153,13 +153,13 @@ def _proof(
     gap = 0.5 * (apart + left) ** 2 + work
     rest = max(gap - 0.25 * max(apart - left, 0.0) ** 2, 0.0)
     middle = mechanics.norm(claimed - (feasible + at_rest) / 2) + left / 2
-    proof = Certificate(
+    found = Certificate(
         u=feasible, multipliers=lam, equilibrium=at_rest, norm=mechanics.norm(feasible),
         distance=apart + left, work=work, claimed=middle + float(np.sqrt(rest)),
         moved=mechanics.norm(claimed - feasible),
         seminorm=mechanics.inverse.kernel.shape[1] > 0,
     )  # fmt: skip
-    return proof if np.isfinite(proof.bound) else None
+    return found if np.isfinite(found.bound) else None
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
