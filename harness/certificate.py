@@ -159,7 +159,7 @@ def proof(
         moved=mechanics.norm(claimed - feasible),
         seminorm=mechanics.inverse.kernel.shape[1] > 0,
     )  # fmt: skip
-    return found if np.isfinite(found.bound) else None
+    return found if np.isfinite(found.pair) else None
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:

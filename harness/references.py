@@ -106,7 +106,7 @@ def _solved(mechanics: Mechanics, solve: Reference) -> ReferencePoint:
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> NDArray[np.bool_]:
-    """Guess the active rows; of very many, those that the bodies alone would violate."""
+    """Guess the active rows; of very many, those that bodies alone would violate."""
     exact, inverse = mechanics.exact, mechanics.inverse
     R, m = inverse.kernel, mechanics.primal.h.size
     f, B = -mechanics.primal.q, csr_array(mechanics.primal.G)
