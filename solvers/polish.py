@@ -18,7 +18,7 @@ nothing changes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,7 +81,7 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
             at = _refined(problem, active, at)
         except ArithmeticError:
             return
-        yield _rounded(problem, active, at)
+        yield replace(_rounded(problem, active, at), iterations=start.iterations)
         new = _corrected(problem, active, at, one=k >= ALL_AT_ONCE)
         if not any((a != b).any() for a, b in zip(new, active, strict=True)):
             return
@@ -118,6 +118,9 @@ def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
 def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> _Active:
     """Let violated constraints enter and multipliers of the wrong sign leave.
 
+    Active rows that are almost dependent cannot all be met, short of huge multipliers;
+    when all else is right, those that keep a slack leave.
+
     one : only that which is most wrong, relative to x or to the gradient
     """
     qp, side = problem.qp, active.side
@@ -128,6 +131,8 @@ def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> 
     wrong_side = np.where(side == 0, outside, pulled)
     violated = (problem.G @ at.x - qp.h) / X
     wrong_rows = np.where(active.rows, -at.z / S, violated)
+    if max(wrong_side.max(initial=0), wrong_rows.max(initial=0)) < ROUNDING:
+        wrong_rows = np.where(active.rows, -violated, 0.0)
     least = ROUNDING
     if one:
         least = max(
