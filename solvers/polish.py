@@ -70,7 +70,7 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
     qp : with the largest entries about one; P, A and G all dense or all sparse
     start : near a solution, mostly of an interior-point method
     """
-    problem = _Problem(qp, *(_extended(M) for M in (qp.P, qp.A, qp.G)))
+    problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
     slack = qp.h - qp.G @ start.x
     side = 1 * (start.z_box > qp.ub - start.x) - 1 * (-start.z_box > start.x - qp.lb)
@@ -86,10 +86,6 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
         if not any((a != b).any() for a, b in zip(new, active, strict=True)):
             return
         active = new
-
-
-def _extended(M: Matrix) -> Matrix:
-    return M.astype(np.longdouble)
 
 
 def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
