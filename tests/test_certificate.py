@@ -199,3 +199,19 @@ def test_so_are_those_of_the_fleet(name):
     found = [e for case in forms_of((name,)) for e in effectivities(*case, fleet)]
     assert np.median(found) <= 3
     assert min(found) >= 1 / ROUNDED
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hertz-cylinder/dual",  # supports dominate the gradient's scale
+        "hertz-cylinder/slave=lower/dual",
+        "beam-ring/Nr=8/Nh=4/step=1/dual",
+        "obstacle/n=10/dual-bounds",
+    ],
+)
+def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(name, PROBLEMS), family, reference_solution)
+    s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
+    assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6
