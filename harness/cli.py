@@ -169,13 +169,14 @@ def _add_replay_options(command: _Parser) -> None:
 
 def _add_test_options(command: _Parser) -> None:
     command.add_argument("solver", metavar="NAME", nargs="+", help="or a pattern")
-    command.add_argument(
+    _add_plugin(command)
+    shown = command.add_mutually_exclusive_group()
+    shown.add_argument(
         "--markdown",
         action="store_true",
         help="only what equivalent formulations change, as in docs/weaknesses.md",
     )
-    _add_plugin(command)
-    _add_json(command)
+    _add_json(shown)
 
 
 def _add_paper_options(command: _Parser) -> None:
@@ -227,5 +228,5 @@ def _add_plugin(command: _Parser) -> None:
     )
 
 
-def _add_json(command: _Parser) -> None:
+def _add_json(command: argparse._ActionsContainer) -> None:
     command.add_argument("--json", action="store_true", help="for machines")

@@ -54,8 +54,10 @@ class DeclinedError(Exception):
 
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
-) -> None:
+) -> tuple[int | None, int | None]:
     """Solve the strings in `form` as they are, then as a change leaves them.
+
+    Return the iterations of both, where the solver tells.
 
     change : a key of `CHANGES`
     old : the answer as they are, where it is known
@@ -82,6 +84,7 @@ def same_answer(
     by = back.x - old.x
     _compare("objective", abs(qp.objective(back.x) - qp.objective(old.x)) / energy)
     _compare("½‖x − x₀‖²_P", 0.5 * float(by @ (qp.P @ by)) / energy)
+    return old.iterations, s.iterations
 
 
 def answer(solver: Solver, qp: QP) -> Solution:

@@ -92,5 +92,5 @@ def examined(
                 weak = name.startswith(KEEPS)
                 yield name, Result(Grade.WEAK if weak else Grade.FAIL, reply.message)
             else:
-                grade = Grade(reply.answer["grade"])
-                yield name, Result(grade, reply.answer["message"])
+                grade, *others = (reply.answer[field] for field in Result._fields)
+                yield name, Result(Grade(grade), *others)

@@ -8,6 +8,8 @@ from harness.conformance import KEEPS, Grade, Result
 from harness.equivalence import AS_IT_IS, CHANGES, TOL, UNITS, changes_of
 from harness.planted import FORMS
 
+TOLD = 2.0  #: times the iterations that are worth telling
+
 Results = Mapping[str, Result]  #: of one solver, by the name of the check
 
 HEAD = f"""\
@@ -28,9 +30,9 @@ Units are those of the paper's benchmark, as powers of two. What they multiply:
 """
 
 KEY = """
-"·": every form keeps verdict and answer. **form**: changed; how, is said below the
-table. (form): the solver declines the changed QP. A blank: it solves no form that this
-changes.
+"·": every form keeps verdict and answer. ×k: at k times the iterations, at least twice,
+in the worst form. **form**: changed; how, is said below the table. (form): the solver
+declines the changed QP. A blank: it solves no form that this changes.
 """
 
 
@@ -77,6 +79,9 @@ def _cell(checks: Results, solved: list[str], change: str) -> str:
     if not grades:
         return ""
     told = [marks[g].format(f) for f, g in grades.items() if g in marks]
+    work = max(checks[f"{KEEPS}: {f}, {change}"].work or 1.0 for f in grades)
+    if work >= TOLD:
+        told.append(f"×{work:.2g}")
     return ", ".join(told) or "·"
 
 
