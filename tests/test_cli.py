@@ -206,6 +206,23 @@ def test_report_judges_at_the_factor_that_is_asked_for(cli):
     )  # fmt: skip
 
 
+def compare(before, after, formats, *, factor):
+    said = [f"{before.name} and {after.name} at {factor:g}", "nothing changed"]
+    return said, [after / f"{form}.{form}" for form in formats]
+
+
+def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(workbench, capsys):
+    bench = replace(workbench, compare=compare)
+    argv = ["report", "one", "two", "--factor", "3"]
+
+    assert main(bench, [*argv, "--format", "csv,html,md"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "one and two at 3", "nothing changed", "two/html.html",
+    ]  # fmt: skip
+    assert main(bench, [*argv, "--format", "csv,md"]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == ["two/csv.csv", "two/md.md"]
+
+
 @pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
 def test_a_factor_that_is_not_positive_is_refused(cli, factor):
     code, out, err = cli("report", "folder", "--factor", factor)

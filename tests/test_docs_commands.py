@@ -93,6 +93,22 @@ ELSEWHERE = {
         "the environment is there"
     ),
 }
+#: what a page promises of the files that its commands leave
+PROMISED = {
+    "tutorial": {
+        "beam.png": "",
+        "out/mine/report/report.md": r"osqp-polish",
+        "out/mine/report/records.parquet": "",
+        "out/again/report/against-mine/index.html": r"what changed from mine to again",
+    },
+    "howto": {
+        "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
+        "out/scaling/report/figures/scaling-1.pdf": "",
+        "out/demo/report/report.md": r"1 × tolerance",
+        "out/demo-again/report/against-demo/report.md": r"Verdicts: 0 worse",
+        "out/own/report/report.md": r"claimed solved but inaccurate",
+    },
+}
 _BEGIN = ("mortarbench ", "make ", "python ", ". .venv", ".venv/bin/")
 _LAST = re.compile(r"\s+#\s+exit code (\d)$")
 
@@ -180,3 +196,6 @@ def test_every_command_of_a_page_works(page, carry_out, tmp_path):
             (tmp_path / what).write_text(more, "utf-8")
         elif what not in elsewhere:
             assert carry_out(instead.get(what, what)) == more, what
+    for file, pattern in PROMISED.get(page.stem, {}).items():
+        written = (tmp_path / file).read_bytes().decode("utf-8", "replace")
+        assert re.search(pattern, written), file
