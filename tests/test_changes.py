@@ -170,6 +170,20 @@ def test_sequences_are_compared_with_sequences(tmp_path):
     }  # fmt: skip
 
 
+def test_a_solver_is_not_set_against_its_own_null_arm(changed):
+    def run(seed, **slower):
+        first = [r for r in suite(seed, **slower) if r.solver != "three"]
+        twin = [
+            replace(r, solver="one (A/A)", run_id=f"null-{r.run_id}", arm="null")
+            for r in first
+            if r.solver == "one"
+        ]
+        return first + twin
+
+    c = changed(run(1), run(2, one=1.5))
+    assert relative_ratio(c, "one").value == pytest.approx(1.5, rel=0.05)
+
+
 # conditions
 
 
@@ -230,6 +244,36 @@ def test_equal_environments_are_called_so(folders):
     assert said[0] == "The environments are the same: machine, versions and code."
 
 
+def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
+    before = [record(repeat=i) for i in range(3)]
+    other = changed(before, [r.but(environment="e2") for r in before])
+
+    assert only(changed(before, before)).ratio is not None
+    assert only(other).ratio is None
+    assert verdict_lines(other)[0].startswith("Environments differ")
+
+
+def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
+    """Half of the cells moved to a slower node: they alone have no ratio."""
+    after = [
+        r.but(environment="n2", total_seconds=9.0) if r.params["n"] >= 2 else r
+        for r in suite(2, cases=4, repeats=3)
+    ]
+    a, b = folders(HERE, HERE)
+    (b / "journal/j.jsonl").unlink()
+    with Journal(b, "j") as journal:
+        for r in after:
+            journal.append(r)
+    (b / "environments").mkdir()
+    node = HERE | {"digest": "n2", "machine": {"cpu": "slow"}}
+    (b / "environments/n2.json").write_text(json.dumps(node))
+    said, _ = write_comparison(a, b, ["csv"])
+    frame = pd.read_csv(b / "report/against-a/tables/changes.csv")
+
+    assert "Times of 6 of 12 cells are compared" in said[0]
+    assert set(frame.case[frame.ratio.isna()]) == {"box/n=2/dual", "box/n=3/dual"}
+
+
 def test_options_that_differ_under_one_label_are_listed(changed):
     before = [record(repeat=i) for i in range(3)]
     after = [r.but(options={"max_iter": 200}) for r in before]
@@ -248,6 +292,8 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
     assert only(bits).ratio is not None
     assert only(sizes).ratio is None
     assert "another QP" not in markdown(compose(changed(before, before)))
+    old = [r.but(qp=None) for r in before]  # a journal from before there were digests
+    assert only(changed(old, before)).same_qp
 
 
 # verdicts, iterations, answers
@@ -348,9 +394,9 @@ def test_verdicts_are_those_at_the_factor(folders):
     a, b = folders(HERE, HERE, before, after)
 
     assert "Verdicts: 0 worse" in " ".join(write_comparison(a, b, ["csv"])[0])
-    assert "Verdicts at 1 × tolerance: 1 worse" in " ".join(
-        write_comparison(a, b, ["csv"], 1.0)[0]
-    )
+    for one, two, found in ((a, b, "1 worse, 0"), (b, a, "0 worse, 1"), (b, b, "0 w")):
+        said, _ = write_comparison(one, two, ["csv"], 1.0)
+        assert f"Verdicts at 1 × tolerance: {found}" in " ".join(said)
 
 
 def test_a_folder_that_is_none_is_refused(folders, tmp_path):
