@@ -14,7 +14,14 @@ from reports.changes import (
     side,
 )
 from reports.comparison_figure import ratios_figure
-from reports.comparison_words import CHANGES, cell_name, named, ratio_text, sentences
+from reports.comparison_words import (
+    CHANGES,
+    cell_name,
+    dates,
+    named,
+    ratio_text,
+    sentences,
+)
 from reports.conditions import Difference, environments, options, settings
 from reports.data import Outcome
 from reports.intervals import COVERAGE
@@ -29,7 +36,6 @@ from reports.layout import (
     source,
     verdict_cell,
 )
-from reports.summary import dateline
 from reports.wording import (
     ABSENT,
     TIMED,
@@ -48,7 +54,7 @@ def compose(c: Comparison) -> Page:
     names = [clean(e.directory.resolve().name, 40) for e in (c.before, c.after)]
     return Page(
         title=f"{clean(c.after.name)}: what changed from {names[0]} to {names[1]}",
-        dateline=f"before: {dateline(c.before)} — after: {dateline(c.after)}",
+        dateline=dates(c),
         sections=(
             _summary(c), _times(c), _verdicts(c), _iterations(c), _answers(c),
             _unpaired(c), _conditions(c),

@@ -7,7 +7,7 @@ from harness.pairs import Ratio
 from reports.changes import Comparison, Mean, Pair, mean_ratio, relative_ratio, side
 from reports.conditions import environments, machines_differ
 from reports.intervals import COVERAGE
-from reports.summary import busy_with
+from reports.summary import busy_with, dateline
 from reports.wording import VERDICTS, clean, plural, power, tolerance
 
 NAMED = 8  #: changes that are named; tables have all
@@ -26,6 +26,16 @@ def verdict_lines(c: Comparison) -> list[str]:
     ]
     lines += [*filter(None, [_shared(c)]), _counted_verdicts(c), _counted_others(c)]
     return lines + [f"  {point}" for point in named(c)]
+
+
+def dates(c: Comparison) -> str:
+    """Say when and on which machine, which is named once if it is the same."""
+    (then, there), (now, here) = (
+        dateline(e).split(" · ", 1) for e in (c.before, c.after)
+    )
+    if there == here:
+        return f"before: {then}, after: {now} · {here}"
+    return f"before: {then} · {there}, after: {now} · {here}"
 
 
 def sentences(c: Comparison) -> tuple[str, ...]:

@@ -237,9 +237,13 @@ def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folder
     assert "~~" in (b / "report/against-a/report.md").read_text()  # struck out
 
 
-def test_equal_environments_are_called_so(folders):
+def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
     busy = HERE | {"now": {"load": 3.0}}
-    said, _ = write_comparison(*folders(HERE, busy), ["csv"])
+    a, b = folders(HERE, busy)
+    said, _ = write_comparison(a, b, ["md"])
+
+    _, dateline, *_ = (b / "report/against-a/report.md").read_text().split("\n\n")
+    assert dateline == "before: 2026-11-21, after: 2026-11-21 · fast"
 
     assert said[0] == "The environments are the same: machine, versions and code."
 
