@@ -13,16 +13,15 @@ from reports.changes import (
     relative_ratio,
     side,
 )
+from reports.comparison_conditions import conditions_that_differ
 from reports.comparison_figure import ratios_figure
 from reports.comparison_words import (
     CHANGES,
-    cell_name,
     dates,
     named,
     ratio_text,
     sentences,
 )
-from reports.conditions import Difference, environments, options, settings
 from reports.data import Outcome
 from reports.intervals import COVERAGE
 from reports.layout import (
@@ -37,11 +36,9 @@ from reports.layout import (
     verdict_cell,
 )
 from reports.wording import (
-    ABSENT,
     TIMED,
     VERDICTS,
     clean,
-    plural,
     power,
     seconds,
     significant,
@@ -57,7 +54,7 @@ def compose(c: Comparison) -> Page:
         dateline=dates(c),
         sections=(
             _summary(c), _times(c), _verdicts(c), _iterations(c), _answers(c),
-            _unpaired(c), _conditions(c),
+            _unpaired(c), conditions_that_differ(c),
         ),
         footer="Point at a number to see the run_id of its measurements: a cell has "
         "the same in both folders, in journal/ of each. Full precision: "
@@ -259,44 +256,6 @@ def _listed(
         return Section(name=name, title=title, prose=("None.",))
     table = Table(caption=caption, columns=columns, rows=tuple(rows), text_columns=2)
     return Section(name=name, title=title, tables=(table,))
-
-
-def _conditions(c: Comparison) -> Section:
-    found = (
-        ("Environments, as recorded.", environments(c.before, c.after)),
-        ("Settings of the suites.", settings(c.before, c.after)),
-        ("Options of solvers with one label.", options(c.before, c.after)),
-    )
-    tables = [_differing(caption, pairs) for caption, pairs in found if pairs]
-    other = [p for p in c.pairs if not p.same_qp]
-    prose = [] if tables else ["No condition differs."]
-    if other:
-        prose.append(
-            f"{plural(len(other), 'cell')} had another QP after than before, bit for "
-            "bit: the generator, its parameters' meaning or the BLAS changed. The "
-            f"first: {cell_name(other[0])}. Where sizes differ, nothing is compared."
-        )
-    return Section(
-        name="conditions",
-        title="Conditions that differ",
-        prose=tuple(prose),
-        tables=tuple(tables),
-    )
-
-
-def _differing(caption: str, pairs: Sequence[Difference]) -> Table:
-    return Table(
-        caption=caption,
-        columns=("key", "before", "after"),
-        rows=tuple(
-            (Cell(text=clean(k)), *(Cell(text=_plain(v), kind="words") for v in values))
-            for k, *values in pairs
-        ),
-    )
-
-
-def _plain(value: object) -> str:
-    return ABSENT if value is None else clean(str(value), 120)
 
 
 def _names(p: Pair) -> tuple[Cell, Cell, Cell]:
