@@ -1,0 +1,140 @@
+"""Pictures of performance and data profiles, for two solvers and for fifty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+
+from reports.conventions import Standing
+from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_ticks, look
+from reports.profiles import Array, Curve, curve, performance_ratios
+
+ROW = 4  #: solvers that are told apart in one panel, with their bands
+ROWS = 4  #: of panels; further solvers are grey in all of them
+PAIRS = 6  #: panels of two solvers
+_COLUMNS = 3  #: of those
+_GREY = "#b4bac2"
+
+Place = tuple[float, float]  #: ends of an axis
+
+
+def rows_of(standing: Standing, solvers: Sequence[str]) -> list[list[int]]:
+    """Share the solvers out among rows, best means first, no colour twice in a row.
+
+    solvers : of the whole report, which their looks go by
+    """
+    rows: list[dict[str, int]] = []
+    for i in map(int, standing.order[: ROW * ROWS]):
+        colour = look(solvers.index(standing.contest.solvers[i]))["color"]
+        free = (row for row in rows if len(row) < ROW and colour not in row)
+        row = next(free, None)
+        if row is None:
+            row = {}
+            rows.append(row)
+        row[colour] = i
+    return [list(row.values()) for row in rows]
+
+
+def rivals(standing: Standing) -> list[int]:
+    """Choose the solvers that the leader is paired with: the next in that order."""
+    return [int(i) for i in standing.order[1 : PAIRS + 1]]
+
+
+def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
+    """Draw both profiles of every solver, a few in colour in each row of panels."""
+    contest = standing.contest
+    ratios = performance_ratios(contest.times)
+    sides = (
+        (ratios, (1.0, _end(ratios)), "time / best time of the case"),
+        (contest.times, (contest.times.min() / 1.3, contest.horizon), "time in s"),
+    )
+    rows = rows_of(standing, solvers)
+    heights = [1.9 + LEGEND_LINE] * len(rows)
+    heights[-1] += LEGEND_LINE  # for the labels of the axes
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.9, sum(heights)))
+        parts = figure.subfigures(len(rows), 1, height_ratios=heights, squeeze=False)
+        for part, mine in zip(parts[:, 0], rows, strict=True):
+            panels = part.subplots(1, 2, sharey=True)
+            for axes, (values, ends, name) in zip(panels, sides, strict=True):
+                _others(axes, values, mine, ends)
+                for i in mine:
+                    style = look(solvers.index(contest.solvers[i]))
+                    _profile(axes, curve(values[:, i], *ends), style)
+                _dress(axes, ends, name if mine is rows[-1] else "")
+            panels[0].set_ylabel("share of cases")
+            names = [contest.solvers[i] for i in mine]
+            _legend(part, names, [look(solvers.index(name)) for name in names])
+    return figure
+
+
+def pairwise_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
+    """Draw performance profiles of two: the leader, in black, and each next rival."""
+    contest, leader = standing.contest, standing.leader
+    against = rivals(standing)
+    names = [contest.solvers[i] for i in (leader, *against)]
+    styles = [look(solvers.index(name)) for name in names]
+    styles[0] |= {"color": INK}
+    columns = min(len(against), _COLUMNS)
+    lines = -(-len(against) // columns)
+    with rc_context(STYLE):
+        legend = LEGEND_LINE * (1 + -(-len(names) // ROW))
+        figure = Figure(figsize=(6.9, 1.75 * lines + legend))
+        grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
+        for n, axes in enumerate(grid.ravel()):
+            if n >= len(against):
+                axes.set_axis_off()
+                continue
+            ratios = performance_ratios(contest.times[:, [leader, against[n]]])
+            ends = (1.0, _end(ratios))
+            _profile(axes, curve(ratios[:, 1], *ends), styles[n + 1])
+            _profile(axes, curve(ratios[:, 0], *ends), styles[0])
+            lowest = n + columns >= len(against)
+            _dress(axes, ends, "time / better of the two" if lowest else "")
+        for axes in grid[:, 0]:
+            axes.set_ylabel("share of cases")
+        _legend(figure, names, styles)
+    return figure
+
+
+def _end(ratios: Array) -> float:
+    """Choose where an axis of ratios ends: a little after the largest finite one."""
+    return float(max(2.0, 1.1 * ratios[np.isfinite(ratios)].max()))
+
+
+def _others(axes: Axes, values: Array, mine: Sequence[int], ends: Place) -> None:
+    """Draw all the other solvers in grey, behind."""
+    for i in set(range(values.shape[1])) - set(mine):
+        at, share = curve(values[:, i], *ends)
+        axes.step(at, share.value, where="post", color=_GREY, linewidth=0.5, zorder=1)
+
+
+def _profile(axes: Axes, drawn: Curve, style: dict[str, Any]) -> None:
+    """Draw a step function with few markers, and its band."""
+    at, share = drawn
+    axes.fill_between(
+        at, share.low, share.high, step="post", color=style["color"], alpha=0.13,
+        linewidth=0,
+    )  # fmt: skip
+    axes.step(at, share.value, where="post", markevery=(0.07, 0.19), **style)
+
+
+def _dress(axes: Axes, ends: Place, label: str) -> None:
+    axes.set(xscale="log", xlim=ends, ylim=(0, 1.03), yticks=[0, 0.5, 1], xlabel=label)
+    axes.grid(visible=True, color="#8a93a0", alpha=0.3, linewidth=0.4)
+    axes.set_axisbelow(True)
+    log_ticks(axes.xaxis)
+
+
+def _legend(
+    figure: Figure | SubFigure, names: Sequence[str], styles: Sequence[dict[str, Any]]
+) -> None:
+    keys = [Line2D([], [], **style) for style in styles]
+    labels = [legible(name) for name in names]
+    figure.legend(keys, labels, loc="outside lower center", ncols=ROW)
