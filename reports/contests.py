@@ -14,7 +14,7 @@ from harness import Record, Verdict
 from reports.data import Evidence
 from reports.wording import clean, listing, plural, tolerance
 
-CASES = 5  #: fewer make no statement about a population of problems
+CASES = 6  #: with fewer no two solvers can be told apart, see reports.resampling
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
 _KIND = ["sweep", "mode", "form", "at"]  # what cases of one contest share

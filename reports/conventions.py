@@ -129,14 +129,20 @@ class Standing:
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
         """(solvers, solvers) whether row is told to be faster than column."""
-        cases = len(self.contest.cases)
-        return resampling.told_apart(np.log(self.means), np.log(self.draws), cases)
+        logs, _ = _logs(self.contest, USUAL)
+        return resampling.told_apart(logs, self.contest.cases)
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
         """Ranks that a solver may have: after all told faster, before all told slower.
 
-        Together these hold the true ranks with 95 %.
+        Together these hold the true ranks with 95 % [1]_.
+
+        References
+        ----------
+        .. [1] M. Mogstad, J. P. Romano, A. M. Shaikh, D. Wilhelm, Inference for Ranks,
+           Review of Economic Studies 91 (2024) 476-518
+
         """
         behind, ahead = self.faster.sum(axis=0), self.faster.sum(axis=1)
         last = len(self.contest.solvers)

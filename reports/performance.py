@@ -73,8 +73,8 @@ def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[P
         pictures.append(
             Picture(
                 name=f"pairwise-{number}",
-                caption=f"Performance profiles of two solvers each: {leader} and the "
-                f"next {plural(len(rivals(standing)), 'solver')} in the order of "
+                caption=f"Performance profiles of two solvers each: {leader}, in "
+                f"black, and the next {plural(len(rivals(standing)), 'solver')} in the order of "
                 f"the means, {described(contest)}",
                 figure=pairwise_figure(standing, solvers),
             )

@@ -20,6 +20,14 @@ ROWS = 4  #: of panels; further solvers are grey in all of them
 PAIRS = 6  #: panels of two solvers
 _COLUMNS = 3  #: of those
 _GREY = "#b4bac2"
+_COARSE = 60  #: points of a grey curve, of which there may be hundreds
+
+#: up to which ratio to use which ticks; beyond, powers of ten
+_FACTORS = {
+    3.5: (1, 1.5, 2, 3),
+    15.0: (1, 2, 5, 10),
+    60.0: (1, 2, 5, 10, 20, 50),
+}
 
 Place = tuple[float, float]  #: ends of an axis
 
@@ -50,9 +58,11 @@ def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
     """Draw both profiles of every solver, a few in colour in each row of panels."""
     contest = standing.contest
     ratios = performance_ratios(contest.times)
+    known = contest.times[contest.solved]
+    span = (float(known.min()) / 1.3, 1.3 * float(known.max()))
     sides = (
         (ratios, (1.0, _end(ratios)), "time / best time of the case"),
-        (contest.times, (contest.times.min() / 1.3, contest.horizon), "time in s"),
+        (contest.times, span, "time in s"),
     )
     rows = rows_of(standing, solvers)
     heights = [1.9 + LEGEND_LINE] * len(rows)
@@ -68,6 +78,8 @@ def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
                     style = look(solvers.index(contest.solvers[i]))
                     _profile(axes, curve(values[:, i], *ends), style)
                 _dress(axes, ends, name if mine is rows[-1] else "")
+                if values is ratios:
+                    _factors(axes, ends[1])
             panels[0].set_ylabel("share of cases")
             names = [contest.solvers[i] for i in mine]
             _legend(part, names, [look(solvers.index(name)) for name in names])
@@ -97,6 +109,7 @@ def pairwise_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
             _profile(axes, curve(ratios[:, 0], *ends), styles[0])
             lowest = n + columns >= len(against)
             _dress(axes, ends, "time / better of the two" if lowest else "")
+            _factors(axes, ends[1])
         for axes in grid[:, 0]:
             axes.set_ylabel("share of cases")
         _legend(figure, names, styles)
@@ -111,7 +124,7 @@ def _end(ratios: Array) -> float:
 def _others(axes: Axes, values: Array, mine: Sequence[int], ends: Place) -> None:
     """Draw all the other solvers in grey, behind."""
     for i in set(range(values.shape[1])) - set(mine):
-        at, share = curve(values[:, i], *ends)
+        at, share = curve(values[:, i], *ends, points=_COARSE)
         axes.step(at, share.value, where="post", color=_GREY, linewidth=0.5, zorder=1)
 
 
@@ -119,10 +132,12 @@ def _profile(axes: Axes, drawn: Curve, style: dict[str, Any]) -> None:
     """Draw a step function with few markers, and its band."""
     at, share = drawn
     axes.fill_between(
-        at, share.low, share.high, step="post", color=style["color"], alpha=0.13,
+        at, share.low, share.high, step="post", color=style["color"], alpha=0.11,
         linewidth=0,
     )  # fmt: skip
-    axes.step(at, share.value, where="post", markevery=(0.07, 0.19), **style)
+    axes.step(
+        at, share.value, where="post", markevery=(0.07, 0.19), clip_on=False, **style
+    )
 
 
 def _dress(axes: Axes, ends: Place, label: str) -> None:
@@ -130,6 +145,16 @@ def _dress(axes: Axes, ends: Place, label: str) -> None:
     axes.grid(visible=True, color="#8a93a0", alpha=0.3, linewidth=0.4)
     axes.set_axisbelow(True)
     log_ticks(axes.xaxis)
+
+
+def _factors(axes: Axes, stop: float) -> None:
+    """Label an axis of ratios, which begins at 1, as one says them."""
+    for last, ticks in _FACTORS.items():
+        if stop <= last:
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.set_xticks([], minor=True)
+            axes.set_xlim(1, stop)
+            return
 
 
 def _legend(

@@ -84,10 +84,10 @@ def solved_within(values: Array, places: ArrayLike) -> Share:
     return share(counts, values.size)
 
 
-def curve(values: Array, start: float, stop: float) -> Curve:
+def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
     """Profile between two finite places, which are its ends."""
     inside = np.unique(values[(values > start) & (values < stop)])
-    if inside.size > POINTS:
-        inside = np.geomspace(start, stop, POINTS)[1:-1]
+    if inside.size > points:
+        inside = np.geomspace(start, stop, points)[1:-1]
     at = np.concatenate([[start], inside, [stop]])
     return Curve(at, solved_within(values, at))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-import numpy as np
+from statistics import median
 
 from harness.pairs import COVERAGE, paired_ratio
 from reports.data import Evidence, Outcome
@@ -16,6 +15,11 @@ def ratios(evidence: Evidence) -> Section | None:
     """Tabulate ratios to the fastest verified answer; None without repeats."""
     if not any(len(o.records) > 1 for o in evidence.flat):
         return None
+    fastest = {key: _fastest(row) for key, row in evidence.outcomes.items()}
+
+    def show(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
+        return _ratio(outcome, fastest[outcome.case, outcome.tol])
+
     return Section(
         name="ratios",
         title="Ratios within blocks",
@@ -26,7 +30,7 @@ def ratios(evidence: Evidence) -> Section | None:
             "interval holds 1, so that the two are not told apart. Blocks that both "
             "were measured in count; fewer than two make no interval.",
         ),
-        tables=(grid(evidence, "Ratio to the fastest, within blocks.", _ratio),),
+        tables=(grid(evidence, "Ratio to the fastest, within blocks.", show),),
     )
 
 
@@ -35,10 +39,9 @@ def by_repeat(outcome: Outcome) -> dict[int, float]:
     return {r.repeat: r.total_seconds for r in outcome.records if r.total_seconds}
 
 
-def _ratio(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
+def _ratio(outcome: Outcome, fastest: Outcome | None) -> Cell:
     if not outcome.verified:
         return Cell(text=ABSENT, title="not verified")
-    fastest = _fastest(row)
     if outcome is fastest:
         return Cell(text="1", value=1.0, kind="best", title=source(outcome))
     its = by_repeat(fastest) if fastest else {}
@@ -58,7 +61,7 @@ def _ratio(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
 def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
     """Find the smallest median of a verified answer; null arms do not compete."""
     medians = {
-        s: float(np.median(times))
+        s: median(times)
         for s, o in row.items()
         if o.verified and not o.first.arm and (times := [*by_repeat(o).values()])
     }
