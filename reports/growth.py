@@ -13,15 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import linregress, t
+from scipy.stats import t
 
-from reports.intervals import COVERAGE, Interval
+from reports.intervals import COVERAGE, Interval, power_law
 from reports.layout import Cell, Section, Table
 from reports.scaling import Ladder
 from reports.wording import ABSENT, clean, seconds
 
 SIZES = 4  #: fewer different sizes make no test: two degrees of freedom at least
 LEVEL = 0.05  #: of the test
+_ROUNDING = 1e-12  #: scatter of logarithms that is none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,15 +86,18 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     x, y = np.asarray(n, dtype=float), np.asarray(values, dtype=float)
     if np.unique(x).size < SIZES or not ((x > 0).all() and (y > 0).all()):
         raise ValueError("a test of growth needs four different sizes, positive values")
-    X, Y = np.log(x), np.log(y)
-    line = linregress(X, Y, alternative="greater")
-    rest = Y - line.intercept - line.slope * X
+    law = power_law(x, y)
+    spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
+    error = (law.high - law.low) / 2 / float(t.ppf(0.5 + COVERAGE / 2, x.size - 2))
+    if error * spread <= _ROUNDING:  # as of counts that are all the same
+        error = 0.0
+    p = law.exponent if abs(law.exponent) * spread > _ROUNDING else 0.0
     return Growth(
-        exponent=float(line.slope),
-        most=float(line.slope + t.ppf(1 - LEVEL, x.size - 2) * line.stderr),
-        p_value=float(line.pvalue),
-        factor=float(np.exp(line.intercept)),
-        scatter=float(np.sqrt(rest @ rest / (x.size - 2))),
+        exponent=p,
+        most=p + float(t.ppf(1 - LEVEL, x.size - 2)) * error,
+        p_value=float(t.sf(p / error, x.size - 2)) if error else float(p <= 0),
+        factor=law.factor,
+        scatter=error * spread,
         sizes=tuple(map(float, x)),
     )
 

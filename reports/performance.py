@@ -70,12 +70,13 @@ def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[P
     ]
     if len(contest.solvers) > 2:
         leader = clean(contest.solvers[standing.leader], 40)
+        others = plural(len(rivals(standing)), "solver")
         pictures.append(
             Picture(
                 name=f"pairwise-{number}",
                 caption=f"Performance profiles of two solvers each: {leader}, in "
-                f"black, and the next {plural(len(rivals(standing)), 'solver')} in the order of "
-                f"the means, {described(contest)}",
+                f"black, and the next {others} in the order of the means, "
+                f"{described(contest)}",
                 figure=pairwise_figure(standing, solvers),
             )
         )

@@ -381,9 +381,16 @@ def test_planted_growth_is_detected_and_bounded():
     assert (found.exponent, found.most) == pytest.approx((0.25, 0.25))
 
 
-@pytest.mark.parametrize("counts", [[12, 12, 12, 12], [40, 30, 25, 20]])
-def test_constant_and_falling_counts_do_not_grow(counts):
-    assert not growth_of([100, 400, 1600, 6400], counts).grows
+def test_constant_counts_do_not_grow_for_sure():
+    found = growth_of([100, 400, 1600, 6400], [13, 13, 13, 13])
+    assert (found.exponent, found.most, found.p_value) == (0, 0, 1)
+    assert found.at(1000) == (pytest.approx(13),) * 3 + (0.95, 4)
+
+
+def test_falling_counts_do_not_grow():
+    found = growth_of([100, 400, 1600, 6400], [40, 30, 25, 20])
+    assert found.p_value > 0.99
+    assert found.most < 0
 
 
 def test_three_sizes_make_no_test():
