@@ -51,7 +51,7 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     n = times.size
     late = np.isinf(times) & ~np.isnan(stopped)
     ends = np.minimum(np.where(late, stopped, times), horizon)
-    censored = late | (times > horizon)
+    censored = times > horizon
     survival = ecdf(CensoredData.right_censored(ends, censored)).sf
     knots = np.append(survival.quantiles, max(horizon, survival.quantiles[-1]))
     share = np.asarray(survival.probabilities)

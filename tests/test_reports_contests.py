@@ -94,14 +94,15 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
     ]
     records += [
         record("b", case, 0.1, repeat,
-               status=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED)
+               status=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
+               claimed="failed" if (case, repeat) == (5, 2) else "solved")
         for case in range(6)
         for repeat in range(3)
     ]  # fmt: skip
     (found,) = contests(evidence(records))
     assert found.times[:, 0] == pytest.approx(0.2)
     assert np.isinf(found.times[:, 1]).tolist() == [False] * 3 + [True] + [False] * 2
-    assert np.isfinite(found.claimed).all()
+    assert np.isinf(found.claimed[:, 1]).tolist() == [False] * 5 + [True]
 
 
 def test_null_arms_do_not_take_part(record, evidence):
@@ -173,6 +174,16 @@ def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
     assert cell["mean up to the limit"].after == "2 out of time, 2 never"
 
 
+def test_a_cell_that_was_late_once_is_late(record, evidence):
+    late = dict(status=Verdict.TIME_LIMIT, claimed=None, seconds=None)
+    records = crowd(record, 2)
+    records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
+    records += [record("z", 2, repeat=2, **late)]
+    (found,) = contests(evidence(records))
+    assert np.isinf(found.times[2, 2])
+    assert not np.isnan(found.stopped[2, 2])
+
+
 # ---- what is said
 
 
@@ -183,6 +194,19 @@ def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
     assert found["s02"]["both solved, to the leader"].after == "n = 6"
     assert [found[s]["tier"].value for s in found] == [1, 2, 3]
     assert found["s01"]["P(best)"].text == "0"
+
+
+def test_few_cases_that_both_solved_make_no_ratio(record, evidence):
+    some = [
+        record(
+            "some", case, 1.0, status=Verdict.WRONG if case > 4 else Verdict.VERIFIED
+        )
+        for case in range(8)
+    ]
+    page = compose(evidence([*crowd(record, 2, cases=8), *some]))
+    cells = rows(section(page, "means").tables[0])
+    assert cells["s01"]["both solved, to the leader"].after == "n = 8"
+    assert cells["some"]["both solved, to the leader"].value is None
 
 
 def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
@@ -237,7 +261,12 @@ def test_the_sections_render(record, evidence):
 
 @pytest.mark.parametrize("count", [2, 7, 20, 50])
 def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
-    found = evidence(crowd(record, count))
+    records = [
+        record(f"s{k:02d}", case, (1 + (k % 6) + k / 100) * 0.01 * (case + 1))
+        for k in range(count)  # solvers of one colour are next to each other
+        for case in range(6)
+    ]
+    found = evidence(records)
     (one,) = map(standing, contests(found))
     groups = rows_of(one, found.solvers)
     shown = [i for row in groups for i in row]
