@@ -1,9 +1,13 @@
 """From records to the sections on means, ranks, profiles, ratios, growth and claims."""
 
+import re
+
 import numpy as np
 import pytest
 
 from harness import Record, Verdict
+from harness.journal import Journal
+from reports import write_report
 from reports.contests import contests
 from reports.conventions import standing
 from reports.data import Evidence, arrange
@@ -11,6 +15,7 @@ from reports.figures import look
 from reports.folder import compose
 from reports.markdown import markdown
 from reports.profile_figures import ROW, pairwise_figure, profile_figure, rows_of
+from reports.sheets import sheets
 
 LIMIT = 20.0
 
@@ -383,3 +388,50 @@ def test_one_refuted_repeat_refutes_the_claim(record, evidence):
     records[1] = records[1].but(status=Verdict.INACCURATE)
     (table,) = section(compose(evidence(records)), "tally").tables
     assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
+
+
+# ---- the whole way
+
+
+def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
+    names = ("<script>x</script>", r"\input{a}$^_#&%", "| a |\n## b", "_$x^2", "ü漢")
+    written = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        with Journal(folder, "test") as journal:
+            for k, name in enumerate(names):
+                for case in range(6):
+                    journal.append(record(name, case, 0.01 * (k + 1), form=names[0]))
+        (folder / "suite.toml").write_text('name = "hostile"')
+        written.append(write_report(folder, ["html", "md", "tex", "csv"]))
+    one, two = ({p.name: p.read_bytes() for p in paths} for paths in written)
+    assert one == two
+    assert {"means.tex", "ranking.tex", "contests.csv", "profiles-1.svg",
+            "pairwise-1.pdf"} <= set(one)  # fmt: skip
+    assert b"<script>x" not in one["index.html"] + one["report.md"]
+    for name in ("means.tex", "ranking.tex", "profiles.tex", "tally.tex"):
+        for line in one[name].decode().splitlines()[1:]:
+            bare = re.sub(r"\\[\\{}$&#%_]", "", line)
+            assert bare.count("{") == bare.count("}"), line
+            assert not re.search(r"[#%]|\\input|U\+03", bare), line
+
+
+def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
+    records = crowd(record, 2)
+    records[0] = records[0].but(status=Verdict.WRONG)
+    sheet = sheets(evidence(records))["contests"]
+    by_cell = sheet.set_index(["case", "solver"])
+    assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}
+    wrong = by_cell.loc["box/n=0/dual", "s00"]
+    assert (wrong["seconds"], wrong["ratio"]) == (np.inf, np.inf)
+    assert by_cell.loc["box/n=0/dual", "s01"]["ratio"] == 1
+    assert set(sheet["contest"]) == {"dual, tol 1e-6"}
+
+
+def test_the_sheet_of_means_holds_every_convention(record, evidence):
+    sheet = sheets(evidence(crowd(record, 3)))["means"]
+    assert len(sheet) == 3 * 19  # 18 combinations and the common cases
+    usual = sheet[(sheet["shift"] == 1) & (sheet["penalty"] == 3)
+                  & (sheet["gate"] == "verified") & ~sheet["common"]]  # fmt: skip
+    assert usual["rank"].tolist() == [1, 2, 3]
+    assert usual["tier"].tolist() == [1, 2, 3]
+    assert (usual["ratio_low"] <= usual["ratio"]).all()
