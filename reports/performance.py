@@ -10,6 +10,7 @@ from reports.conventions import Standing
 from reports.layout import Cell, Picture, Section, Table, name_cell
 from reports.means import described
 from reports.profile_figures import (
+    banded,
     pairwise_figure,
     profile_figure,
     rivals,
@@ -64,7 +65,7 @@ def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[P
         Picture(
             name=f"profiles-{number}",
             caption="Performance profiles (left) and data profiles (right), "
-            f"{described(contest)}{_greys(standing, solvers)}",
+            f"{described(contest)}{_remarks(standing, solvers)}",
             figure=profile_figure(standing, solvers),
         )
     ]
@@ -83,14 +84,17 @@ def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[P
     return pictures
 
 
-def _greys(standing: Standing, solvers: Sequence[str]) -> str:
-    """Say what is grey where solvers share out among rows of panels."""
+def _remarks(standing: Standing, solvers: Sequence[str]) -> str:
+    """Say what is grey where solvers share out among rows, and where bands are."""
     rows = rows_of(standing, solvers)
+    bands = "" if banded(standing) else " Bands: in the next figure, pair by pair."
     if len(rows) < 2:
-        return ""
+        return bands
     behind = len(standing.contest.solvers) - sum(map(len, rows))
-    text = " Rows roughly in the order of the means; grey: the solvers of other rows"
-    return f"{text} and {plural(behind, 'solver')} behind." if behind else f"{text}."
+    others = "the solvers of other rows"
+    if behind:
+        others += f" and {plural(behind, 'solver')} behind"
+    return f" Rows roughly in the order of the means; grey: {others}.{bands}"
 
 
 def _table(standing: Standing) -> Table:

@@ -18,8 +18,9 @@ from reports.profiles import Array, Curve, curve, performance_ratios
 ROW = 4  #: solvers that are told apart in one panel, with their bands
 ROWS = 4  #: of panels; further solvers are grey in all of them
 PAIRS = 6  #: panels of two solvers
+BANDED = 20  #: cases; with fewer, bands of more than two solvers hide each other
 _COLUMNS = 3  #: of those
-_GREY = "#b4bac2"
+_GREY = "#d3d7dc"
 _COARSE = 60  #: points of a grey curve, of which there may be hundreds
 
 #: up to which ratio to use which ticks; beyond, powers of ten
@@ -54,6 +55,12 @@ def rivals(standing: Standing) -> list[int]:
     return [int(i) for i in standing.order[1 : PAIRS + 1]]
 
 
+def banded(standing: Standing) -> bool:
+    """Whether `profile_figure` has bands; `pairwise_figure` always has."""
+    contest = standing.contest
+    return len(contest.solvers) <= 2 or len(contest.cases) >= BANDED
+
+
 def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
     """Draw both profiles of every solver, a few in colour in each row of panels."""
     contest = standing.contest
@@ -76,7 +83,8 @@ def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
                 _others(axes, values, mine, ends)
                 for i in mine:
                     style = look(solvers.index(contest.solvers[i]))
-                    _profile(axes, curve(values[:, i], *ends), style)
+                    drawn = curve(values[:, i], *ends)
+                    _profile(axes, drawn, style, band=banded(standing))
                 _dress(axes, ends, name if mine is rows[-1] else "")
                 if values is ratios:
                     _factors(axes, ends[1])
@@ -128,13 +136,16 @@ def _others(axes: Axes, values: Array, mine: Sequence[int], ends: Place) -> None
         axes.step(at, share.value, where="post", color=_GREY, linewidth=0.5, zorder=1)
 
 
-def _profile(axes: Axes, drawn: Curve, style: dict[str, Any]) -> None:
+def _profile(
+    axes: Axes, drawn: Curve, style: dict[str, Any], *, band: bool = True
+) -> None:
     """Draw a step function with few markers, and its band."""
     at, share = drawn
-    axes.fill_between(
-        at, share.low, share.high, step="post", color=style["color"], alpha=0.11,
-        linewidth=0,
-    )  # fmt: skip
+    if band:
+        axes.fill_between(
+            at, share.low, share.high, step="post", color=style["color"], alpha=0.11,
+            linewidth=0,
+        )  # fmt: skip
     axes.step(
         at, share.value, where="post", markevery=(0.07, 0.19), clip_on=False, **style
     )

@@ -302,6 +302,20 @@ def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
         assert starts == [0, 1]  # the rival is never the better one, the leader always
 
 
+@pytest.mark.parametrize(
+    ("solvers", "cases", "bands"), [(2, 6, 2), (3, 6, 0), (3, 20, 3)]
+)
+def test_bands_are_drawn_where_they_do_not_hide_each_other(
+    record, evidence, solvers, cases, bands
+):
+    found = evidence(crowd(record, solvers, cases=cases))
+    (one,) = map(standing, contests(found))
+    for axes in profile_figure(one, found.solvers).subfigs[0].axes:
+        assert len(axes.collections) == bands
+    if solvers > 2:
+        assert len(pairwise_figure(one, found.solvers).axes[0].collections) == 2
+
+
 def test_two_solvers_need_no_pictures_of_pairs(record, evidence):
     found = section(compose(evidence(crowd(record, 2))), "profiles")
     assert [p.name for p in found.pictures] == ["profiles-1"]
