@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -160,13 +161,18 @@ def log_log(axes: Axes, xlabel: str, ylabel: str) -> None:
     axes.grid(visible=True, which="major", color="#8a93a0", alpha=0.3, linewidth=0.4)
     axes.set_axisbelow(True)
     for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        decades = np.log10(high / low)
-        axis.set_minor_formatter(NullFormatter())
-        if decades < 1.8:
-            few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
-            axis.set_major_locator(few)
-            axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        log_ticks(axis)
+
+
+def log_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis so that labels leave each other room."""
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    axis.set_minor_formatter(NullFormatter())
+    if decades < 1.8:
+        few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
+        axis.set_major_locator(few)
+        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
 
 
 def _slopes(axes: Axes) -> None:

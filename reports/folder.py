@@ -13,20 +13,28 @@ from harness.journal import read_journal
 from harness.kkt import VERIFIED_FACTOR
 from harness.store import load_fields
 from reports.cases import cases
+from reports.contests import contests
+from reports.conventions import standing
 from reports.courses import convergence
 from reports.data import Evidence, Outcome, read_evidence
 from reports.figures import accuracy_figure, scaling_figure
+from reports.growth import growth
 from reports.layout import Page, Picture, Section
+from reports.means import means
 from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
 from reports.parquet import write_records
+from reports.performance import profiles
 from reports.physics import agreement, physics
 from reports.precision import precision
+from reports.ranking import ranking
+from reports.ratios import ratios
 from reports.results import claims, errors, iterations
 from reports.scaling import Ladder, ladders, scaling
 from reports.setting import definitions, environment
 from reports.sheets import sheets
 from reports.summary import dateline, summary
 from reports.sweeps import accuracy
+from reports.tally import tally
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
 from reports.writing import RENDERED, write_page, write_text
@@ -71,18 +79,25 @@ def write_report(
 def compose(evidence: Evidence) -> Page:
     """Put the report together, summary first."""
     found = ladders(evidence)
+    standings = [standing(c) for c in contests(evidence)]
     sections = (
         summary(evidence),
         cases(evidence),
+        tally(evidence),
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
+        ratios(evidence),
         precision(evidence),
+        means(standings),
+        ranking(standings),
+        profiles(standings, evidence.solvers),
         accuracy(evidence),
         iterations(evidence),
         convergence(evidence),
         errors(evidence),
         agreement(evidence),
         _grown(found, evidence),
+        growth(found),
         physics(evidence),
         deformed(evidence),
         environment(evidence),
