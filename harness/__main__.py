@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -33,6 +34,7 @@ def main() -> None:
         vtu=_vtu,
         series=_series,
         paper=_paper,
+        validation=_validation,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
@@ -41,6 +43,12 @@ def _report(folder: Path, formats: Sequence[str]) -> list[Path]:
     from reports import write_report  # late: workers must not carry matplotlib
 
     return write_report(folder, formats)
+
+
+def _validation(folder: Path, data: Mapping[str, Any]) -> list[Path]:
+    from reports.validation import write_validation
+
+    return write_validation(folder, data)
 
 
 def _plot(fields: Fields, path: Path) -> None:

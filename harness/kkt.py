@@ -124,22 +124,32 @@ def _scales(
     return _Scales(X, S, max(_sup(energies), floor_E, key=_nan_first))
 
 
-def verdict(claimed: Status, residuals: Residuals, tol: float) -> Verdict:
+def allowed(tol: float, factor: float = VERIFIED_FACTOR) -> float:
+    """Return the largest residual that verification allows: factor·tol, at most 0.1."""
+    return min(factor * tol, 0.1)
+
+
+def verdict(
+    claimed: Status,
+    residuals: Residuals,
+    tol: float,
+    factor: float = VERIFIED_FACTOR,
+) -> Verdict:
     """Judge a point by its residuals; the claim decides only how a failure is called.
 
-    Verified: every residual ≤ 10·tol, whatever was claimed. A refuted claim of success
-    is `inaccurate` while at least half of the digits asked for are there (worst
-    residual ≤ √(10·tol)), and `wrong` beyond. A residual above 0.1 verifies nothing,
-    whatever the tolerance.
+    Verified: every residual ≤ factor·tol, whatever was claimed. A refuted claim of
+    success is `inaccurate` while at least half of the digits asked for are there (worst
+    residual ≤ √(factor·tol)), and `wrong` beyond. A residual above 0.1 verifies
+    nothing, whatever the tolerance.
     """
-    allowed = min(VERIFIED_FACTOR * tol, 0.1)
+    most = allowed(tol, factor)
     if claimed is Status.DECLINED:
         return Verdict.DECLINED
-    if residuals.worst <= allowed:
+    if residuals.worst <= most:
         return Verdict.VERIFIED
     match claimed:
         case Status.SOLVED:
-            close = residuals.worst <= max(allowed, np.sqrt(allowed))
+            close = residuals.worst <= max(most, np.sqrt(most))
             return Verdict.INACCURATE if close else Verdict.WRONG
         case Status.INFEASIBLE:
             return Verdict.INFEASIBLE_CLAIM
