@@ -118,7 +118,7 @@ def compared(
         p
         for p in pairs
         if max(p.distance, p.equilibrium or 0.0) > p.allowed
-        and not (answers[p.a].refuted or answers[p.b].refuted)
+        and all(_upheld(answers[i]) for i in (p.a, p.b))
     ]
     return Problem(
         name=name, truth=truth.name, doubt=truth.doubt, closed=truth.closed,
@@ -221,6 +221,10 @@ def _pairs(
             )
         )
     return found
+
+
+def _upheld(a: Answer) -> bool:
+    return a.claimed == Status.SOLVED and not a.refuted
 
 
 def _farther(a: Assessment) -> float:

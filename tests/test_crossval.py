@@ -22,7 +22,7 @@ from harness.record import Verdict
 from harness.references import reference_point
 from harness.registry import SolverSpec, load_plugin
 from harness.store import save_solution, write_point
-from harness.truth import Given
+from harness.truth import Given, truth_of
 from harness.workbench import Workbench
 from problems import PROBLEMS
 from reports.validation import write_validation
@@ -286,15 +286,49 @@ def test_different_multipliers_of_one_contact_force_agree(duplicate):
     assert not any(a.refuted or a.assessment.rows for a in found.answers)
 
 
-def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
-    def fails(qp):
-        raise ArithmeticError("it found nothing")
+def finds_nothing(qp):
+    raise ArithmeticError("it found nothing")
 
+
+def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
+    """As an interior point has them: all forces and all gaps are positive."""
+    point = reference_point(duplicate.mechanics, reference_solution)
+    inside = pushed((1.5, 1e-9), (0.5 - 5e-8, 1 - 1e-7))
+
+    found, _ = assess(duplicate.mechanics, point, inside, 1e-8)
+
+    assert found.active == 1
+    assert found.rows == ()
+
+
+def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
+    duplicate, monkeypatch
+):
+    def back(s):  # which leads astray, while nothing is known for sure
+        return replace(s, x=s.x + 1) if s.iterations else s
+
+    def doubtful(*args):
+        return truth_of(*args)._replace(doubt=np.inf)
+
+    monkeypatch.setattr("harness.crossval.truth_of", doubtful)
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    s = pushed((1.5, 0.0))
+    answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
+    silent = replace(s, iterations=3, status=Status.FAILED)
+
+    found = compared("wall", [*answers, given(case, "c", silent)], finds_nothing, None)
+
+    assert not any(a.refuted for a in found.answers)
+    assert [(p.a, p.b) for p in found.unresolved] == [(0, 1)]
+    assert found.unresolved[0].distance > found.unresolved[0].allowed
+
+
+def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
     good, bad = pushed((1.5, 0.0)), pushed((1.5, 0.0), (0.45, 0.9))
     answers = [given(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))]
     answers.append(given(duplicate, "good", good))
 
-    found = compared("wall", answers, fails, None)
+    found = compared("wall", answers, finds_nothing, None)
 
     assert found.truth == "good on primal"
     assert "it found nothing" in found.note
@@ -328,6 +362,39 @@ def test_an_answer_within_its_claim_that_stands_out_is_a_remark(truths, tmp_path
 
     assert code == 0
     assert {d["solver"] for d in verdict["remarks"]} == {"lazy"}
+
+
+def test_what_all_solvers_are_is_no_remark(truths, tmp_path, cli):
+    _, s = truths[2, "dual-bounds"]
+    lazy = replace(s, x=s.x * (1 + 2e-5))
+    answers = [(label, f"{BEAM}/dual-bounds", lazy) for label in HONEST]
+
+    _, verdict = verdict_on(cli, write(tmp_path, answers, tol=1e-5))
+
+    assert verdict["remarks"] == []
+
+
+def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
+    truths, tmp_path, cli
+):
+    off = disturbed(*truths[2, "dual-bounds"], 1e-3)
+    asked = {"smalbe": "dual", "b": "primal", "c": "dual"}
+    exact = [(k, f"{BEAM}/{form}", truths[2, form][1]) for k, form in asked.items()]
+    write(
+        tmp_path, [*exact, *((k, f"{BEAM}/dual-bounds", off) for k in "bc")], tol=1e-4
+    )
+    write(tmp_path, exact, tol=1e-6)
+
+    _, verdict = verdict_on(cli, tmp_path)
+
+    rows = {(r["solver"], r["tol"]): r for r in verdict["solvers"]}
+    assert next(iter(rows)) == ("smalbe", 1e-4)
+    assert rows["b", 1e-4]["primal_dual"] == pytest.approx(1e-3, rel=1e-3)
+    assert rows["c", 1e-4]["primal_dual"] is None  # dual forms only
+    assert rows["b", 1e-4]["from_ours"] == pytest.approx(1e-3, rel=1e-3)
+    assert rows["b", 1e-6]["from_ours"] < 1e-8
+    assert rows["smalbe", 1e-4]["from_ours"] is None  # alone
+    assert verdict["counts"]["pairs"] == 10 + 3  # of answers at one tolerance
 
 
 def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
