@@ -34,7 +34,8 @@ def admissible(
     that does not end, θu with θ < 1 is admissible while c > 0.
     """
     B, c = mechanics.exact.B, mechanics.exact.c
-    inside = 16 * _EPS * (abs(B) @ np.abs(u) + np.abs(c))
+    size = np.abs(u).max(initial=Real(0))  # of what is added up to get there
+    inside = _EPS * abs(B) @ (16 * np.abs(u) + 4 * size) + 16 * _EPS * np.abs(c)
     held = closed & False
     moved, step = u, None
     for _ in range(ROUNDS):

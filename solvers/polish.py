@@ -18,7 +18,7 @@ nothing changes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,7 +70,7 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
     qp : with the largest entries about one; P, A and G all dense or all sparse
     start : near a solution, mostly of an interior-point method
     """
-    problem = _Problem(qp, *(_extended(M) for M in (qp.P, qp.A, qp.G)))
+    problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
     slack = qp.h - qp.G @ start.x
     side = 1 * (start.z_box > qp.ub - start.x) - 1 * (-start.z_box > start.x - qp.lb)
@@ -81,15 +81,11 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
             at = _refined(problem, active, at)
         except ArithmeticError:
             return
-        yield _rounded(problem, active, at)
+        yield replace(_rounded(problem, active, at), iterations=start.iterations)
         new = _corrected(problem, active, at, one=k >= ALL_AT_ONCE)
         if not any((a != b).any() for a, b in zip(new, active, strict=True)):
             return
         active = new
-
-
-def _extended(M: Matrix) -> Matrix:
-    return M.astype(np.longdouble)
 
 
 def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
@@ -118,6 +114,9 @@ def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
 def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> _Active:
     """Let violated constraints enter and multipliers of the wrong sign leave.
 
+    Active rows that are almost dependent cannot all be met, short of huge multipliers;
+    when all else is right, those that keep a slack leave.
+
     one : only that which is most wrong, relative to x or to the gradient
     """
     qp, side = problem.qp, active.side
@@ -128,6 +127,8 @@ def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> 
     wrong_side = np.where(side == 0, outside, pulled)
     violated = (problem.G @ at.x - qp.h) / X
     wrong_rows = np.where(active.rows, -at.z / S, violated)
+    if max(wrong_side.max(initial=0), wrong_rows.max(initial=0)) < ROUNDING:
+        wrong_rows = np.where(active.rows, -violated, 0.0)
     least = ROUNDING
     if one:
         least = max(

@@ -2,7 +2,8 @@
 
 Where P is positive semidefinite, such a matrix is quasidefinite: it is regular, and a
 sparse one has triangular factors in every symmetric order of its rows (Vanderbei 1995,
-SIAM J. Optim. 5), hence the order is that of least fill, without pivoting.
+SIAM J. Optim. 5), hence the order is that of least fill, without pivoting. Where D and
+W are so small that rounding spoils such factors, pivots are chosen by size.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -12,6 +12,7 @@ import pytest
 from harness import Mechanics, Solution, Status, UncertifiableError, certify
 from harness.build import build
 from harness.certificate import Certificate
+from harness.judge import has_point
 from harness.mechanics import Extended, Real
 from harness.names import parse
 from harness.references import ReferencePoint, reference_point
@@ -154,3 +155,63 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
     problem = known(name)
     assert problem.exact.bound < 1e-8
     assert certify(problem.mechanics, problem.solution()).bound < 1e-7
+
+
+def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
+    """Bound over true error of the pairs that solvers return at 1e-3 to 1e-8."""
+    problem, found = known(name), []
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(f"{name}/{form}", PROBLEMS), family, reference_solution)
+    assert case.mechanics is not None
+    for solver in (SOLVERS[label] for label in labels):
+        if solver.declines(case.qp) is not None:
+            continue
+        for tol in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
+            s = solver.prepare(case.qp, tol)()
+            if not has_point(s):
+                continue
+            s = case.mechanics.back(s)
+            c = certify(case.mechanics, s)
+            assert holds(problem, s, c)
+            true = np.hypot(problem.error(c.u), problem.error(c.equilibrium))
+            if true > 10 * problem.slack:  # below, the reference is no measure
+                found.append(c.pair / true)
+    return found
+
+
+def forms_of(names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(n, form) for n in names for form in PROBLEMS[n.partition("/")[0]].forms]
+
+
+def test_bounds_of_what_solvers_return_are_sharp():
+    cases = forms_of((CASES[0], CASES[3], CASES[7]))
+    labels = ("smalbe", "clarabel", "piqp")
+    found = [e for case in cases for e in effectivities(*case, labels)]
+    assert len(found) > 70
+    assert np.median(found) <= 3
+    assert min(found) >= 1 / ROUNDED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_so_are_those_of_the_fleet(name):
+    fleet = ("smalbe", "osqp", "clarabel", "proxqp", "piqp", "scs", "highs", "daqp")
+    found = [e for case in forms_of((name,)) for e in effectivities(*case, fleet)]
+    assert np.median(found) <= 3
+    assert min(found) >= 1 / ROUNDED
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hertz-cylinder/dual",  # supports dominate the gradient's scale
+        "hertz-cylinder/slave=lower/dual",
+        "beam-ring/Nr=8/Nh=4/step=1/dual",
+        "obstacle/n=10/dual-bounds",
+    ],
+)
+def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(name, PROBLEMS), family, reference_solution)
+    s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
+    assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6

@@ -196,6 +196,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, given, forms, rel)
         energies.append(case.scale * case.qp.objective(s.x) + case.constant)
 
         assert kkt_residuals(case.qp, s).worst <= 1e-15 + rounding(case.qp, s)
+        assert s.iterations is None or s.iterations <= 20
         if form != "primal":
             assert kkt_residuals(case.qp, s).worst <= 1e-15
     assert energies == pytest.approx(energies[:1] * len(forms), rel=rel)
@@ -220,6 +221,74 @@ def test_energies_known_by_hand_are_reached(name, given, form, energy):
     assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
         energy, rel=1e-14
     )
+
+
+@pytest.mark.parametrize(
+    ("steps", "tip", "force"), [(1, -0.303750, 0.0), (10, -0.297282, -2.840e7)]
+)
+def test_the_beam_sinks_by_what_a_prototype_found(steps, tip, force):
+    """Nr = 20, Nh = 10; the load in one or ten linearisations; 11 844 displacements."""
+    family = PROBLEMS["beam-ring"]
+    given = completed(family, dict(Nr=20, Nh=10, steps=steps))
+    case = family.build("primal", given, reference_solution)
+    s = reference_solution(case.qp)
+    got = case.quantities(s)
+
+    assert kkt_residuals(case.qp, s).worst <= 1e-15 + rounding(case.qp, s)
+    assert got["tip"][1] == pytest.approx(tip, abs=5e-7)
+    assert abs(got["contact_force"][0]) == pytest.approx(abs(force), abs=5e3)
+
+
+def test_rows_without_entries_hold_nothing():
+    qp, exact = planted("everything", dense=True)
+    empty = np.zeros((1, 20))
+    more = replace(
+        qp, A=np.vstack([qp.A, empty]), b=np.append(qp.b, 0),
+        G=np.vstack([qp.G, empty]), h=np.append(qp.h, 0),
+    )  # fmt: skip
+    s = reference_solution(more)
+
+    assert s.x == pytest.approx(exact.x, rel=1e-14)
+    assert kkt_residuals(more, s).worst <= 1e-15
+
+
+@pytest.mark.parametrize("size", [1e10, 1e20, 1e100])
+def test_a_far_bound_is_as_none(size):
+    qp, exact = planted("some bounds")
+    far = replace(
+        qp, lb=np.maximum(qp.lb, -size), ub=np.minimum(qp.ub, size),
+        G=csr_array(np.eye(1, 20)), h=np.array([size]),
+    )  # fmt: skip
+
+    assert reference_solution(far).x == pytest.approx(exact.x, rel=1e-14)
+
+
+@pytest.mark.parametrize("noise", [1e-16, 1e-12, 1e-9, 1e-6])
+def test_rows_that_are_almost_the_same_do_no_harm(noise):
+    qp, exact = planted("everything", dense=True)
+    wobble = 1 + noise * np.random.default_rng(31415).standard_normal(qp.G.shape)
+    G = np.vstack([qp.G, qp.G * wobble])
+    almost = replace(qp, G=G, h=np.append(qp.h, qp.h))
+    s = reference_solution(almost)
+
+    assert kkt_residuals(almost, s).worst <= max(1e-15, 1e-3 * noise)
+    assert s.x == pytest.approx(exact.x, abs=100 * noise + 1e-14)
+
+
+@pytest.mark.parametrize("digits", [6, 12, 18])
+def test_ill_conditioning_costs_no_digit_of_the_residuals(digits):
+    rng = np.random.default_rng(2718)
+    Q = np.linalg.qr(rng.standard_normal((40, 40)))[0]
+    P = Q * np.logspace(0, -digits, 40) @ Q.T
+    x = np.where(np.arange(40) % 2, rng.exponential(size=40), 0.0)
+    pushed = np.where(x == 0, rng.exponential(size=40), 0.0)
+    A = rng.standard_normal((3, 40))
+    qp = QP(
+        P=(P + P.T) / 2, q=pushed - P @ x, A=A, b=A @ x, G=no_rows(40), h=np.zeros(0),
+        lb=np.zeros(40), ub=np.full(40, np.inf),
+    )  # fmt: skip
+
+    assert kkt_residuals(qp, reference_solution(qp)).worst <= 1e-13
 
 
 def test_few_iterations_tell_the_active_constraints_and_one_factor_gives_the_digits():
