@@ -146,11 +146,16 @@ def _answer(g: Given, found: Assessment | None, doubt: float | None) -> Answer:
 
 
 def _contradiction(a: Answer) -> str:
-    """Say so where an error is larger than the certificate of it allows."""
+    """Say so where an error is larger than the certificate of it allows.
+
+    Of the point that the run certified, that is, which has the verdict that it had.
+    """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
     least = a.assessment.error - a.doubt
-    if least <= 1.01 * a.energy_bound + 1e-15 or a.energy_bound > 0.01:
+    if a.verdict is not a.stored or a.energy_bound > 0.01:
+        return ""
+    if least <= 1.01 * a.energy_bound + 1e-15:
         return ""
     return f"error {brief(least)}, certified at most {brief(a.energy_bound)}"
 

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from harness import Verdict
-from reports.layout import Cell, Page, Section, Table, name_cell
+from reports.compared import (
+    Data,
+    count_cell,
+    left_out,
+    listed,
+    number_cell,
+    problems,
+    remarks,
+    run,
+    tol_cell,
+)
+from reports.error_figure import error_figure
+from reports.figures import save
+from reports.layout import Cell, Page, Picture, Section, Table, name_cell
 from reports.markdown import markdown
 from reports.page import html
-from reports.wording import ABSENT, VERDICTS, clean, plural, power, tolerance
-
-Data = Mapping[str, Any]
+from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
 
 _FOOTER = (
     "All answers and all pairs are in validation.json beside the journal, at full "
@@ -49,7 +58,10 @@ _RULES = (
 def write_validation(directory: Path, data: Data) -> list[Path]:
     """Write DIR/report/validation.html and .md from the data of `validate`."""
     page, target = compose(data), directory / "report"
-    target.mkdir(parents=True, exist_ok=True)
+    (target / "figures").mkdir(parents=True, exist_ok=True)
+    for picture in (p for section in page.sections for p in section.pictures):
+        for ending in ("pdf", "svg", "png"):
+            save(picture.figure, target / "figures" / f"{picture.name}.{ending}")
     written = [target / "validation.html", target / "validation.md"]
     for path, text in zip(written, (html(page), markdown(page)), strict=True):
         path.write_text(text, encoding="utf-8", newline="\n")
@@ -61,18 +73,18 @@ def compose(data: Data) -> Page:
     sections = (
         _verdict(data),
         _disagreements(data),
-        _problems(data),
-        _remarks(data),
-        _left_out(data),
+        problems(data),
+        remarks(data),
+        left_out(data),
         Section(name="rules", title="How it is decided", points=_RULES),
     )
-    answers, solvers, cases, problems, pairs = (
+    answers, solvers, cases, asked, pairs = (
         plural(data["counts"][f"{noun}s"], noun)
         for noun in ("answer", "solver", "case", "problem", "pair")
     )
     return Page(
         title=f"Cross-validation of {clean(data['folder'])}",
-        dateline=f"{answers} of {solvers} to {cases} of {problems}; {pairs} compared",
+        dateline=f"{answers} of {solvers} to {cases} of {asked}; {pairs} compared",
         sections=tuple(s for s in sections if s is not None),
         footer=_FOOTER,
     )
@@ -101,7 +113,22 @@ def _verdict(data: Data) -> Section:
         title="Verdict",
         prose=(clean(data["headline"], 600),),
         tables=(table,),
+        pictures=_errors(data),
     )
+
+
+def _errors(data: Data) -> tuple[Picture, ...]:
+    """Draw the errors of all answers at the tightest tolerance."""
+    answers = [a for p in data["problems"] for a in p["answers"]]
+    tol = min(a["tol"] for a in answers)
+    figure = error_figure(answers, tol)
+    if figure is None:
+        return ()
+    caption = (
+        f"Certified error of every answer at tol {tolerance(tol)}. It is never below "
+        "what is known of the reference. Beyond √(20t) no verified answer may lie."
+    )
+    return (Picture(name="errors", caption=caption, figure=figure),)
 
 
 def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:
@@ -110,21 +137,21 @@ def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:
     return (
         Cell(text=clean(row["solver"], 40)),
         *tol,
-        _count(row["answers"]),
+        count_cell(row["answers"]),
         Cell(text=str(refuted), value=refuted, kind="over" if refuted else ""),
-        _count(row["unanswered"]),
-        _number(row["error_median"]),
-        _number(row["error_worst"]),
+        count_cell(row["unanswered"]),
+        number_cell(row["error_median"]),
+        number_cell(row["error_worst"]),
         Cell(
             text=clean(row["worst_case"], 60) or ABSENT,
             kind="words",
             title=clean(row["worst_case"], 2000),
         ),
-        _number(row["penetration"]),
-        _number(row["balance"]),
-        _count(row["contradicted_rows"]),
-        _number(row["primal_dual"]),
-        _number(row["from_ours"]),
+        number_cell(row["penetration"]),
+        number_cell(row["balance"]),
+        count_cell(row["contradicted_rows"]),
+        number_cell(row["primal_dual"]),
+        number_cell(row["from_ours"]),
     )
 
 
@@ -151,7 +178,7 @@ def _disagreements(data: Data) -> Section | None:
         )
     if broken := data["contradictions"]:
         tables.append(
-            _listed("Certificates that the reference contradicts: our fault.", broken)
+            listed("Certificates that the reference contradicts: our fault.", broken)
         )
     if not tables:
         return None
@@ -164,12 +191,12 @@ def _wrong(d: Data) -> tuple[Cell, ...]:
     if d["rows"]:
         why += f"; contradicts contact at {plural(len(d['rows']), 'row')}"
     return (
-        Cell(text=clean(d["solver"], 40), title=f"run {clean(d['run_id'], 40)}"),
+        Cell(text=clean(d["solver"], 40), title=run(d)),
         name_cell(d["case"]),
-        _tol(d),
+        tol_cell(d),
         Cell(text=clean(d["claimed"], 20), kind="words"),
         Cell(text=words, symbol=symbol, kind=d["verdict"]),
-        _number(d["error"]),
+        number_cell(d["error"]),
         Cell(text=clean(why, 400), kind="words"),
     )
 
@@ -178,136 +205,7 @@ def _apart(d: Data) -> tuple[Cell, ...]:
     return (
         name_cell(d["problem"]),
         Cell(text=clean(" and ".join(d["between"]), 120)),
-        _tol(d),
-        _number(d["distance"]),
-        _number(d["allowed"]),
+        tol_cell(d),
+        number_cell(d["distance"]),
+        number_cell(d["allowed"]),
     )
-
-
-def _problems(data: Data) -> Section:
-    table = Table(
-        caption="Every problem: all pairs of answers, of each solver and form.",
-        columns=(
-            "problem", "answers", "pairs", "closed rows", "error of the reference",
-            "largest distance", "of forces", "of energies", "between",
-        ),
-        rows=tuple(map(_problem, data["problems"])),
-        notes=(
-            "Distances in the energy norm over ‖u*‖, energies over ½‖u*‖². A problem "
-            "is a case without its form; without mechanics (file:), one QP, and the "
-            "norm is that of P.",
-        ),
-    )  # fmt: skip
-    return Section(name="problems", title="Problems", tables=(table,))
-
-
-def _problem(p: Data) -> tuple[Cell, ...]:
-    pairs, answers = p["pairs"], p["answers"]
-    farthest = max(pairs, key=_distance, default=None)
-    between = ABSENT
-    if farthest is not None:
-        between = " and ".join(_who(answers[farthest[k]]) for k in ("a", "b"))
-    truth = "" if p["truth"] == "reference" else clean(p["truth"] or "none", 40)
-    return (
-        name_cell(p["name"]),
-        _count(len(answers)),
-        _count(len(pairs)),
-        Cell() if p["closed"] is None else _count(p["closed"]),
-        Cell(text=power(p["doubt"]), value=p["doubt"], after=truth),
-        _number(_largest(pairs, "distance")),
-        _number(_largest(pairs, "equilibrium")),
-        _number(_largest(pairs, "energy")),
-        Cell(text=clean(between, 80), kind="words"),
-    )
-
-
-def _distance(pair: Data) -> float:
-    found = [pair[k] for k in ("distance", "equilibrium") if pair[k] is not None]
-    return max(found, default=float("inf"))
-
-
-def _who(a: Data) -> str:
-    return f"{a['solver']} on {a['form']}"
-
-
-def _remarks(data: Data) -> Section | None:
-    """Say per solver how often it stands out, and where most."""
-    grouped: dict[str, list[Data]] = {}
-    for d in data["remarks"]:
-        grouped.setdefault(d["solver"], []).append(d)
-    if not grouped:
-        return None
-    rows = []
-    for solver, mine in grouped.items():
-        worst = max(mine, key=lambda d: d["error"] or 0.0)
-        rows.append(
-            (
-                Cell(text=clean(solver, 40)),
-                _count(len({d["run_id"] for d in mine})),
-                _number(worst["error"]),
-                Cell(text=clean(worst["case"]), kind="words"),
-                Cell(text=clean(worst["text"], 200), kind="words"),
-            )
-        )
-    table = Table(
-        caption="Answers within what they claim that stand out from the others.",
-        columns=("solver", "answers", "largest error", "on", "what"),
-        rows=tuple(rows),
-    )
-    return Section(name="remarks", title="What stands out", tables=(table,))
-
-
-def _left_out(data: Data) -> Section | None:
-    """List what was asked and not answered, and what could not be judged."""
-    named = (
-        ("unanswered", "Measurements that ended without a claim."),
-        ("not_validated", "Stored answers that could not be judged."),
-    )
-    tables = tuple(_listed(words, data[key]) for key, words in named if data[key])
-    points = tuple(
-        f"{clean(d['problem'])}: {clean(d['text'], 300)}; "
-        + (f"{clean(d['truth'], 60)} stands for it" if d["truth"] else "residuals only")
-        for d in data["without_reference"]
-    )
-    prose = ("These problems have no reference point:",) if points else ()
-    if not tables and not points:
-        return None
-    return Section(
-        name="left-out", title="Not compared", prose=prose, points=points,
-        tables=tables,
-    )  # fmt: skip
-
-
-def _listed(caption: str, entries: Sequence[Data]) -> Table:
-    return Table(
-        caption=caption,
-        columns=("solver", "case", "tol", "what"),
-        rows=tuple(
-            (
-                Cell(
-                    text=clean(d["solver"], 40), title=f"run {clean(d['run_id'], 40)}"
-                ),
-                name_cell(d["case"]),
-                _tol(d),
-                Cell(text=clean(d["text"], 240), kind="words"),
-            )
-            for d in entries
-        ),
-        text_columns=2,
-    )
-
-
-def _largest(pairs: Sequence[Data], name: str) -> float | None:
-    return max((p[name] for p in pairs if p[name] is not None), default=None)
-
-
-def _tol(d: Data) -> Cell:
-    return Cell(text=tolerance(d["tol"]), value=d["tol"])
-
-
-def _count(n: int) -> Cell:
-    return Cell(text=str(n), value=n)
-
-
-def _number(value: float | None) -> Cell:
-    return Cell(text=power(value), value=value)

@@ -274,6 +274,25 @@ def pushed(z, x=(0.5, 1.0)):
     )  # fmt: skip
 
 
+def test_a_certificate_that_the_reference_contradicts_is_our_fault(
+    truths, tmp_path, cli
+):
+    """The error is 2e-5, which the claim allows, but certified as 1e-7."""
+    _, s = truths[2, "dual-bounds"]
+    answers = [("a", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5)))]
+    write(tmp_path, answers, tol=1e-5)
+    for bound, code in ((1e-4, 0), (1e-7, 1)):
+        (record,) = {r.run_id: r for r in read_journal(tmp_path)}.values()
+        with Journal(tmp_path, "here") as journal:
+            journal.append(record.but(energy_bound=bound))
+
+        found, verdict = verdict_on(cli, tmp_path)
+
+        assert found == code
+        assert culprits(verdict) == set()
+        assert [d["solver"] for d in verdict["contradictions"]] == ["a"] * code
+
+
 def test_different_multipliers_of_one_contact_force_agree(duplicate):
     shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
     answers = [given(duplicate, k, pushed(z)) for k, z in shares.items()]
