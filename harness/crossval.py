@@ -138,10 +138,13 @@ def _answer(g: Given, found: Assessment | None, doubt: float | None) -> Answer:
         energy_allowed=energy_allowed(r.tol), energy_bound=r.energy_bound,
         doubt=doubt, assessment=found, remarks=g.remarks,
     )  # fmt: skip
+    refuted = tuple(_refutations(answer))
+    twin = (f"the very point that it gave for {g.twin}",) if g.twin and refuted else ()
     return replace(
         answer,
-        refuted=tuple(_refutations(answer)),
+        refuted=refuted,
         contradiction=_contradiction(answer),
+        remarks=g.remarks + twin,
     )
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from harness.assessment import Assessment, Deviation, assess, assess_point
 from harness.certificate import UncertifiableError, certify
+from harness.judge import note_of
 from harness.kkt import Residuals, kkt_residuals
 from harness.mechanics import Mechanics
 from harness.plugin import Case, Reference
@@ -38,6 +39,7 @@ class Given:
     case: Case
     solution: Solution
     remarks: tuple[str, ...] = ()  #: what is odd about the point itself
+    twin: str = ""  #: another case to which it gave the very same point
 
 
 class Truth(NamedTuple):
@@ -59,15 +61,13 @@ def truth_of(
     mechanics = given[0].case.mechanics
     if mechanics is None:
         return _plain_truth(given, solve)
-    why = ""
     try:
-        point, name = reference_point(mechanics, solve, references), "reference"
-    except UnsolvedError as e:
-        why = str(e)
-        best = _best_certified(mechanics, given)
-        if best is None:
-            return f"{why}, and no answer can be certified"
-        point, name = best
+        found = _elastic_truth(mechanics, given, solve, references)
+    except Exception as e:  # the family's code, of the factorisation
+        return note_of("reference", e)
+    if isinstance(found, str):
+        return found
+    point, name, why = found
 
     def assessed(g: Given) -> tuple[Assessment, Deviation]:
         assert g.case.mechanics is not None
@@ -80,6 +80,20 @@ def truth_of(
     kernel = mechanics.inverse.kernel
     P = mechanics.primal.P
     return Truth(name, point.bound, closed, assessed, P, kernel, why)
+
+
+def _elastic_truth(
+    mechanics: Mechanics, given: Sequence[Given], solve: Reference,
+    references: Path | None,
+) -> tuple[ReferencePoint, str, str] | str:  # fmt: skip
+    """Find a point, its name, and why it is not the reference, if it is not."""
+    try:
+        return reference_point(mechanics, solve, references), "reference", ""
+    except UnsolvedError as e:
+        best = _best_certified(mechanics, given)
+        return (
+            f"{e}, and no answer can be certified" if best is None else (*best, f"{e}")
+        )
 
 
 def _best_certified(

@@ -23,7 +23,7 @@ def validate(workbench: Workbench, options: Namespace) -> int:
     workbench = workbench.with_files(options.plugin)
     found = validated(options.folder, workbench.families, workbench.reference, say)
     data = as_data(found, options.folder.resolve().name)
-    if not data["counts"]["answers"]:
+    if not (data["counts"]["answers"] or found.false_claims):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{options.folder}: no stored answer can be judged: {why}")
     target = options.folder / "validation.json"

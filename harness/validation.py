@@ -6,24 +6,24 @@ residuals, errors and distances computed from them; what cannot be is listed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from harness.build import build, unbuilt
-from harness.capsule import plugins_needed
 from harness.crossval import Problem, brief, compared
 from harness.errors import InputError
-from harness.folder import environment_of
 from harness.journal import read_journal
 from harness.judge import has_point
-from harness.names import CaseName, assemble
 from harness.plugin import Case, Family, Reference
 from harness.qpfile import qp_digest
+from harness.rebuilt import rebuilt
 from harness.record import Record, Verdict
-from harness.solution import Solution, Status
+from harness.solution import Status
 from harness.store import digest_of, load_solution, point_arrays
 from harness.truth import Given
+
+_CHANGED = "the stored point is not the one that was measured: its file was changed"
+PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,11 @@ def validated(
         problems=tuple(problems),
         solvers=tuple(sorted({r.solver for r in records})),
         false_claims=tuple(false_claims),
-        unanswered=tuple(_listed(r, _ending(r)) for r in records if _silent(r)),
+        unanswered=tuple(
+            _listed(r, _ending(r))
+            for r in records
+            if _silent(r) and r.run_id not in {x.run_id for x in false_claims}
+        ),
         not_validated=tuple(lost),
         declined=sum(r.status is Verdict.DECLINED for r in records),
     )
@@ -149,8 +153,14 @@ def _group(
                  folder.references)
         for same in by_numbers.values()
     ]  # fmt: skip
-    solvable = {a.case: p for p in problems for a in p.answers if _proven(p)}
-    false = [_listed(r, text) for r in records if (text := _falsehood(r, solvable))]
+    proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
+    solvable = {a.case: p for p in proven for a in p.answers}
+    elastic = next((p for p in proven if p.closed is not None), None)  # of all forms
+    false = [
+        _listed(r, text)
+        for r in records
+        if (text := _falsehood(r, solvable.get(r.case, elastic)))
+    ]
     return problems, lost, false
 
 
@@ -162,40 +172,13 @@ def _built(
     lost: list[Listed] = []
     for first in {r.case: r for r in records if r.vectors}.values():
         try:
-            cases[first.case] = _build(folder, first)
+            cases[first.case] = rebuilt(
+                first, folder.path, folder.families, folder.reference
+            )
         except InputError as e:
             answered = [r for r in records if r.case == first.case and r.vectors]
             lost += [_listed(r, str(e)) for r in answered]
     return cases, lost
-
-
-def _build(folder: _Folder, r: Record) -> Case:
-    """Build the case of a record.
-
-    Raises
-    ------
-    InputError
-        When its family is not known, or fails, or builds another QP than then.
-
-    """
-    if r.family not in folder.families:
-        try:
-            needs = plugins_needed(environment_of(folder.path, r.environment))
-        except InputError:
-            needs = ""
-        raise InputError(f"unknown family {r.family!r}{needs}")
-    family = folder.families[r.family]
-    name: CaseName = assemble(family, r.params, r.form)
-    try:
-        case = build(name, family, folder.reference)
-    except (Exception, SystemExit) as e:  # the family's code
-        raise InputError(unbuilt(r.case, e)) from None
-    if r.qp is not None and (now := qp_digest(case.qp, recipe=True)) != r.qp:
-        raise InputError(
-            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
-            "the same version of the code, of its libraries and of plug-ins"
-        )
-    return case
 
 
 def _given(
@@ -221,18 +204,16 @@ def _given(
             continue
         found[key] = Given(
             record=r, label=r.solver, repeats=1, case=case, solution=s,
-            remarks=tuple(_oddities(folder, r, s)),
+            remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
+            twin=_twin(folder, r),
         )  # fmt: skip
     return list(found.values()), lost
 
 
-def _oddities(folder: _Folder, r: Record, s: Solution) -> Iterator[str]:
-    """Say what is odd about a stored point itself."""
-    if digest_of(point_arrays(s)) != r.vectors:
-        yield "the stored point is not the one that was measured: its file was changed"
+def _twin(folder: _Folder, r: Record) -> str:
+    """Name another case to which the solver gave the same point; empty if none."""
     others = folder.twins.get((r.solver, r.vectors or ""), set()) - {r.case}
-    if others:
-        yield f"the very point that it gave for {min(others)}"
+    return min(others, default="")
 
 
 def _stands(r: Record) -> bool:
@@ -241,26 +222,26 @@ def _stands(r: Record) -> bool:
 
 
 def _silent(r: Record) -> bool:
-    """Whether a record neither claims anything nor is verified."""
-    claims = r.claimed in (Status.SOLVED, Status.INFEASIBLE)
-    return not claims and r.status not in (Verdict.VERIFIED, Verdict.DECLINED)
+    """Whether a record neither claims success nor is verified."""
+    return r.claimed != Status.SOLVED and r.status not in (
+        Verdict.VERIFIED,
+        Verdict.DECLINED,
+    )
 
 
-def _falsehood(r: Record, solvable: Mapping[str, Problem]) -> str:
-    """Say what is false about a claim without a point; empty where nothing is."""
+def _falsehood(r: Record, solved: Problem | None) -> str:
+    """Say what is false about a claim without a point; empty where nothing is.
+
+    solved : the problem, where it has a solution that is known
+    """
     if r.claimed == Status.SOLVED and not r.vectors:
         return "claims success without a finite point"
-    if r.claimed == Status.INFEASIBLE and (p := solvable.get(r.case)) is not None:
+    if r.claimed == Status.INFEASIBLE and solved is not None:
         return (
-            f"claims that there is no solution; the {p.truth} is one, with an error "
-            f"of at most {brief(p.doubt or 0.0)}"
+            f"claims that there is no solution; the {solved.truth} is one, with an "
+            f"error of at most {brief(solved.doubt or 0.0)}"
         )
     return ""
-
-
-def _proven(p: Problem) -> bool:
-    """Whether a problem has a solution that is known well enough to refute a claim."""
-    return p.doubt is not None and p.doubt < 1e-2
 
 
 def _ending(r: Record) -> str:

@@ -71,12 +71,12 @@ def write(folder, answers, tol=1e-8):
 @pytest.fixture
 def cli(capsys):
     """Validate a folder; returns the exit code, stdout and stderr."""
-    workbench = Workbench(
-        families=PROBLEMS, solvers={}, reference=reference_solution,
-        validation=write_validation, **NOWHERE,
-    )  # fmt: skip
 
-    def cli(*argv):
+    def cli(*argv, **more):
+        workbench = Workbench(
+            families=PROBLEMS, solvers={}, reference=reference_solution, **NOWHERE,
+            **more,
+        )  # fmt: skip
         code = main(workbench, ["validate", *map(str, argv)])
         return code, *capsys.readouterr()
 
@@ -150,7 +150,7 @@ def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli):
         for label in ("a", "smalbe")
     ]
 
-    code, out, err = cli(write(tmp_path, answers))
+    code, out, err = cli(write(tmp_path, answers), validation=write_validation)
 
     assert code == 0
     assert out.startswith("No disagreement: 12 answers of 2 solvers to 6 cases")
@@ -161,7 +161,9 @@ def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli):
     assert all(r["error_worst"] < 1e-7 for r in data["solvers"])
     assert all(r["primal_dual"] < 1e-7 for r in data["solvers"])
     assert all(r["from_ours"] < 1e-7 for r in data["solvers"])
-    assert (tmp_path / "report" / "validation.html").exists()
+    pages = [tmp_path / "report" / f"validation.{kind}" for kind in ("html", "md")]
+    assert out.split()[-2:] == list(map(str, pages))
+    assert all("No disagreement" in page.read_text() for page in pages)
 
 
 def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_path, cli):
@@ -482,6 +484,42 @@ def test_claims_without_a_point_are_refuted_and_what_died_is_listed(
     assert verdict["counts"]["declined"] == 1
 
 
+def test_a_claim_that_nothing_refutes_is_listed_all_the_same(tmp_path, cli):
+    qp = built("membrane/qp").qp
+    denied = PLUGIN.solvers["denies"].prepare(qp, 1e-8)()
+    answers = [("a", "half/qp", pulled()), ("denies", "membrane/qp", denied)]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers), "--plugin", LIARS)
+
+    assert code == 0
+    assert [d["text"] for d in verdict["unanswered"]] == ["infeasible claim"]
+
+
+def test_a_form_that_all_deny_is_refuted_by_the_other_forms(truths, tmp_path, cli):
+    _, s = truths[2, "dual"]
+    denied = PLUGIN.solvers["denies"].prepare(truths[2, "primal"][0].qp, 1e-8)()
+    answers = [("a", f"{BEAM}/dual", s), ("denies", f"{BEAM}/primal", denied)]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert (code, culprits(verdict)) == (1, {"denies"})
+
+
+def test_mechanics_that_fail_leave_the_residuals(duplicate):
+    def factorise():
+        raise ZeroDivisionError("no factor")
+
+    mechanics = replace(duplicate.mechanics, factorise=factorise)
+    answers = [given(replace(duplicate, mechanics=mechanics), k, pushed(z))
+               for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
+
+    found = compared("wall", answers, reference_solution, None)
+
+    assert found.truth == ""
+    assert "no factor" in found.note
+    assert [bool(a.refuted) for a in found.answers] == [False, True]
+
+
 def test_a_stored_point_that_was_changed_afterwards_is_noticed(truths, tmp_path, cli):
     _, s = truths[2, "dual-bounds"]
     answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]
@@ -546,7 +584,7 @@ def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
     huge = replace(s, x=np.full_like(s.x, 1e300))
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
-    code, out, _ = cli(write(tmp_path, answers))
+    code, out, _ = cli(write(tmp_path, answers), validation=write_validation)
 
     def refuse(constant):
         raise AssertionError(constant)
