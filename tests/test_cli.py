@@ -352,7 +352,7 @@ WRONG = {
     ),
     "bad value": (
         ("export", "well/n=two/primal", "a.npz"),
-        "well: n='two' is no integer",
+        "well: n='two'; expected an integer, such as 4",
     ),
     "value out of range": (
         ("solve", "well/n=0/primal", "--solver", "exact"),
@@ -395,7 +395,7 @@ WRONG = {
     ),
     "absurd integer": (
         ("solve", f"well/n={5000 * '9'}/primal", "--solver", "exact"),
-        "… is no integer",
+        "…; expected an integer, such as 4",
     ),
     "nowhere to write": (("run", "tiny", "--out", ""), "--out is empty; expected a"),
     "nothing to draw": (
