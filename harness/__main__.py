@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -35,6 +36,7 @@ def main() -> None:
         vtu=_vtu,
         series=_series,
         paper=_paper,
+        validation=_validation,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
@@ -53,6 +55,12 @@ def _compare(
     from reports import write_comparison
 
     return write_comparison(before, after, formats, factor)
+
+
+def _validation(folder: Path, data: Mapping[str, Any]) -> list[Path]:
+    from reports.validation import write_validation
+
+    return write_validation(folder, data)
 
 
 def _plot(fields: Fields, path: Path) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from harness import commands, examine, one, processes
+from harness import commands, examine, one, processes, validate
 from harness.errors import InputError
 from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
@@ -110,6 +110,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_run_options(add("run", "measure a suite; continues a run", commands.run))
     _add_solve_options(add("solve", "one solver on one case, once", one.solve))
     _add_export_options(add("export", "one QP as a file", one.export))
+    _add_validate_options(
+        add("validate", "do all answers of a folder agree", validate.validate)
+    )
     _add_report_options(add("report", "report on a result folder", commands.report))
     _add_replay_options(add("replay", "one measurement again", commands.replay))
     _add_test_options(
@@ -150,6 +153,12 @@ def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE")
     command.add_argument("file", metavar="FILE.npz|mat|parquet", type=Path)
     _add_plugin(command)
+
+
+def _add_validate_options(command: _Parser) -> None:
+    command.add_argument("folder", metavar="DIR", type=Path)
+    _add_plugin(command)
+    _add_json(command)
 
 
 def _add_report_options(command: _Parser) -> None:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from harness.block import Commands
 from harness.errors import InputError, unknown
@@ -50,6 +50,8 @@ class Workbench:
     paper: Callable[[Path, bool, Callable[[str], None]], list[Path]]
     """Measure and write the paper's figures: folder, quick?, progress."""
     compare: Comparer = lambda *_, **__: ([], [])
+    #: writes the page of a cross-validation: result folder, `harness.agreement.as_data`
+    validation: Callable[[Path, Mapping[str, Any]], list[Path]] = lambda *_: []
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)
