@@ -245,8 +245,16 @@ def test_equal_solvers_are_ties(record, evidence):
     ]
     found = section(compose(evidence(records)), "ranking")
     assert "4 solvers in 1 tier; of 6 pairs 0 told apart" in found.points[0]
-    assert {row["inside the noise"].text for row in rows(found.tables[0]).values()} == {
-        "1–4"
+    cells = rows(found.tables[0]).values()
+    assert {row["inside the noise"].text for row in cells} == {"1–4"}
+    assert all("inside the noise" in row["reading"].text for row in cells)
+
+
+def test_ranks_that_nothing_changes_are_said_to_be_so(record, evidence):
+    found = section(compose(evidence(crowd(record, 2))), "ranking")
+    assert found.points[0].endswith("1 told apart; no convention turns an order.")
+    assert {row["reading"].text for row in rows(found.tables[0]).values()} == {
+        "the same under all"
     }
 
 
