@@ -128,7 +128,7 @@ def _errors(data: Data) -> tuple[Picture, ...]:
         f"Certified error of every answer at tol {tolerance(tol)}. It is never below "
         "what is known of the reference. Beyond √(20t) no verified answer may lie."
     )
-    return (Picture(name="errors", caption=caption, figure=figure),)
+    return (Picture(name="validation-errors", caption=caption, figure=figure),)
 
 
 def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:

@@ -17,7 +17,7 @@ from harness.journal import Journal, read_journal
 from harness.judge import blank, judged
 from harness.measure import Measurement
 from harness.names import canonical, parse
-from harness.qpfile import qp_digest
+from harness.qpfile import qp_digest, save_qp
 from harness.record import Verdict
 from harness.references import reference_point
 from harness.registry import SolverSpec, load_plugin
@@ -367,6 +367,13 @@ def test_distances_are_those_of_the_energy_norm():
     d = V[0] - V[1]
     assert found[0, 1] == pytest.approx(np.sqrt(d @ K @ d))
     assert found[2, 0] == found[1, 2] == np.inf
+
+
+@pytest.mark.parametrize("recipe", [True, False])
+def test_a_qp_has_the_digest_that_a_run_writes_down(recipe, truths, tmp_path):
+    for case, _ in truths.values():
+        written = save_qp(tmp_path / "qp.npz", case.qp, {}, recipe=recipe)
+        assert qp_digest(case.qp, recipe=recipe) == written
 
 
 def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():

@@ -183,9 +183,18 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + "params = 3", "problems[0]: params = 3; expected a table"),
         (MINIMAL + "params = { n = [] }", "problems[0]: params.n is empty; expected"),
         (MINIMAL + "params = { k = 1 }", "problems[0]: well: unknown key 'k'; "),
-        (MINIMAL + "params = { n = 2.0 }", "problems[0]: well: n=2.0; expected an integer, such as 4"),
-        (MINIMAL + "params = { n = '4' }", "problems[0]: well: n='4'; expected an integer, such as 4"),
-        (MINIMAL + "params = { n = true }", "problems[0]: well: n=True; expected an integer, such as 4"),
+        (
+            MINIMAL + "params = { n = 2.0 }",
+            "problems[0]: well: n=2.0; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = '4' }",
+            "problems[0]: well: n='4'; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = true }",
+            "problems[0]: well: n=True; expected an integer, such as 4",
+        ),
         (f"repeats = {5000 * '9'}\n" + MINIMAL, "an integer with too many digits"),
         (f"time_limit = {400 * '9'}\n" + MINIMAL, "time_limit = 999"),
         (
