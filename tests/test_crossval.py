@@ -182,6 +182,20 @@ def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_pat
     assert (wrong["solver"], wrong["case"]) == ("stale", f"{BEAM}/dual-bounds")
     assert wrong["error"] > 0.1
     assert any("the very point that it gave for" in r for r in wrong["reasons"])
+    assert f"its contact forces are those of {BEAM}/step=1" in wrong["reasons"]
+
+
+def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
+    """Two steps of one problem could share them; it is u that is wrong here."""
+    case, s = truths[2, "primal"]
+    answers = [("a", f"{BEAM}/primal", s), ("a", f"{BEAM}/step=1/primal",
+                                            truths[1, "primal"][1])]  # fmt: skip
+    answers.append(("off", f"{BEAM}/primal", disturbed(case, s, 1e-2)))
+
+    _, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    (wrong,) = verdict["disagreements"]
+    assert not any("contact forces are those" in r for r in wrong["reasons"])
 
 
 def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
