@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from harness import QP, Solution, cli
 from harness.environment import capture
 from harness.experiment import save_experiment
+from harness.kkt import VERIFIED_FACTOR
 from harness.plugin import Fields
 from harness.supervisor import ONE_THREAD
 from harness.workbench import Workbench
@@ -30,6 +31,7 @@ def main() -> None:
         solvers=SOLVERS,
         reference=reference_solution,
         report=_report,
+        compare=_compare,
         plot=_plot,
         vtu=_vtu,
         series=_series,
@@ -39,10 +41,20 @@ def main() -> None:
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
 
-def _report(folder: Path, formats: Sequence[str]) -> list[Path]:
+def _report(
+    folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
+) -> list[Path]:
     from reports import write_report  # late: workers must not carry matplotlib
 
-    return write_report(folder, formats)
+    return write_report(folder, formats, factor)
+
+
+def _compare(
+    before: Path, after: Path, formats: Sequence[str], *, factor: float
+) -> tuple[list[str], list[Path]]:
+    from reports import write_comparison
+
+    return write_comparison(before, after, formats, factor)
 
 
 def _validation(folder: Path, data: Mapping[str, Any]) -> list[Path]:

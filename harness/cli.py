@@ -17,6 +17,7 @@ from typing import NoReturn
 
 from harness import commands, examine, one, processes, validate
 from harness.errors import InputError
+from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
 
@@ -150,7 +151,7 @@ def _add_solve_options(command: _Parser) -> None:
 
 def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE")
-    command.add_argument("file", metavar="FILE.npz|mat", type=Path)
+    command.add_argument("file", metavar="FILE.npz|mat|parquet", type=Path)
     _add_plugin(command)
 
 
@@ -163,7 +164,21 @@ def _add_validate_options(command: _Parser) -> None:
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
+        "other",
+        metavar="DIR2",
+        type=Path,
+        nargs="?",
+        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+    )
+    command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
+    )
+    command.add_argument(
+        "--factor",
+        metavar="F",
+        type=float,
+        default=VERIFIED_FACTOR,
+        help="verified: every residual within F times the tolerance; default: 10",
     )
 
 

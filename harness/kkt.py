@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.qp import QP, Matrix, Vector
-from harness.record import Verdict
+from harness.record import Record, Verdict
 from harness.solution import Solution, Status
 
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance asked for
@@ -155,6 +155,24 @@ def verdict(
             return Verdict.INFEASIBLE_CLAIM
         case _:
             return Verdict(claimed.value)
+
+
+def rejudged(record: Record, factor: float) -> Verdict:
+    """Judge a stored measurement anew, at factor·tol instead of 10·tol.
+
+    Claim and residuals decide. Where they do not explain the stored status (a limit, a
+    crash, a sequence that had ended before), it was decided by something else, and
+    stands.
+    """
+    if record.claimed is None:
+        return record.status
+    stored = (getattr(record, name) for name in Residuals._fields)
+    residuals = Residuals(*(np.inf if r is None else r for r in stored))
+    tol = record.tol if record.accuracy is None else record.accuracy
+    claimed = Status(record.claimed)
+    if verdict(claimed, residuals, tol) is not record.status:
+        return record.status
+    return verdict(claimed, residuals, tol, factor)
 
 
 def _sup(v: Vector) -> float:
