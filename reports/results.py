@@ -132,6 +132,7 @@ def _counts(evidence: Evidence) -> list[Table]:
                     caption=f"Counts of {clean(solver, 40)}, first repeat.",
                     columns=("case", "tol", *heads),
                     rows=tuple(rows),
+                    solver=solver,
                 )
             )
     return tables

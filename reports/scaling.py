@@ -19,13 +19,18 @@ SIZES_NAMED = (
 SIZES = 3  #: fewer different sizes make no table
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Ladder:
     """Cases that differ in size only, and the verified answers on each."""
 
     title: str  #: family, the parameters held, form, tolerance
     solvers: tuple[str, ...]
     rungs: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+
+    @property
+    def answers(self) -> int:
+        """How many verified answers it rests on."""
+        return sum(len(row) for _, _, row in self.rungs)
 
     def curve(self, solver: str) -> list[tuple[int, Outcome]]:
         """Sizes n and verified answers of one solver, smallest first."""

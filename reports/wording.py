@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import unicodedata
 from collections.abc import Sequence
+from functools import lru_cache
 
 from harness import Verdict
 from reports.intervals import Interval, PowerLaw
@@ -34,6 +35,7 @@ VERDICTS = {
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 
 
+@lru_cache(1 << 16)
 def clean(text: str, limit: int = 96) -> str:
     """Make foreign text fit for a table: one line, no control characters, not longer.
 
