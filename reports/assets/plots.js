@@ -10,7 +10,8 @@ function chart(box, content, linked, name) {
   const drawing = svg("svg", { tabindex: 0, role: "group", "aria-label": `${name}${content.title ? `, ${content.title}` : ""}: ${axes.y.label} against ${axes.x.label || "the same"}` });
   const tip = make("div", { class: "tip", role: "status", hidden: "" });
   const bar = make("div", { class: "bar" });
-  const height = small ? Math.max(34, content.height * PER_INCH) : Math.min(Math.max(content.height * PER_INCH, 230), 460);
+  const below = content.x.label ? 42 : small ? 3 : 10; // px, for ticks and label
+  const height = small ? 14 * content.traces.length + 6 + below : Math.min(Math.max(content.height * PER_INCH, 230), 460);
   let points = [], at = -1, scale = null, band = null;
   const up = { x: (v) => (axes.x.log ? Math.log10(v) : v), y: (v) => (axes.y.log ? Math.log10(v) : v) };
   const down = { x: (v) => (axes.x.log ? 10 ** v : v), y: (v) => (axes.y.log ? 10 ** v : v) };
@@ -137,7 +138,7 @@ function chart(box, content, linked, name) {
       const x = place("x", 0), y = place("y", 1);
       if (!(x >= scale.left - 1 && x <= scale.right + 1 && y >= scale.top - 1 && y <= scale.bottom + 1)) continue;
       const end = t.align[0] === "right" || x > scale.right - 20;
-      const shift = t.align[1] === "top" ? 12 : t.align[1] === "bottom" || x > scale.right - 20 ? -4 : 0;
+      const shift = t.align[1] === "top" ? 15 : t.align[1] === "bottom" || x > scale.right - 20 ? -4 : 0;
       yield svg("text", { x: x + (end ? -3 : 3), y: y + shift, "text-anchor": end ? "end" : "start", ...(shift ? {} : { "dominant-baseline": "central" }), class: "remark" }, t.text);
     }
   }
@@ -145,7 +146,7 @@ function chart(box, content, linked, name) {
   function draw() {
     const W = drawing.clientWidth || box.clientWidth, H = height;
     if (!W) return;
-    scale = { left: 66, right: W - 14, top: content.title ? 24 : 8, bottom: H - (axes.x.label ? 42 : small ? 3 : 10) };
+    scale = { left: 66, right: W - 14, top: content.title ? 24 : 8, bottom: H - below };
     const line = (axis, from, to) => {
       const [a, b] = axes[axis].view.map(up[axis]);
       return (v) => from + ((up[axis](v) - a) / (b - a)) * (to - from);
