@@ -5,7 +5,7 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 BIN := .venv/bin
 
-.PHONY: help setup demo test bench docs size check clean
+.PHONY: help setup browser demo test bench docs size check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -16,10 +16,16 @@ setup: .venv/.ready  ## make .venv: system packages, Python packages
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 
+browser: setup .venv/.browser  ## chromium and its driver, for the tests of the report's page
+
+.venv/.browser: .venv/.ready
+	@tools/setup.sh $(PYTHON) browser
+	@touch $@
+
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
-test: setup check  ## check, then run the tests
+test: setup browser check  ## check, then run the tests
 	$(BIN)/pytest -q
 
 bench: setup  ## time our own kernels (pytest-benchmark)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
@@ -24,9 +25,9 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
     report.
     """
     found = {
-        "measurements": pd.DataFrame(map(_measurement, evidence.records)),
-        "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
-        "energies": pd.DataFrame(
+        "measurements": _frame(map(_measurement, evidence.records)),
+        "outcomes": _frame(map(_outcome, evidence.flat)),
+        "energies": _frame(
             {
                 "case": s.answers[0].physical,
                 "tol": s.answers[0].tol,
@@ -36,13 +37,26 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
             }
             for s in spreads(evidence.flat)
         ),
-        "scaling": pd.DataFrame(
+        "scaling": _frame(
             _law(ladder, solver)
             for ladder in ladders(evidence)
             for solver in ladder.solvers
         ),
     }
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
+
+
+def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
+    """Put rows together; a lone surrogate, which no file can hold, is spelt out."""
+    return pd.DataFrame(
+        {
+            name: value.encode(errors="backslashreplace").decode()
+            if isinstance(value, str)
+            else value
+            for name, value in row.items()
+        }
+        for row in rows
+    )
 
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:

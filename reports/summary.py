@@ -224,7 +224,7 @@ def dateline(evidence: Evidence) -> str:
     """Say when and on which machine, in one line."""
     days = sorted({r.started[:10] for r in evidence.records if r.started})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
-    return f"{when} · {machine(evidence.environment)}"
+    return f"{clean(when)} · {machine(evidence.environment)}"
 
 
 def machine(environment: Mapping[str, Any]) -> str:

@@ -16,7 +16,10 @@ from reports.data import read_evidence
 from reports.folder import compose
 from reports.page import html
 
-sync_api = pytest.importorskip("playwright.sync_api")
+try:
+    from playwright import sync_api
+except ModuleNotFoundError:
+    sync_api = None
 sys.path.append(str(Path(__file__).parent))
 from crowd import crowd, write  # noqa: E402
 
@@ -36,8 +39,8 @@ HOSTILE = (
 
 @pytest.fixture(scope="session")
 def browser():
-    if CHROMIUM is None:
-        pytest.fail("no chromium; make test installs it, or: apt-get install chromium")
+    if sync_api is None or CHROMIUM is None:
+        pytest.fail("no playwright or no chromium; make browser installs both")
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=root)
@@ -283,7 +286,9 @@ def test_keys_toggle_solvers_sort_tables_and_walk_through_numbers(visit, folder)
     page.keyboard.press("ArrowDown")
     below = times.locator("tbody tr").nth(1).locator("a").nth(1)
     assert below.evaluate("(a) => a === document.activeElement")
-    assert links.evaluate_all("(all) => all.filter((a) => a.tabIndex === 0).length") == 1
+    assert (
+        links.evaluate_all("(all) => all.filter((a) => a.tabIndex === 0).length") == 1
+    )
     page.keyboard.press("Enter")
     opened(page)
     page.keyboard.press("Escape")
@@ -449,7 +454,7 @@ def test_the_policy_of_the_page_stops_what_an_injection_would_do(browser, folder
     page.goto((folder / "report" / "index.html").as_uri())
     page.evaluate(
         "document.body.insertAdjacentHTML('beforeend', "
-        "'<img src=\"http://evil.example/x\" onerror=\"window.broken=1\">')"
+        '\'<img src="http://evil.example/x" onerror="window.broken=1">\')'
     )
     page.wait_for_timeout(200)
     assert page.evaluate("window.broken") is None
