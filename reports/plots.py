@@ -24,7 +24,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.text import Annotation, Text
-from matplotlib.ticker import FixedFormatter
+from matplotlib.ticker import FixedLocator
 
 from reports.figures import INK
 from reports.mathtext import plain
@@ -81,12 +81,13 @@ def _panel(axes: Axes, labels: Mapping[str, str], keys: Sequence[Data]) -> Data:
 
 
 def _axis(axis: Axis) -> Data:
-    """Describe an axis; ticks only if they have names instead of numbers, or none."""
+    """Describe an axis; its ticks only if they were set by hand, or if there is none."""
     low, high = sorted(axis.get_view_interval())
-    at, formatter = axis.get_majorticklocs(), axis.get_major_formatter()
+    at = axis.get_majorticklocs()
     ticks: list[Any] | None = None
-    if isinstance(formatter, FixedFormatter):
-        ticks = [[float(v), plain(n)] for v, n in zip(at, formatter.seq, strict=False)]
+    if isinstance(axis.get_major_locator(), FixedLocator):
+        names = map(plain, axis.get_major_formatter().format_ticks(list(at)))
+        ticks = [[float(v), name] for v, name in zip(at, names, strict=True)]
     elif not len(at):
         ticks = []
     return {

@@ -21,7 +21,7 @@ try:
 except ModuleNotFoundError:
     sync_api = None
 sys.path.append(str(Path(__file__).parent))
-from crowd import crowd, write  # noqa: E402
+from crowd import crowd, write
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOLVERS, CASES, REPEATS = 4, 120, 3
