@@ -5,7 +5,7 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 BIN := .venv/bin
 
-.PHONY: help setup browser demo test bench docs size check clean
+.PHONY: help setup browser demo test bench docs size crowd check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -37,6 +37,9 @@ docs: setup  ## write docs/solvers.md anew from the adapters
 
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py
+
+crowd: setup  ## time, memory and size of reports up to 50 000 measurements
+	$(BIN)/python benchmarks/crowd.py
 
 check: setup  ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

@@ -81,7 +81,7 @@ def _panel(axes: Axes, labels: Mapping[str, str], keys: Sequence[Data]) -> Data:
 
 
 def _axis(axis: Axis) -> Data:
-    """Describe an axis; its ticks only if they were set by hand, or if there is none."""
+    """Describe an axis; its ticks only if set by hand, or if there is none."""
     low, high = sorted(axis.get_view_interval())
     at = axis.get_majorticklocs()
     ticks: list[Any] | None = None
