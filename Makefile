@@ -5,7 +5,11 @@ export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 BIN := .venv/bin
 
-.PHONY: help setup browser demo test bench docs size crowd check clean
+# that stand for the wildcards of the registry
+BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
+    cvxpy:CLARABEL cvxpy:HIGHS
+
+.PHONY: help setup browser demo test bench docs weaknesses size crowd check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -34,6 +38,9 @@ bench: setup  ## time our own kernels (pytest-benchmark)
 
 docs: setup  ## write docs/solvers.md anew from the adapters
 	@$(BIN)/mortarbench list solvers --markdown > docs/solvers.md
+
+weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
+	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > docs/weaknesses.md
 
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py

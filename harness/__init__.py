@@ -1,9 +1,11 @@
 """The contract between problems, solvers and reports, and the clock."""
 
 from harness.about import About
+from harness.certificate import Certificate, UncertifiableError, certify
 from harness.errors import InputError
 from harness.kkt import Residuals, kkt_residuals, verdict
 from harness.limits import memory_limit_mib, too_large
+from harness.mechanics import Mechanics
 from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
@@ -13,11 +15,13 @@ __all__ = [
     "QP",
     "About",
     "Case",
+    "Certificate",
     "Chained",
     "Family",
     "Fields",
     "InputError",
     "Matrix",
+    "Mechanics",
     "Record",
     "Reference",
     "Residuals",
@@ -25,9 +29,11 @@ __all__ = [
     "Solver",
     "Status",
     "Structure",
+    "UncertifiableError",
     "Value",
     "Vector",
     "Verdict",
+    "certify",
     "kkt_residuals",
     "memory_limit_mib",
     "no_rows",

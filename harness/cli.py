@@ -112,7 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_report_options(add("report", "report on a result folder", commands.report))
     _add_replay_options(add("replay", "one measurement again", commands.replay))
     _add_test_options(
-        add("test-solver", "the conformance suite, on one solver", examine.test_solver)
+        add("test-solver", "the conformance suite, on solvers", examine.test_solver)
     )
     _add_paper_options(add("paper", "every figure of the paper", commands.paper))
     _add_json(add("doctor", "is this machine fit to measure", commands.doctor))
@@ -168,9 +168,15 @@ def _add_replay_options(command: _Parser) -> None:
 
 
 def _add_test_options(command: _Parser) -> None:
-    command.add_argument("solver", metavar="NAME")
+    command.add_argument("solver", metavar="NAME", nargs="+", help="or a pattern")
     _add_plugin(command)
-    _add_json(command)
+    shown = command.add_mutually_exclusive_group()
+    shown.add_argument(
+        "--markdown",
+        action="store_true",
+        help="only what equivalent formulations change, as in docs/weaknesses.md",
+    )
+    _add_json(shown)
 
 
 def _add_paper_options(command: _Parser) -> None:
@@ -222,5 +228,5 @@ def _add_plugin(command: _Parser) -> None:
     )
 
 
-def _add_json(command: _Parser) -> None:
+def _add_json(command: argparse._ActionsContainer) -> None:
     command.add_argument("--json", action="store_true", help="for machines")

@@ -1,7 +1,8 @@
 """What every solver must do: the checks of ``mortarbench test-solver``.
 
 Each check is named after what it shows. It passes, fails with what was wrong, or, where
-the solver declines its QP, is declined with the solver's reason.
+the solver declines its QP, is declined with the solver's reason. That an equivalent
+formulation changes the answer is told as a weakness; most solvers have one.
 """
 
 from __future__ import annotations
@@ -17,9 +18,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.linalg import aslinearoperator
 
+from harness.equivalence import DeclinedError, WeakError, changes_of, same_answer
 from harness.kkt import VERIFIED_FACTOR, kkt_residuals
 from harness.measure import measure
 from harness.planted import (
+    FORMS,
     SHAPES,
     infeasible,
     membrane,
@@ -32,6 +35,7 @@ from harness.qp import QP, Vector
 from harness.solution import Solution, Status
 
 FINDS = "finds the planted solution"  #: how the checks begin that need an answer
+KEEPS = "keeps its answer"  #: how those begin that compare equivalent formulations
 ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
 
 
@@ -40,36 +44,36 @@ class Grade(StrEnum):
 
     PASS = "pass"
     DECLINE = "decline"  #: the solver says that it cannot
+    WEAK = "weak"  #: a weakness, reported; the solver conforms nevertheless
     FAIL = "fail"
 
 
 class Result(NamedTuple):
-    """How a check ended, and why where it did not pass."""
+    """How a check ended; why where it did not pass, else a remark if there is one."""
 
     grade: Grade
     message: str = ""
+    work: float | None = None  #: iterations, relative to those before a change
 
 
 class BrokenError(Exception):
     """What a solver did wrong."""
 
 
-class DeclinedError(Exception):
-    """Why a solver cannot take a QP."""
-
-
-Check = Callable[[Solver], None]  #: raises one of the two
+#: raises that, DeclinedError or WeakError; where there is a remark, returns it
+Check = Callable[[Solver], Result | None]
 
 
 def run_check(name: str, solver: Solver) -> Result:
     """Run one of `CHECKS`."""
     try:
-        CHECKS[name](solver)
+        return CHECKS[name](solver) or Result(Grade.PASS)
     except BrokenError as e:
         return Result(Grade.FAIL, str(e))
     except DeclinedError as e:
         return Result(Grade.DECLINE, str(e))
-    return Result(Grade.PASS)
+    except WeakError as e:
+        return Result(Grade.WEAK, str(e))
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
@@ -226,6 +230,14 @@ def _sequence() -> list[QP]:
     return [qp, moved, softer, planted("bounds", n=12)[0]]
 
 
+def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
+    before, after = same_answer(form, change, solver)
+    if before is None or after is None:
+        return Result(Grade.PASS)
+    message = f"{after} iterations, {before} as it is"
+    return Result(Grade.PASS, message, after / max(before, 1))
+
+
 def _near(what: str, got: Vector | float, expected: Vector | float, by: float) -> None:
     error = float(np.max(np.abs(np.subtract(got, expected)), initial=0.0))
     if not error <= by:
@@ -261,6 +273,9 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     yield "takes or declines an operator", _an_operator_is_taken_or_declined
     yield "computes in one thread", _runs_in_one_thread
     yield "solves a sequence", _a_sequence_is_solved
+    for form in FORMS:
+        for change in changes_of(form):
+            yield f"{KEEPS}: {form}, {change}", partial(_keeps_its_answer, form, change)
 
 
 CHECKS: Mapping[str, Check] = dict(_all_checks())

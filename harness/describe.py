@@ -25,6 +25,9 @@ it then claims is recorded beside our own verdict and never believed.
 `mortarbench test-solver NAME` runs the conformance suite on any of them, and on one of
 your own with `--plugin FILE.py`. A solver whose library is missing declines, and names
 the command that installs it; `make setup` installs all of them (the extra `fleet`).
+
+Whether units, order, scaled or repeated rows, an offset or a mirror change what each
+answers is measured in [weaknesses.md](weaknesses.md).
 """
 
 

@@ -5,8 +5,8 @@ It answers the requests of `harness.serving` with these of its own:
 * ``{"build": NAME, "qp": PATH, "keep": N}``: it builds the case, writes its QP to PATH
   and says ``{"event": "done", "meta": {…}}``, with the digest of its numbers
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
-  point means: ``{"event": "done", "quantities": {…}, "notes": […]}``, and the deformed
-  state in ``fields`` where the case has one
+  point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
+  with bounds of its error, and the deformed state in ``fields`` where there is one
 
 or to both ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME is
 ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to stay
@@ -23,10 +23,11 @@ from time import perf_counter
 from typing import Any
 
 from harness.build import build, unbuilt
-from harness.judge import note_of, plain, quantities_of
+from harness.judge import certified, note_of, plain, quantities_of
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference
 from harness.qpfile import save_qp
+from harness.record import finite
 from harness.serving import answer_requests
 from harness.solution import Status
 from harness.store import field_arrays, read_point, write_arrays
@@ -95,10 +96,16 @@ def _described(case: Case, request: dict[str, Any]) -> dict[str, Any]:
     start = perf_counter()
     quantities, note = quantities_of(case, s)
     seconds = perf_counter() - start
-    notes = [note] if note else []
+    bounds, objection = certified(case, s)
+    notes = [text for text in (note, objection) if text]
     if request["fields"] is not None and case.fields is not None:
         try:
             write_arrays(Path(request["fields"]), field_arrays(case.fields(s)))
         except Exception as e:  # the family's code; its fault must not lose the record
             notes.append(note_of("fields", e))
-    return {"quantities": quantities, "notes": notes, "seconds": seconds}
+    return {
+        "quantities": quantities,
+        "bounds": finite(bounds),
+        "notes": notes,
+        "seconds": seconds,
+    }

@@ -6,10 +6,12 @@ import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from hashlib import sha256
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from harness.certificate import UncertifiableError, certify
 from harness.kkt import kkt_residuals, verdict
 from harness.measure import Measurement
 from harness.names import CaseName
@@ -104,6 +106,31 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
         return plain(case.quantities(s)), ""
     except Exception as e:  # the family's code; its fault must not lose the record
         return {}, note_of("quantities", e)
+
+
+def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
+    """Bound the error of a point: fields of its record; with a note, if impossible.
+
+    energy_bound covers the answer itself, û and u_λ of `harness.certificate`.
+    certificate: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)),
+    `answer` (the bound of the answer alone) and `moved` = ‖u − û‖, all relative to ‖û‖,
+    and `seminorm`, 1 where bodies can move rigidly, which nothing bounds.
+    """
+    if case.mechanics is None or not has_point(s):
+        return {}, ""
+    start = perf_counter()
+    try:
+        found = certify(case.mechanics, case.mechanics.back(s))
+    except UncertifiableError as e:
+        seconds = perf_counter() - start
+        return {"certify_seconds": seconds}, f"no energy_bound: {e}"
+    except Exception as e:  # the family's code; its fault must not lose the record
+        return {}, note_of("energy_bound", e)
+    return {
+        "energy_bound": found.bound,
+        "certificate": found.parts,
+        "certify_seconds": perf_counter() - start,
+    }, ""
 
 
 def has_point(s: Solution) -> bool:

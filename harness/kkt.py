@@ -116,9 +116,9 @@ def _scales(
         _sup(np.abs(x[lower]) + np.abs(qp.lb[lower])),
         _sup(np.abs(x[upper]) + np.abs(qp.ub[upper])),
         *(
-            _ratio(abs(M) @ np.abs(x) + np.abs(rhs), _row_sums(M))
+            _ratio((abs(M) @ np.abs(x) + np.abs(rhs))[told], sums[told])
             for M, rhs in ((qp.A, qp.b), (qp.G, qp.h))
-            if rhs.size
+            if (told := (sums := _row_sums(M)) > 0).any()  # 0ᵀx ≤ h tells nothing of x
         ),
     )
     return _Scales(X, S, max(_sup(energies), floor_E, key=_nan_first))

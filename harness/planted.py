@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-from harness.qp import QP, Matrix, Vector, no_rows
+from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.solution import Solution, Status
 
 #: m equality and p inequality rows, which bounds, fixed variables, rank of P, …
@@ -107,6 +107,64 @@ def membrane(k: int) -> QP:
         lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
         ub=np.full(n, np.inf),
     )  # fmt: skip
+
+
+FORMS = ("primal", "dual", "dual-bounds")  #: of `strings`
+
+
+def strings(form: str) -> QP:
+    """Pull a string of 24 cells onto a softer one of 16: frictionless contact in small.
+
+    The unknown is the deflection u (24 + 1 and 16 + 1 nodes), K the stiffness:
+    min ½uᵀKu − fᵀu, ends held by A u = 0, each inner node of the upper string kept
+    above the lower by a row of G u ≤ h (its own −1, the weights of two nodes there).
+
+    form : "primal", that QP. "dual", with B = [A; G], c = [0; h] and an orthonormal
+        basis R of ker K:  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  λ_I ≥ 0.
+        "dual-bounds", the same of the held strings: λ ≥ 0 and no rows
+    """
+    K, f, R = _two_strings()
+    upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)
+    at = upper / 24
+    weights = [np.interp(at, lower, hat) for hat in np.eye(17)]
+    G = np.hstack([-np.eye(25)[1:-1], np.transpose(weights)])
+    h = 0.01 + 0.1 * (at - 0.4) ** 2
+    held = np.array([0, 24, 25, 41])
+    A, no_box = np.eye(42)[held], np.full(42, np.inf)
+    if form == "primal":
+        return QP(
+            P=csr_array(K), q=-f, A=csr_array(A), b=np.zeros(4), G=csr_array(G), h=h,
+            lb=-no_box, ub=no_box,
+        )  # fmt: skip
+    free = np.setdiff1d(np.arange(42), held)
+    if form == "dual":
+        B, c, fixed = np.vstack([A, G]), np.append(np.zeros(4), h), held[:0]
+        inverse = np.linalg.pinv(K, hermitian=True)
+    else:
+        B, c, fixed, inverse = G, h, held, np.zeros((42, 42))
+        inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
+        R = R[:, :0]
+    F, m = B @ inverse @ B.T, c.size
+    return QP(
+        P=(F + F.T) / 2, q=c - B @ inverse @ f, A=R.T @ B.T, b=R.T @ f,
+        G=no_rows(m), h=np.zeros(0),
+        lb=np.where(np.arange(m) < m - h.size, -np.inf, 0), ub=np.full(m, np.inf),
+        structure=Structure(K=csr_array(K), B=csr_array(B), fixed=fixed),
+    )  # fmt: skip
+
+
+def _two_strings() -> tuple[Vector, Vector, Vector]:
+    """Assemble stiffness (42, 42), load (42,) on the upper and kernel (42, 2)."""
+    K, R = np.zeros((42, 42)), np.zeros((42, 2))
+    for body, (tension, cells, nodes) in enumerate(
+        [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
+    ):
+        ends = np.diff(np.eye(cells + 1), axis=0)
+        K[nodes, nodes] = tension * cells * ends.T @ ends
+        R[nodes, body] = 1 / np.sqrt(cells + 1)
+    f = np.zeros(42)
+    f[1:24] = -1 / 24
+    return K, f, R
 
 
 def infeasible() -> QP:

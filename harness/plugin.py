@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from harness.mechanics import Mechanics
 from harness.qp import QP, Vector
 from harness.solution import Solution
 
@@ -72,6 +73,7 @@ class Case:
     dualise_seconds: float | None = (
         None  #: what a dual form took to come by, factor too
     )
+    mechanics: Mechanics | None = None  #: to certify errors with, where there are any
 
 
 class Family(Protocol):

@@ -64,17 +64,9 @@ def save_qp(
     if recipe and isinstance(P, Recipe):
         maker = {"maker": P.maker}
         qp = replace(qp, P=csc_array(P.shape))
-    matrices, dense = explicit_matrices(qp)
-    arrays = {name: getattr(qp, name) for name in _VECTORS}
-    if recipe and qp.structure is not None:
-        matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
-        arrays["fixed"] = qp.structure.fixed
+    arrays, dense = _arrays(qp, structure=recipe)
     if maker:
         arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
-    for name, M in matrices.items():
-        M = csc_array(M)
-        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
-        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
     digest = digest_of(arrays)
     arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
     try:
@@ -82,6 +74,25 @@ def save_qp(
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
     return digest
+
+
+def qp_digest(qp: QP) -> str:
+    """Name the numbers of a QP by 16 hex digits; an operator P is multiplied out."""
+    return digest_of(_arrays(qp, structure=False)[0])
+
+
+def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Take a QP apart; also tell which matrices are dense."""
+    matrices, dense = explicit_matrices(qp)
+    arrays = {name: getattr(qp, name) for name in _VECTORS}
+    if structure and qp.structure is not None:
+        matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
+        arrays["fixed"] = qp.structure.fixed
+    for name, M in matrices.items():
+        M = csc_array(M)
+        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
+    return arrays, dense
 
 
 def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:

@@ -73,6 +73,7 @@ class Record:
         None  #: part of build: factor, dual; dual forms only
     )
     recover_seconds: float | None = None  #: from the point to quantities
+    certify_seconds: float | None = None  #: from the point to energy_bound
     canary_seconds: float | None = None  #: a fixed kernel, just before: drift
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to
@@ -84,6 +85,8 @@ class Record:
     complementarity: float | None = None
     gap: float | None = None
     energy_bound: float | None = None  #: certified relative error, energy norm
+    #: what it is made of, relative to ‖û‖ too; see `harness.judge.certified`
+    certificate: Mapping[str, float] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
     qp: str | None = None  #: digest of the emitted QP; None in old journals

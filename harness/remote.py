@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from harness.judge import judged, noted, quantities_of
+from harness.judge import certified, judged, noted, quantities_of
 from harness.measure import Measurement
 from harness.plugin import Case
 from harness.qp import QP
@@ -115,4 +115,6 @@ def measured_once(
     if solution is None or record.status is Verdict.DECLINED:
         return record, solution
     quantities, note = quantities_of(case, solution)
-    return noted(record, note).but(quantities=quantities), solution
+    bounds, objection = certified(case, solution)
+    record = noted(record, note, objection).but(quantities=quantities, **bounds)
+    return record, solution

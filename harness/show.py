@@ -114,6 +114,7 @@ def outcome(r: Record) -> str:
             (f"{name} residual", _text(_known(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
+        ("energy error", _bound(r)),
         ("objective", _text(_known(r.objective))),
         *(
             (name.replace("_", " "), _text(value, units.get(name, "")))
@@ -121,6 +122,14 @@ def outcome(r: Record) -> str:
         ),
     ]
     return aligned([name, value] for name, value in rows if value)
+
+
+def _bound(r: Record) -> str:
+    """Show the certified error: of the answer, of nothing that bodies can do freely."""
+    if r.energy_bound is None:
+        return ""
+    beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
+    return f"at most {r.energy_bound:.2g} (certified, relative{beside})"
 
 
 def convergence(history: History) -> str:

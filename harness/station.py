@@ -116,7 +116,9 @@ class Station:
             answer = self._ask_generator(request, block)
             notes = answer["notes"]
             record = record.but(
-                quantities=answer["quantities"], recover_seconds=answer["seconds"]
+                quantities=answer["quantities"],
+                recover_seconds=answer["seconds"],
+                **answer["bounds"],
             )
         except _UnbuiltError as e:
             notes = [f"no quantities: {e.reason}"]

@@ -92,6 +92,7 @@ class BeamRing:
             bodies, primal, form,
             floating=lambda: _floating(*geometry),
             clamped=lambda: _clamped(*geometry),
+            supported=lambda: _clamped(*geometry),
             quantities=lambda s: quantities(bodies, primal, s)
             | {"tip": (s.x[tip] * LENGTH).tolist()},
         )  # fmt: skip

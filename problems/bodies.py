@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
 from harness import InputError, Vector
@@ -23,6 +23,7 @@ from problems.inverse import (
     GeneralisedInverse,
     floating_inverse,
     regular_inverse,
+    supported_inverse,
 )
 from problems.mesh import Mesh, Nodes, dofs_of
 
@@ -77,6 +78,20 @@ class Bodies:
         return np.unique(
             dofs_of(np.concatenate([np.concatenate(p) for p in self.pairs]))
         )
+
+    @property
+    def rigid(self) -> NDArray[np.float64]:
+        """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
+        owner, points = self.body_of_node, self.mesh.points
+        modes = [rigid_modes(points[owner == b]) for b in range(len(self.names))]
+        return np.asarray(block_diag([csr_array(R) for R in modes]).toarray())
+
+    @property
+    def mesh_size(self) -> float:
+        """Mean distance of neighbours on the slave sides, in lengths `length`."""
+        sides = [self.mesh.points[pair.slave] for pair in self.pairs]
+        steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
+        return float(np.concatenate(steps).mean() / self.length)
 
     @property
     def D(self) -> NDArray[np.float64]:
@@ -148,6 +163,12 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
             "the supports leave a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"
         ) from None
+
+
+def supported(bodies: Bodies) -> GeneralisedInverse:
+    """Factorise K without the prescribed components, and what else a body needs."""
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
+    return supported_inverse(bodies.K, free, bodies.rigid, bodies.interface)
 
 
 def _elasticity_matrices(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Case, Solution, Vector
+from harness import QP, Case, Mechanics, Solution, Vector
 from problems.bodies import Bodies
 from problems.dual import Transformed, dual_bounds, dualise
 from problems.inverse import GeneralisedInverse
@@ -27,6 +27,7 @@ def contact_case(
     *,
     floating: Factorise,
     clamped: Factorise,
+    supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
 ) -> Case:
     """Emit the primal QP of a contact problem in one of FORMS.
@@ -35,6 +36,8 @@ def contact_case(
     ----------
     floating, clamped : factorise K with its rigid modes, and without the prescribed
         components; called where the form needs it
+    supported : as clamped, but of bodies, too, that contact alone holds; called when an
+        answer is to be certified
     quantities : physical results from a solution of the primal QP
 
     """
@@ -63,7 +66,11 @@ def contact_case(
         constant=new.constant * energy,
         matrices=matrices,
         dualise_seconds=seconds,
-    )
+        mechanics=Mechanics(
+            primal=primal, back=new.recover, factorise=supported,
+            mesh_size=bodies.mesh_size, rigid=bodies.rigid,
+        ),
+    )  # fmt: skip
 
 
 def _paper(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from harness import QP, Case, InputError, Reference, Value
-from problems.bodies import Bodies, clamped, floating
+from problems.bodies import Bodies, clamped, floating, supported
 from problems.content import check_digest, digest
 from problems.description import CHOICES, SETTINGS, described_bodies, read_description
 from problems.emit import FORMS, contact_case
@@ -86,6 +86,7 @@ class GmshBodies:
         return contact_case(
             bodies, primal, form,
             floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
+            supported=lambda: _supported(*source),
             quantities=lambda s: quantities(bodies, primal, s),
         )  # fmt: skip
 
@@ -116,6 +117,11 @@ def _floating(*source: Any) -> GeneralisedInverse:
 @lru_cache(maxsize=4)
 def _clamped(*source: Any) -> GeneralisedInverse:
     return clamped(model(*source))
+
+
+@lru_cache(maxsize=4)
+def _supported(*source: Any) -> GeneralisedInverse:
+    return supported(model(*source))
 
 
 @lru_cache(maxsize=4)

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Reference, Solution, Value, Vector
-from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.bodies import Bodies, ContactPair, assemble, clamped, floating, supported
 from problems.contact import ContactRows
 from problems.elasticity import Material, Plane
 from problems.emit import contact_case
@@ -251,6 +251,7 @@ def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> C
     return contact_case(
         bodies, primal, form,
         floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
     )  # fmt: skip

@@ -24,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import lapack, null_space, qr
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze
 
@@ -134,6 +134,31 @@ def floating_inverse(
     K_rho = csc_array(K + rho * (R_star @ R_star.T))
     whole = np.asarray(block_diag([csr_array(R) for R in kernels]).toarray())
     return _inverse(K_rho, np.arange(K.shape[0]), whole, interface)
+
+
+def supported_inverse(
+    K: Matrix, free: Nodes, rigid: NDArray[np.float64], interface: Nodes | None = None
+) -> GeneralisedInverse:
+    """Factorise K_ff where the supports may leave rigid motions of some body.
+
+    As many further components are held as there are such motions, those that a pivoted
+    QR factorisation of the motions finds to fix them best: on loads that balance these,
+    they feel no force.
+
+    Parameters
+    ----------
+    rigid : (n, r) rigid motions of all bodies, supports or not
+    interface : components to condense onto
+
+    """
+    held = np.setdiff1d(np.arange(K.shape[0]), free)
+    kernel = rigid @ null_space(rigid[held]) if held.size else rigid
+    if not kernel.shape[1]:
+        return _inverse(csc_array(K), free, kernel, interface)
+    kernel[held] = 0
+    kernel = np.linalg.qr(kernel)[0]
+    pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
+    return _inverse(csc_array(K), np.setdiff1d(free, pins), kernel, interface)
 
 
 def _inverse(

@@ -27,9 +27,9 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
-from harness import QP, Case, Reference, Solution, Value, Vector, no_rows
+from harness import QP, Case, Mechanics, Reference, Solution, Value, Vector, no_rows
 from problems.dual import Transformed, dual_bounds
-from problems.inverse import regular_inverse
+from problems.inverse import GeneralisedInverse, regular_inverse
 from problems.ranges import at_least, one_of
 from problems.results import ACTIVE
 
@@ -64,7 +64,7 @@ class Obstacle:
         if form == "primal":
             new = with_bounds(rows)
         else:
-            new = dual_bounds(rows, regular_inverse(rows.P, rows.G.indices))
+            new = dual_bounds(rows, problem.factorise())
         seconds = None if form == "primal" else perf_counter() - start
         return Case(
             qp=new.qp,
@@ -73,7 +73,11 @@ class Obstacle:
             scale=new.sign,
             constant=new.constant + problem.energy(np.zeros(rows.q.size)),
             dualise_seconds=seconds,
-        )
+            mechanics=Mechanics(
+                primal=rows, back=new.recover, factorise=problem.factorise,
+                mesh_size=2 * HALF / p["n"], rigid=np.zeros((rows.q.size, 0)),
+            ),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +93,10 @@ class Problem:
     cells: int
     lift: Vector  #: w (N,), m
     qp: QP
+
+    def factorise(self) -> GeneralisedInverse:
+        """Factorise K without the prescribed components."""
+        return regular_inverse(self.qp.P, self.qp.G.indices)
 
     def energy(self, v: Vector) -> float:
         """Return ∫ ½|∇u|² + q u, per tension."""

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from harness import Case, Reference, Solution, Value
-from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.bodies import Bodies, ContactPair, assemble, clamped, floating, supported
 from problems.elasticity import Material
 from problems.emit import contact_case
 from problems.linearise import METHODS, linearisation
@@ -72,6 +72,7 @@ class ContactPatch:
         return contact_case(
             bodies, primal, form,
             floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+            supported=lambda: supported(bodies),
             quantities=lambda s: quantities(bodies, primal, s)
             | {"stress_error": stress_error(bodies, s)},
         )  # fmt: skip

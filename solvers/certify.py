@@ -158,8 +158,9 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
     """Tighten the tolerance until the original problem's KKT residuals agree."""
     options, problem, at = task.options, task.problem, task.start
     constants = Constants(
-        options.M, options.beta, options.eta, options.rho_growth, options.max_steps
-    )
+        options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
+        options.energy,
+    )  # fmt: skip
     tighter, best, waited = 1.0, np.inf, 0
     while True:
         at = smalbe(problem, constants, task.means, tighter * tol, at)

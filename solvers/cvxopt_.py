@@ -48,6 +48,9 @@ class CVXOPT:
         limits=(
             "Equality rows that depend on each other end in an error or as 'unknown' "
             "(conformance, shape 'redundant'): declined.",
+            "Bodies that only equality rows hold (an exactly singular P) end as "
+            "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
+            "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
         ),
     )
 

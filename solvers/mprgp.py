@@ -80,7 +80,7 @@ class Minimum(NamedTuple):
 
     x: Vector
     g: Vector  #: Hx − b
-    projected_norm: float  #: ‖g^P‖₂
+    face: Face
     stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
     trace: str  #: one letter per step: c, e, f, p
 
@@ -121,7 +121,7 @@ def mprgp(
     start: tuple[Vector, Vector],
     *,
     B: Model,
-    stop: Callable[[Vector, float], bool],
+    stop: Callable[[Point, Face], bool],
     rules: Rules,
     precondition: Precondition | None = None,
     watch: Watch | None = None,
@@ -136,7 +136,7 @@ def mprgp(
     bounds : l and u (n,), possibly infinite
     start : a feasible x (n,) and its gradient Hx − b
     B : a model of H; ᾱ = 1/τ is the length of plain gradient projection steps
-    stop : says from x and ‖g^P‖₂ whether to stop; asked before every step
+    stop : says from the point and its face whether to stop; asked before every step
     precondition : makes the preconditioner of the CG steps in a face
     watch : told the letter of each step, the new point and its face
     run : takes the CG steps, faster than one by one; `watch` is not told of them
@@ -149,7 +149,7 @@ def mprgp(
     z_of = precondition(face.free)
     p = z_of(face.phi)
     Hp: Vector | None
-    while not (done := stop(at.x, face.projected_norm)) and len(trace) < max_steps:
+    while not (done := stop(at, face)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
             step = _proportion(task, at, face, B)
         else:
@@ -173,7 +173,7 @@ def mprgp(
         trace += letter
         if watch is not None:
             watch(letter, at, face)
-    return Minimum(at.x, at.g, face.projected_norm, done, trace)
+    return Minimum(at.x, at.g, face, done, trace)
 
 
 def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+import numpy as np
+
 from solvers.conversion import positive
 from solvers.mprgp import EXPANSIONS, PROPORTIONINGS, Expansion, Proportioning
 from solvers.preconditioner import PRECONDITIONERS, Preconditioner
@@ -32,6 +34,7 @@ class Options:
     lanczos_steps: int = 12  #: products spent on it
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
+    energy: float = 50.0  #: estimated energy error/tol to reach, too; 0: whatever
     history: bool = False  #: keep a row per step
     max_steps: int = 20_000  #: of MPRGP and outer iterations, in total
 
@@ -42,6 +45,10 @@ class Options:
         )  # fmt: skip
         if not 0 < self.beta < 1:
             raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
+        if not 0 <= self.energy < np.inf:
+            raise ValueError(
+                f"energy = {self.energy}; expected 0, or a positive number"
+            )
         if not self.rho_growth >= 1:
             raise ValueError(f"rho_growth = {self.rho_growth}; expected at least 1")
         if not self.alpha <= 2:

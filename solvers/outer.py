@@ -11,6 +11,8 @@ Algorithm 6.1; `solvers.projected` makes that problem). For k = 0, 1, …:
 
 until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
 is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
+What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
+‖b‖ may be the gap of supports, beside which contact is small.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
 MOST_RHO; and CᵀCν is tried as proof that there is no feasible point.
@@ -28,8 +30,10 @@ import numpy as np
 from harness import Status, Vector
 from solvers.model import Model
 from solvers.mprgp import (
+    Face,
     FaceRun,
     Minimum,
+    Point,
     Precondition,
     Rules,
     Watch,
@@ -51,6 +55,7 @@ class Constants:
     eta: float
     rho_growth: float
     max_steps: int
+    energy: float = 0.0  #: estimated energy error/tol to reach; 0: none
 
 
 class Until(NamedTuple):
@@ -125,13 +130,22 @@ def smalbe(
     lagrangian = -np.inf
     until = Until(tol * b_size, constants.eta * b_size, at.M)
 
-    def small(nu: Vector, projected: float) -> bool:
-        return projected <= until.small and problem.rows.met(nu, tol, b_size)
+    def accurate(here: Point, face: Face) -> bool:
+        error = problem.energy_error(here.x, face.phi + face.beta)
+        return error <= constants.energy * tol
 
-    def precise(nu: Vector, projected: float) -> bool:
-        if len(C) and projected < until.coarse and projected < at.M * _norm(C @ nu):
+    def small(here: Point, face: Face) -> bool:
+        return (
+            face.projected_norm <= until.small
+            and problem.rows.met(here.x, tol, b_size)
+            and (not constants.energy or accurate(here, face))
+        )
+
+    def precise(here: Point, face: Face) -> bool:
+        size = face.projected_norm
+        if len(C) and size < until.coarse and size < at.M * _norm(C @ here.x):
             return True
-        return small(nu, projected)
+        return small(here, face)
 
     while True:
         rhs = b - C.T @ at.mu
@@ -146,7 +160,7 @@ def smalbe(
         left -= len(run.trace) + 1
         at = _updated(problem, constants, at, run, lagrangian)
         lagrangian = at.outer[-1].lagrangian
-        if small(at.nu, run.projected_norm):
+        if small(Point(run.x, run.g), run.face):
             return at._replace(status=Status.SOLVED)
         if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
             return at._replace(status=Status.INFEASIBLE)

@@ -36,7 +36,10 @@ CALLS: Mapping[str, Call] = {
     "highs": Call(
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
         # HiGHS else adds 1e-7 to the Hessian and drops entries below 1e-9
-        {"qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1},
+        {
+            "qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1,
+            "qp_iteration_limit": 1_000_000,  # or it cycles for ever
+        },
         size=1.0, tighter=1e-2, floor=1e-10,
     ),
     "osqp": Call(

@@ -80,20 +80,20 @@ class SMALBE(Options):
 #: standard expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
 PERMON = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,
-    reduced=False, alpha=2.0, norm="power", eliminate="never",
+    reduced=False, alpha=2.0, norm="power", eliminate="never", energy=0.0,
 )  # fmt: skip
 
 #: ESPRESO's: projected CG steps with a check of the cost, gradient projection as
 #: proportioning, everything relative to ‖𝒫F𝒫‖
 ESPRESO = SMALBE(
     expansion="mixed", proportioning="model", preconditioner="none", rho=1.0,
-    beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never",
+    beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never", energy=0.0,
 )  # fmt: skip
 
 #: the textbook's (the paper's reference [3]): Γ = 1, reduced free gradient, fixed ᾱ
 PAPER = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.0,
-    eliminate="never",
+    eliminate="never", energy=0.0,
 )  # fmt: skip
 
 CONDENSED = SMALBE(eliminate="always")

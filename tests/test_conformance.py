@@ -3,16 +3,27 @@
 import gc
 import json
 import os
+import re
 import signal
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from harness import Solution, Status, examine, kkt_residuals
-from harness.conformance import CHECKS, Grade, run_check
-from harness.planted import SHAPES, planted
+from harness.conformance import CHECKS, KEEPS, Grade, run_check
+from harness.equivalence import (
+    CHANGES,
+    DeclinedError,
+    WeakError,
+    answer,
+    changes_of,
+    same_answer,
+)
+from harness.planted import FORMS, SHAPES, planted, strings
+from harness.weaknesses import line_of
 from solvers import SOLVERS
 
 #: backends that stand for the wildcard entries of the registry; the others are slow
@@ -41,6 +52,9 @@ def configured(backends):
 NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
 SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
+#: no condition of conformance are equivalent formulations, which have their own test
+STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
+WEAKNESSES = Path(__file__).parents[1] / "docs/weaknesses.md"
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -62,21 +76,57 @@ def test_a_planted_point_is_a_solution(shape, dense):
     assert kkt_residuals(qp, expected).worst < 1e-13
 
 
-@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("check", STRICT)
 @pytest.mark.parametrize("name", CONCRETE)
 def test_a_solver_conforms(name, check):
-    grade, message = run_check(check, CONCRETE[name])
+    grade, message, _ = run_check(check, CONCRETE[name])
     if grade is Grade.DECLINE:
         pytest.skip(message)
     assert grade is Grade.PASS, message
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("check", STRICT)
 @pytest.mark.parametrize("name", SLOW)
 def test_variants_and_other_backends_conform(name, check):
-    grade, message = run_check(check, SLOW[name])
+    grade, message, _ = run_check(check, SLOW[name])
     assert grade is not Grade.FAIL, message
+
+
+def weaknesses(solver):
+    """Every (form, change) that changes verdict or answer, and how many were solved."""
+    weak, solved = [], 0
+    for form in FORMS:
+        old = None
+        for change in changes_of(form):
+            try:
+                old = old or answer(solver, strings(form))
+                same_answer(form, change, solver, old)
+            except WeakError:
+                weak.append((form, change))
+            except DeclinedError:
+                continue
+            solved += 1
+    return weak, solved
+
+
+@pytest.mark.parametrize("name", CONCRETE)
+def test_what_an_equivalent_formulation_changes_is_in_the_documents(name):
+    """`make weaknesses` writes the page; one that is gone again may stay there."""
+    page = WEAKNESSES.read_text()
+    weak, solved = weaknesses(CONCRETE[name])
+
+    assert solved
+    assert f"| `{name}` |" in page
+    assert [w for w in weak if line_of(name, *w) not in page] == []
+
+
+def test_our_own_solvers_have_no_weakness():
+    page = WEAKNESSES.read_text()
+    for name in NATIVE:
+        if name.startswith(("smalbe", "pdas", "projected-gradient")):
+            assert f"| `{name}` |" in page
+            assert f"- `{name}`" not in page
 
 
 @dataclass(frozen=True)
@@ -186,6 +236,31 @@ class Slow(Sound):
         return self.honest(qp, tol)
 
 
+class MindsUnits(Sound):
+    """Gives up where numbers are large, as an absolute tolerance would."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return s if abs(qp.q).max() < 1e6 else replace(s, x=1.01 * s.x)
+
+
+class SlowInNewtons(Sound):
+    """Takes 49 times the iterations where unknowns are large, as OSQP does."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        factor = 49 if abs(s.x).max() > 1e5 else 1
+        return replace(s, iterations=7 * factor)
+
+
+class MindsTheOrder(Sound):
+    """Fails where the first unknown may be no less than zero."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, status=Status.FAILED) if qp.lb[0] == 0 else s
+
+
 class RepeatsTheFirst(Sound):
     def chain(self, tol):
         prepare = SOLVERS["piqp"].chain(tol)
@@ -208,12 +283,15 @@ class Dies(Sound):
         os.kill(os.getpid(), signal.SIGSEGV)
 
 
-PLUGIN_SOLVERS = {"sound": Sound(), "dies": Dies(), "declines": DeclinesAll()}
+PLUGIN_SOLVERS = {
+    "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
+    "slow": SlowInNewtons(),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_a_sound_solver_fails_no_check(check):
-    grade, message = run_check(check, Sound())
+    grade, message, _ = run_check(check, Sound())
     assert grade is not Grade.FAIL, message
 
 
@@ -242,6 +320,26 @@ def test_a_check_catches_its_fault(kind, check):
     assert run_check(check, kind()).grade is Grade.FAIL
 
 
+@pytest.mark.parametrize(
+    ("kind", "check"),
+    [
+        (MindsUnits, "keeps its answer: primal, units N, m"),
+        (MindsTheOrder, "keeps its answer: dual, unknowns permuted"),
+    ],
+)
+def test_what_an_equivalent_formulation_changes_is_a_weakness(kind, check):
+    assert run_check(check, Sound()).grade is Grade.PASS
+    assert run_check(check, kind()).grade is Grade.WEAK
+
+
+def test_what_was_not_solved_cannot_change():
+    weak = run_check("keeps its answer: dual-bounds, as it is", MindsTheOrder())
+    other = run_check("keeps its answer: dual-bounds, mirrored", MindsTheOrder())
+    assert weak.grade is Grade.WEAK
+    assert other.grade is Grade.DECLINE
+    assert other.message.startswith("not solved as it is: ended as failed")
+
+
 def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
     # a fake clock: real threads need idle cores to show
     monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
@@ -255,7 +353,7 @@ def test_a_decline_of_all_is_no_pass():
     grades = {run_check(check, DeclinesAll()).grade for check in CHECKS}
     assert Grade.PASS in grades  # its options
     result = run_check("gives multipliers our signs", DeclinesAll())
-    assert result == (Grade.DECLINE, "never on a Monday")
+    assert result == (Grade.DECLINE, "never on a Monday", None)
 
 
 @pytest.fixture
@@ -289,6 +387,50 @@ def test_the_command_says_how_every_check_ended(plugin, capsys):
     rows = json.loads(capsys.readouterr().out)
     assert [row["check"] for row in rows] == list(CHECKS)
     assert {row["grade"] for row in rows} == {"pass", "decline"}
+
+
+def test_weaknesses_are_told_and_solvers_that_have_some_conform(
+    plugin, capsys, monkeypatch
+):
+    few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
+    monkeypatch.setattr(examine, "CHECKS", few)
+    assert command("test-solver", "minds", "--plugin", plugin) == 0
+    out = capsys.readouterr().out
+    (line,) = (x for x in out.splitlines() if "primal, units N, m " in x)
+    assert line.startswith("weak")
+    assert "wrong: " in line
+    assert out.endswith("0 decline, 1 weak, 0 fail\n")
+
+
+def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
+    plugin, capsys
+):
+    names = ("sound", "minds", "slow")
+    assert command("test-solver", *names, "--plugin", plugin, "--markdown") == 0
+    page = capsys.readouterr().out
+    (sound,) = (x for x in page.splitlines() if x.startswith("| `sound` |"))
+    (minds,) = (x for x in page.splitlines() if x.startswith("| `minds` |"))
+    assert sound.count(" | ") == len(CHANGES)  # name, forms, all changes but none
+    assert "**" not in sound
+    assert minds.split(" | ")[2].startswith("**primal**")
+    assert page.count("×49") == 1  # forces of 1e8 N, not a displacement, not 1e5 N/mm
+    assert line_of("minds", "primal", "units N, m") in page
+    assert line_of("sound", "primal", "units N, m") not in page
+
+
+def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
+    few = ("refuses a misspelt option", "keeps its answer: dual, mirrored")
+    monkeypatch.setattr(examine, "CHECKS", few)
+    command("test-solver", "piqp-*", "sound", "--plugin", plugin, "--json")
+    rows = json.loads(capsys.readouterr().out)
+    named = ["piqp-dense", "piqp-sparse", "sound"]
+    assert [row["solver"] for row in rows] == np.repeat(named, 2).tolist()
+    for row in rows[1::2]:
+        assert re.fullmatch(r"\d+ iterations, \d+ as it is", row["message"])
+
+    assert command("test-solver", "nobody*") == 2
+    assert "nobody*" in capsys.readouterr().err
+    assert command("test-solver", "piqp", "--json", "--markdown") == 2
 
 
 def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):

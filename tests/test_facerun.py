@@ -73,7 +73,7 @@ def test_compiled_steps_take_the_path_that_is_written(qp, preconditioner, expans
             partial(problem.H, rho=1.0), b, problem.bounds,
             (x, problem.H(x, 1.0) - b),
             B=problem.plain_model(1.0, alpha=1.9), rules=rules,
-            stop=lambda x, size, stop=stop: size <= stop,
+            stop=lambda at, face, stop=stop: face.projected_norm <= stop,
             precondition=problem.model(1.0).inverse_in if with_model else None,
             run=run(1.0, Until(stop, 0.0, 0.0)) if compiled else None, max_steps=20,
         )  # fmt: skip

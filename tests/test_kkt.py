@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array, vstack
 from scipy.sparse.linalg import aslinearoperator
 
 from harness import (
@@ -16,6 +17,7 @@ from harness import (
     no_rows,
     verdict,
 )
+from harness.planted import planted
 from problems.beam_ring import BeamRing
 from solvers.clarabel_ import Clarabel
 from solvers.osqp_ import OSQP
@@ -239,3 +241,13 @@ def test_an_operator_is_judged_alike_in_all_units(planted, unit):
     assert kkt_residuals(scaled, same) == pytest.approx(
         kkt_residuals(qp, moved), rel=1e-9
     )
+
+
+def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
+    qp, s = planted("inequalities")
+    n = qp.q.size
+    empty = replace(
+        qp, G=vstack([csr_array(qp.G), csr_array((1, n))]), h=np.append(qp.h, 3.0)
+    )
+    point = replace(s, x=s.x * (1 + 1e-15), z=np.append(s.z, 0.0))
+    assert kkt_residuals(empty, point).worst < 1e-13

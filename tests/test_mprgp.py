@@ -40,7 +40,7 @@ def minimise(
     run = mprgp(
         H, b, (lower, upper), (x, A @ x - b),
         B=B or Model.of_norm(1 / (alpha or 1.9 / np.linalg.norm(A, 2)), b.size),
-        stop=lambda x, size: size <= tol, rules=rules, **options,
+        stop=lambda at, face: face.projected_norm <= tol, rules=rules, **options,
     )  # fmt: skip
     return run, len(products)
 

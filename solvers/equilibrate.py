@@ -1,0 +1,87 @@
+"""The units taken out of a QP: a transform with its way back.
+
+Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
+largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). That leaves a
+factor of x against those of y and z open: it makes the largest entry of P about one,
+whatever the unit of the objective. All factors are powers of two, so that no entry is
+rounded: a point of the scaled QP is a point of the given one, digit for digit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, diags_array
+
+from harness import QP, Matrix, Solution, Vector
+
+ROUNDS = 20  #: more than it takes units that differ by 1e±12 from entry to entry
+Exponents = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Equilibrated:
+    """A scaled QP, with the factors of x, y and z: x = D x̂, y = E ŷ, z = H ẑ."""
+
+    qp: QP
+    D: Vector  #: (n,)
+    E: Vector  #: (m,)
+    H: Vector  #: (p,)
+
+    def recover(self, s: Solution) -> Solution:
+        """Take a point of the scaled QP to the given one."""
+        return replace(
+            s, x=s.x * self.D, y=s.y * self.E, z=s.z * self.H, z_box=s.z_box / self.D
+        )
+
+
+def equilibrated(qp: QP) -> Equilibrated:
+    """Scale a QP with an explicit P; all matrices sparse unless P is dense."""
+    store = np.asarray if isinstance(qp.P, np.ndarray) else csc_array
+    P, A, G = (store(_as(M, store is np.asarray)) for M in (qp.P, qp.A, qp.G))
+    d, e, h = (np.zeros(v.size, dtype=np.int64) for v in (qp.q, qp.b, qp.h))
+    for _ in range(ROUNDS):
+        P_, A_, G_ = _times(d, P, d), _times(e, A, d), _times(h, G, d)
+        columns = np.maximum.reduce([_largest(M, 0) for M in (P_, A_, G_)])
+        changes = [_root(v) for v in (columns, _largest(A_, 1), _largest(G_, 1))]
+        if not any(c.any() for c in changes):
+            break
+        d, e, h = d + changes[0], e + changes[1], h + changes[2]
+    common = _root(_largest(_times(d, P, d), 0).max(initial=0.0, keepdims=True))
+    d, e, h = d + common, e - common, h - common
+    D, E, H = (np.ldexp(1.0, k) for k in (d, e, h))
+    scaled = QP(
+        P=_times(d, P, d), q=D * qp.q, A=_times(e, A, d), b=E * qp.b,
+        G=_times(h, G, d), h=H * qp.h, lb=qp.lb / D, ub=qp.ub / D,
+    )  # fmt: skip
+    return Equilibrated(scaled, D, E, H)
+
+
+def _as(M: Matrix, dense: bool) -> Matrix:
+    return M.toarray() if dense and not isinstance(M, np.ndarray) else M
+
+
+def _times(left: Exponents, M: Matrix, right: Exponents) -> Matrix:
+    """Multiply by powers of two from both sides."""
+    rows, columns = np.ldexp(1.0, left), np.ldexp(1.0, right)
+    if isinstance(M, np.ndarray):
+        return rows[:, None] * M * columns
+    return csc_array(diags_array(rows) @ M @ diags_array(columns))
+
+
+def _largest(M: Matrix, axis: int) -> Vector:
+    """Largest |entry| per column (axis 0) or row (axis 1)."""
+    if 0 in M.shape:
+        return np.zeros(M.shape[1 - axis])
+    largest = abs(M).max(axis=axis)
+    return np.asarray(
+        largest if isinstance(M, np.ndarray) else largest.toarray()
+    ).ravel()
+
+
+def _root(largest: Vector) -> Exponents:
+    """Give the exponent of about 1/√largest; zero for an empty row."""
+    filled = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
+    return np.rint(-0.5 * np.log2(filled)).astype(np.int64)

@@ -1,0 +1,217 @@
+"""The certificate: no error above its bound, for answers of every kind of badness."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from harness import Mechanics, Solution, Status, UncertifiableError, certify
+from harness.build import build
+from harness.certificate import Certificate
+from harness.judge import has_point
+from harness.mechanics import Extended, Real
+from harness.names import parse
+from harness.references import ReferencePoint, reference_point
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+CASES = (
+    "beam-ring/Nr=3/Nh=2/step=10",
+    "beam-ring/Nr=3/Nh=2/step=2/contact=mortar",
+    "beam-ring/Nr=2/Nh=3/step=6/contact=mortar/basis=standard",
+    "contact-patch",
+    "hertz-plane/n=3",
+    "hertz-cylinder/n=3/m=2",
+    "obstacle/dim=1/n=16",
+    "obstacle/n=8",
+)
+PERTURBATIONS = 10_000
+ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A small problem with its solution to rounding."""
+
+    mechanics: Mechanics
+    exact: ReferencePoint
+
+    def solution(self) -> Solution:
+        """The solution as a solver would return it, on the primal QP."""
+        u, z = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
+        primal = self.mechanics.primal
+        y = -primal.A @ (primal.P @ u + primal.q + primal.G.T @ z)
+        return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
+
+    def error(self, u: Extended) -> float:
+        """‖u − u*‖_K."""
+        return self.mechanics.norm(u - self.exact.u)
+
+    @property
+    def slack(self) -> float:
+        """How far the reference itself may be off."""
+        return self.exact.bound * self.exact.norm
+
+
+@cache
+def known(name: str) -> Known:
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(f"{name}/primal", PROBLEMS), family, reference_solution)
+    assert case.mechanics is not None
+    point = reference_point(case.mechanics, reference_solution)
+    return Known(case.mechanics, point)
+
+
+def holds(problem: Known, s: Solution, found: Certificate) -> bool:
+    """Whether no error that the certificate speaks of exceeds what it says."""
+    slack = problem.slack
+    of_u, of_equilibrium = map(problem.error, (found.u, found.equilibrium))
+    of_answer = problem.error(s.x.astype(Real))
+    return bool(
+        np.hypot(of_u, of_equilibrium) <= ROUNDED * found.pair + 2 * slack
+        and max(of_u, of_equilibrium, of_answer)
+        <= ROUNDED * max(found.pair, found.claimed) + slack
+        and (found.multipliers >= 0).all()
+        and (problem.mechanics.exact.B @ found.u <= problem.mechanics.exact.c).all()
+    )  # fmt: skip
+
+
+def _noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Disturb all components by as much."""
+    x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
+    z = s.z + size * s.z.max() * rng.standard_normal(s.z.size)
+    return replace(s, x=x, z=z)
+
+
+def _wrong_active_set(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Move multipliers from rows in contact to others."""
+    z = s.z.copy()
+    swapped = rng.random(z.size) < max(size, 1.5 / z.size)
+    z[swapped] = rng.permutation(z)[swapped]
+    return replace(s, z=z)
+
+
+def _scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Scale point and multipliers by factors near 1, or not near at all."""
+    a, b = 1 + 3 * size * rng.standard_normal(2)
+    return replace(s, x=a * s.x, z=b * s.z)
+
+
+def _truncated(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Set what is small to zero, and round the rest to as many digits."""
+    x = np.where(np.abs(s.x) < size * np.abs(s.x).max(), 0, s.x)
+    z = np.where(s.z < size * s.z.max(), 0, s.z)
+    digits = rng.integers(1, 6)
+    unit = 10.0 ** np.floor(np.log10(np.abs(s.x).max()))
+    return replace(s, x=np.round(x / unit, digits) * unit, z=z)
+
+
+def _infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Push bodies into each other, move what is held, and let contact pull."""
+    x = s.x * (1 + 10 * size) + size * np.abs(s.x).max() * rng.random(s.x.size)
+    return replace(s, x=x, z=s.z - size * s.z.max() * rng.random(s.z.size))
+
+
+KINDS: tuple[Callable[[Solution, float, np.random.Generator], Solution], ...] = (
+    _noise, _wrong_active_set, _scaled, _truncated, _infeasible,
+)  # fmt: skip
+
+
+def violations(name: str, count: int) -> list[str]:
+    """Disturb the solution at random; tell every time that a bound did not hold."""
+    problem, told = known(name), []
+    rng = np.random.default_rng(sum(map(ord, name)))
+    for i in range(count):
+        kind, size = KINDS[i % len(KINDS)], 10 ** rng.uniform(-10, 0.5)
+        s = kind(problem.solution(), size, rng)
+        try:
+            found = certify(problem.mechanics, s)
+        except UncertifiableError:
+            told.append(f"{kind.__name__} {size:.1e}: no certificate")
+            continue
+        if not holds(problem, s, found):
+            told.append(f"{kind.__name__} {size:.1e}: bound {found.bound:.3e}")
+    return told
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_disturbed_solution_is_further_off_than_its_bound(name):
+    assert violations(name, 100) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_none_of_ten_thousand_is(name):
+    assert violations(name, PERTURBATIONS // len(CASES)) == []
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_bound_of_the_solution_is_that_of_rounding(name):
+    problem = known(name)
+    assert problem.exact.bound < 1e-8
+    assert certify(problem.mechanics, problem.solution()).bound < 1e-7
+
+
+def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
+    """Bound over true error of the pairs that solvers return at 1e-3 to 1e-8."""
+    problem, found = known(name), []
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(f"{name}/{form}", PROBLEMS), family, reference_solution)
+    assert case.mechanics is not None
+    for solver in (SOLVERS[label] for label in labels):
+        if solver.declines(case.qp) is not None:
+            continue
+        for tol in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
+            s = solver.prepare(case.qp, tol)()
+            if not has_point(s):
+                continue
+            s = case.mechanics.back(s)
+            c = certify(case.mechanics, s)
+            assert holds(problem, s, c)
+            true = np.hypot(problem.error(c.u), problem.error(c.equilibrium))
+            if true > 10 * problem.slack:  # below, the reference is no measure
+                found.append(c.pair / true)
+    return found
+
+
+def forms_of(names: Sequence[str]) -> list[tuple[str, str]]:
+    return [(n, form) for n in names for form in PROBLEMS[n.partition("/")[0]].forms]
+
+
+def test_bounds_of_what_solvers_return_are_sharp():
+    cases = forms_of((CASES[0], CASES[3], CASES[7]))
+    labels = ("smalbe", "clarabel", "piqp")
+    found = [e for case in cases for e in effectivities(*case, labels)]
+    assert len(found) > 70
+    assert np.median(found) <= 3
+    assert min(found) >= 1 / ROUNDED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_so_are_those_of_the_fleet(name):
+    fleet = ("smalbe", "osqp", "clarabel", "proxqp", "piqp", "scs", "highs", "daqp")
+    found = [e for case in forms_of((name,)) for e in effectivities(*case, fleet)]
+    assert np.median(found) <= 3
+    assert min(found) >= 1 / ROUNDED
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "hertz-cylinder/dual",  # supports dominate the gradient's scale
+        "hertz-cylinder/slave=lower/dual",
+        "beam-ring/Nr=8/Nh=4/step=1/dual",
+        "obstacle/n=10/dual-bounds",
+    ],
+)
+def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
+    family = PROBLEMS[name.partition("/")[0]]
+    case = build(parse(name, PROBLEMS), family, reference_solution)
+    s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
+    assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6

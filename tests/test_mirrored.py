@@ -1,0 +1,159 @@
+"""The generator on the same bodies, seen in a mirror or measured in other units."""
+
+import numpy as np
+import pytest
+from scipy.sparse import diags_array
+
+from problems.beam_ring import model
+from problems.bodies import ContactPair, assemble, clamped, floating
+from problems.emit import contact_case
+from problems.linearise import linearisation
+from problems.results import quantities
+from problems.stepping import LoadPath
+from solvers.reference import reference_solution
+from solvers.smalbe import SMALBE
+
+METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
+STEPS = 3
+every_method = pytest.mark.parametrize(("contact", "basis"), METHODS)
+
+
+def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
+    """Assemble the same bodies anew, but for what is given."""
+    return assemble(
+        mesh or bodies.mesh, bodies.body, names=bodies.names,
+        materials=bodies.materials, plane=bodies.plane,
+        units=units or (bodies.length, bodies.force), fixed=bodies.B_D.indices,
+        load=bodies.f * bodies.force if load is None else load,
+        pairs=pairs or bodies.pairs,
+    )  # fmt: skip
+
+
+def mirrored(bodies, about):
+    """Reflect about the line x = `about`, m.
+
+    What ran anticlockwise runs clockwise: cells and chains are turned round.
+    """
+    mesh, flip = bodies.mesh, sign(bodies)
+    points = mesh.points * [-1, 1] + [2 * about, 0]
+    sides = {name: chain[::-1] for name, chain in mesh.boundaries.items()}
+    return again(
+        bodies, mesh=type(mesh)(points, mesh.cells[:, ::-1], sides),
+        load=flip * bodies.f * bodies.force,
+        pairs=tuple(ContactPair(*(side[::-1] for side in p)) for p in bodies.pairs),
+    )  # fmt: skip
+
+
+def sign(bodies):
+    return np.tile([-1.0, 1.0], len(bodies.mesh.points))
+
+
+def path_of(bodies, contact, basis, relin=1):
+    return LoadPath(
+        bodies, linearisation(bodies, contact, basis), clamped(bodies),
+        reference_solution, STEPS, relin,
+    )  # fmt: skip
+
+
+def results(bodies, primal, form):
+    """Solve the emitted QP in `form`: u in m, and what it means in SI."""
+    case = contact_case(
+        bodies, primal, form, floating=lambda: floating(bodies),
+        clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
+        quantities=lambda s: quantities(bodies, primal, s),
+    )  # fmt: skip
+    s = SMALBE().prepare(case.qp, 1e-12)()
+    found = dict(case.quantities(s))
+    (push, found["up"]), stress = found.pop("contact_force"), found.pop("max_von_mises")
+    found |= stress | {
+        "sideways": abs(push),
+        "objective": case.scale * case.qp.objective(s.x) + case.constant,
+    }
+    return case.recover(s), found
+
+
+@pytest.fixture(params=["strain", "stress"])
+def bodies(request):
+    return model(4, 3, 4, request.param)
+
+
+def test_stiffness_and_load_are_mirrored(bodies):
+    there, S = mirrored(bodies, 0.7), diags_array(sign(bodies))
+    difference = abs(S @ bodies.K @ S - there.K).max()
+
+    assert difference <= 1e-13 * abs(bodies.K).max()
+    assert (there.f == S @ bodies.f).all()
+
+
+def kinked(bodies):
+    """Bend the beam to a V, whose tip is what several nodes of the ring are next to."""
+    u = np.zeros((len(bodies.mesh.points), 2))
+    beam = bodies.body_of_node == 0
+    u[beam, 1] = 2 * abs(bodies.mesh.points[beam, 0] - 1.0625)
+    return u.ravel()
+
+
+@every_method
+@pytest.mark.parametrize("about", [1.0, -3.7])
+@pytest.mark.parametrize("state", ["loaded", "kinked"])
+def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
+    """Where nodes have slid along segments, and at a corner; in the other order."""
+    there, flip = mirrored(bodies, about), sign(bodies)
+    loaded = path_of(bodies, contact, basis).solution(1) * bodies.length
+    u = loaded if state == "loaded" else kinked(bodies)
+    here, other = (
+        linearisation(b, contact, basis)(v) for b, v in ((bodies, u), (there, flip * u))
+    )
+
+    assert here.B.shape == other.B.shape
+    assert abs(here.B @ diags_array(flip) - other.B[::-1]).max() <= 1e-11
+    assert here.c == pytest.approx(other.c[::-1], abs=1e-12)
+
+
+@every_method
+@pytest.mark.parametrize("relin", [1, 2])
+def test_the_mirrored_path_is_the_mirror_of_the_path(bodies, contact, basis, relin):
+    there = mirrored(bodies, 1.0)
+    here, other = (path_of(b, contact, basis, relin) for b in (bodies, there))
+
+    for k in range(1, STEPS + 1):
+        u, v = here.solution(k), other.solution(k)
+        assert v == pytest.approx(sign(bodies) * u, abs=1e-10 * abs(u).max())
+
+
+@every_method
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, form):
+    there = mirrored(bodies, 1.0)
+    primals = [path_of(b, contact, basis).primal(STEPS) for b in (bodies, there)]
+    (u, here), (v, other) = (
+        results(b, primal, form)
+        for b, primal in zip((bodies, there), primals, strict=True)
+    )
+
+    assert v == pytest.approx(sign(bodies) * u, abs=1e-8 * abs(u).max())
+    assert other == pytest.approx(here, rel=1e-8)
+    assert here["energy"] == pytest.approx(here["objective"], rel=1e-9)
+    assert here["up"] > bodies.force  # the ring holds the beam
+
+
+#: of length and of force per thickness: SI; mm and N/mm; m and GN/m; inches and lbf
+UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
+
+
+@every_method
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+@pytest.mark.parametrize("units", UNITS, ids=str)
+def test_units_of_the_qp_change_no_physical_result(contact, basis, form, units):
+    bodies = model(4, 3, 4, "strain")
+    other = again(bodies, units=units)
+    primals = [path_of(b, contact, basis).primal(STEPS) for b in (bodies, other)]
+    (u, here), (v, there) = (
+        results(b, primal, form)
+        for b, primal in zip((bodies, other), primals, strict=True)
+    )
+
+    factor = (bodies.force / bodies.length) / (units[1] / units[0])
+    assert abs(other.K - factor * bodies.K).max() <= 1e-14 * abs(other.K).max()
+    assert v == pytest.approx(u, abs=1e-9 * abs(u).max())
+    assert there == pytest.approx(here, rel=1e-8)
