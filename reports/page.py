@@ -17,7 +17,7 @@ from reports.figures import inline_svg
 from reports.layout import Cell, Page, Picture, short
 
 FIRST = 50  #: rows of a table that are in the page as written; its script has all
-SCRIPTS = ("base", "tables", "marks", "plots", "runs")
+SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
 _NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
 _RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
 

@@ -32,7 +32,7 @@ const quoted = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replac
 function pairs(fields) {
   const rows = fields.map(([name, value]) => {
     const text = typeof value === "string" ? value : JSON.stringify(value);
-    return make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, text));
+    return make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, ...breakable(text)));
   });
   return make("table", { class: "fields" }, make("tbody", {}, ...rows));
 }
