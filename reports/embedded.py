@@ -12,9 +12,10 @@ from typing import Any
 
 from harness import Record
 from harness.record import finite
+from reports.artists import Data
 from reports.figures import legible, look
 from reports.layout import Cell, Page, Table, named, short
-from reports.plots import Data, read_back
+from reports.plots import read_back
 from reports.wording import VERDICTS, clean, tolerance
 
 Rows = Mapping[str, int]  #: run_id, as titles have it → position among the records

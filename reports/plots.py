@@ -18,21 +18,16 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_hex, to_rgba
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.text import Annotation, Text
+from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator
 
-from reports.figures import INK
+from reports.artists import Data, colour_of, look_of, numbers, rules, texts, traces
 from reports.mathtext import plain
 from reports.traces import measured
-
-Data = dict[str, Any]
-
-MOST = 4000  #: points of a line; of more, each stretch shows its least and largest
 
 
 def read_back(figure: Figure, labels: Mapping[str, str]) -> list[Data] | None:
@@ -43,7 +38,8 @@ def read_back(figure: Figure, labels: Mapping[str, str]) -> list[Data] | None:
     panels = [a for a in figure.axes if a.axison]
     if not panels or not all(map(_readable, panels)):
         return None
-    keys = [k for legend in _legends(figure) for k in _keys(legend, labels)]
+    legends = dict.fromkeys(_legends(figure))
+    keys = [k for legend in legends for k in _keys(legend, labels)]
     rows = [a.get_subplotspec() for a in panels]
     columns = len({None if spec is None else spec.colspan.start for spec in rows})
     groups = [tuple(sorted(map(id, _sharing(a)))) for a in panels]
@@ -68,15 +64,21 @@ def _readable(axes: Axes) -> bool:
 
 
 def _panel(axes: Axes, labels: Mapping[str, str], keys: Sequence[Data]) -> Data:
-    traces = [{**t, "s": _solver(a, t, labels, keys)} for a, t in _traces(axes)]
+    drawn = [{**t, "s": _solver(a, t, labels, keys)} for a, t in traces(axes)]
+    owners: dict[str, set[int]] = {}
+    for t in drawn:
+        owners.setdefault(t["colour"], set()).add(t["s"])
+    for t in drawn:  # bands and caps, which have no key, go with the line of a colour
+        others = owners[t["colour"]] - {-1}
+        t["s"] = others.pop() if t["s"] < 0 and len(others) == 1 else t["s"]
     return {
         "title": plain(axes.get_title() or axes.get_title(loc="left")),
         "x": _axis(axes.xaxis),
         "y": _axis(axes.yaxis),
         "height": _height(axes),
-        "traces": traces,
-        "rules": list(_rules(axes)),
-        "texts": list(_texts(axes)),
+        "traces": drawn,
+        "rules": list(rules(axes)),
+        "texts": list(texts(axes)),
     }
 
 
@@ -86,22 +88,28 @@ def _axis(axis: Axis) -> Data:
     at = axis.get_majorticklocs()
     ticks: list[Any] | None = None
     if isinstance(axis.get_major_locator(), FixedLocator):
-        names = map(plain, axis.get_major_formatter().format_ticks(list(at)))
-        ticks = [[float(v), name] for v, name in zip(at, names, strict=True)]
+        names = [plain(n) for n in axis.get_major_formatter().format_ticks(list(at))]
+        if not any(map(_number, names)):
+            ticks = [[float(v), name] for v, name in zip(at, names, strict=True)]
     elif not len(at):
         ticks = []
     return {
         "label": plain(axis.get_label_text()),
         "log": axis.get_scale() == "log",
-        "limits": _numbers((low, high), 9),
+        "limits": numbers((low, high), 9),
         "ticks": ticks,
+        "numbered": bool(axis.get_tick_params().get("labelbottom", True)),
     }
+
+
+def _number(name: str) -> bool:
+    return re.fullmatch(r"[-−]?[\d.]+", name) is not None
 
 
 def _height(axes: Axes) -> float:
     """Height in inches of the whole row that the axes are in."""
     figure, spec = axes.get_figure(), axes.get_subplotspec()
-    total = float(figure.get_figheight()) if isinstance(figure, Figure) else 3.0
+    total = float(figure.bbox.height / figure.dpi) if figure is not None else 3.0
     if spec is None:
         return total
     given = spec.get_gridspec().get_height_ratios()
@@ -110,147 +118,18 @@ def _height(axes: Axes) -> float:
     return round(total * float(ratios[rows].sum() / ratios.sum()), 2)
 
 
-def _traces(axes: Axes) -> Iterator[tuple[Artist, Data]]:
-    """Yield what is drawn in data coordinates, back to front."""
-    artists = [*axes.patches, *axes.collections, *axes.lines]
-    for artist in sorted(artists, key=lambda a: a.get_zorder()):
-        if not artist.get_visible():
-            continue
-        match artist:
-            case Line2D() if artist.get_transform() == axes.transData:
-                yield artist, _line(artist)
-            case LineCollection():
-                yield artist, _segments(artist)
-            case PolyCollection():
-                outlines = [p.vertices for p in artist.get_paths()]
-                colour = _first(artist.get_facecolor())
-                yield artist, _area(outlines, colour)
-            case Patch() if artist.get_data_transform() == axes.transData:
-                path = artist.get_path().transformed(artist.get_patch_transform())
-                yield artist, _area([path.vertices], artist.get_facecolor())
-
-
-def _line(line: Line2D) -> Data:
-    x, y = np.asarray(line.get_xydata(), dtype=float).T
-    points = measured(line)
-    kept = _thinned(y) if len(points) != x.size else np.arange(x.size)
-    return {
-        **_look(line),
-        "kind": "line",
-        "step": line.get_drawstyle() == "steps-post",
-        "x": _numbers(x[kept]),
-        "y": _numbers(y[kept]),
-        "runs": _runs(line),
-    }
-
-
-def _runs(artist: Artist) -> list[list[str]]:
-    """List the run_ids of every point, or of all (one list), or of none."""
-    return [[r.run_id for r in runs] for runs in measured(artist)]
-
-
-def _thinned(y: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Choose the least and largest of every stretch of a long line, and its ends."""
-    if y.size <= MOST:
-        return np.arange(y.size)
-    size = -(-2 * y.size // MOST)
-    kept = {0, y.size - 1}
-    for start in range(0, y.size, size):
-        stretch = np.nan_to_num(y[start : start + size], nan=-np.inf)
-        kept |= {start + int(stretch.argmin()), start + int(stretch.argmax())}
-    return np.array(sorted(kept))
-
-
-def _look(line: Line2D) -> Data:
-    marker = str(line.get_marker() or "None")
-    drawn = line.get_linestyle() not in ("None", "none", " ", "")
-    return {
-        "colour": _colour(line.get_color()),
-        "marker": "" if marker.lower() in ("none", " ", "") else marker,
-        "hollow": to_rgba(line.get_markerfacecolor())[3] == 0,
-        "dash": _dash(line) if drawn else None,
-        "width": round(float(line.get_linewidth()), 2),
-        "size": round(float(line.get_markersize()), 2),
-        "opacity": 1.0 if line.get_alpha() is None else line.get_alpha(),
-    }
-
-
-def _dash(line: Line2D) -> str:
-    """Lengths of dashes and gaps in px; empty for a line without gaps."""
-    _, pattern = line._dash_pattern  # type: ignore[attr-defined]  # has no public name
-    return " ".join(f"{v:.3g}" for v in pattern or ())
-
-
-def _segments(lines: LineCollection) -> Data:
-    ends = np.array([s[[0, -1]] for s in lines.get_segments() if len(s) > 1])
-    ends = ends.reshape(-1, 4).astype(float)
-    return {
-        "kind": "segments",
-        "colour": _colour(_first(lines.get_edgecolor())),
-        "width": round(float(np.ravel(lines.get_linewidth())[0]), 2),
-        "ends": [_numbers(row) for row in ends],
-        "runs": _runs(lines),
-    }
-
-
-def _area(outlines: Sequence[Any], colour: Any) -> Data:
-    return {
-        "kind": "area",
-        "colour": _colour(colour),
-        "opacity": round(float(to_rgba(colour)[3]), 3),
-        "outlines": [_numbers(np.ravel(v)) for v in outlines],
-    }
-
-
-def _colour(colour: Any) -> str:
-    """Name a colour as SVG does; ink is that of the text around."""
-    name = to_hex(colour)
-    return "currentColor" if name == INK else name
-
-
-def _first(colours: Any) -> Any:
-    rows = np.atleast_2d(colours)
-    return rows[0] if len(rows) else (0, 0, 0, 0)
-
-
-def _rules(axes: Axes) -> Iterator[Data]:
-    """Yield lines across the axes, which have one coordinate each."""
-    for line in axes.lines:
-        if line.get_transform() == axes.get_yaxis_transform(which="grid"):
-            at = ("y", line.get_ydata(orig=False))
-        elif line.get_transform() == axes.get_xaxis_transform(which="grid"):
-            at = ("x", line.get_xdata(orig=False))
-        else:
-            continue
-        yield _look(line) | {"axis": at[0], "at": float(np.asarray(at[1])[0])}
-
-
-def _texts(axes: Axes) -> Iterator[Data]:
-    for text in axes.texts:
-        coords = getattr(text, "xycoords", "data")
-        modes = coords if isinstance(coords, tuple) else (coords, coords)
-        if not set(modes) <= {"data", "axes fraction"} or not text.get_visible():
-            continue
-        place = text.xy if isinstance(text, Annotation) else text.get_position()
-        yield {
-            "text": plain(text.get_text()),
-            "place": [float(v) for v in place],
-            "inside": [mode != "data" for mode in modes],
-            "align": [text.get_horizontalalignment(), text.get_verticalalignment()],
-        }
-
-
-def _legends(figure: Figure) -> list[Legend]:
+def _legends(figure: Figure | SubFigure) -> list[Legend]:
     inner = [a.get_legend() for a in figure.axes]
-    return [*figure.legends, *(one for one in inner if one is not None)]
+    parts = [legend for part in figure.subfigs for legend in _legends(part)]
+    return [*figure.legends, *(one for one in inner if one is not None), *parts]
 
 
 def _keys(legend: Legend, labels: Mapping[str, str]) -> Iterator[Data]:
     for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=False):
         if isinstance(handle, Line2D):
-            look = _look(handle)
+            look = look_of(handle)
         elif isinstance(handle, Patch):
-            look = {"colour": _colour(handle.get_facecolor()), "marker": "s",
+            look = {"colour": colour_of(handle.get_facecolor()), "marker": "s",
                     "hollow": False, "dash": None, "width": 1, "size": 6}  # fmt: skip
         else:
             continue
@@ -286,8 +165,3 @@ def _solver(
         if len(places) == 1:
             return int(places.pop())
     return -1
-
-
-def _numbers(values: Any, digits: int = 6) -> list[float | None]:
-    """Round for the page; what is not finite has no place in JSON."""
-    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in values]

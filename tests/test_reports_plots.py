@@ -8,11 +8,12 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from harness import Record, Verdict
+from reports.artists import MOST
 from reports.embedded import cell, rows_of, script, spans, table
 from reports.figures import legible, look
 from reports.layout import Cell, Table, named
 from reports.mathtext import plain
-from reports.plots import MOST, read_back
+from reports.plots import read_back
 from reports.traces import behind
 
 LABELS = {"a $b": legible("a $b"), "b": "b", "b2": "b2"}
@@ -49,6 +50,7 @@ def test_a_line_is_read_back_with_its_look_its_axes_and_its_runs(axes):
     assert len(trace["dash"].split()) == 2
     assert panel["x"] == {
         "label": "size n", "log": True, "limits": [1, 100], "ticks": None,
+        "numbered": True,
     }  # fmt: skip
     assert panel["y"]["log"] is False
 
@@ -66,6 +68,32 @@ def test_a_line_without_a_label_belongs_to_the_key_that_looks_like_it(axes):
     panel = read(axes)
     assert [t["s"] for t in panel["traces"]] == [0, 1, 2]
     assert [k["label"] for k in panel["keys"]] == ["a $b", "b", "b2"]
+
+
+def test_bands_and_error_bars_belong_to_the_line_of_their_colour(axes):
+    for i, label in enumerate(LABELS.values()):
+        axes.plot([1, 2], [1, 2], label=label, **look(i))
+        axes.fill_between([1, 2], [0, 1], [2, 3], color=look(i)["color"], alpha=0.1)
+        axes.errorbar([1], [1], yerr=[1], fmt="none", color=look(i)["color"], capsize=2)
+    assert sorted(t["s"] for t in read(axes)["traces"]) == sorted([0, 1, 2] * 5)
+
+
+def test_legends_of_parts_of_a_figure_are_keys_of_the_whole():
+    figure = Figure()
+    for part, label in zip(figure.subfigures(2, 1), ("b", "b2"), strict=True):
+        lines = part.subplots().plot([1, 2], [1, 2], **look(1))
+        part.legend(lines, [label])
+    first, _ = read_back(figure, LABELS)
+    assert [key["label"] for key in first["keys"]] == ["b", "b2"]
+
+
+def test_numbers_under_an_axis_are_left_out_where_the_figure_leaves_them_out():
+    figure = Figure()
+    for axes in figure.subplots(2, 1, sharex=True):
+        axes.plot([1, 2], [1, 2])
+    panels = read_back(figure, LABELS)
+    assert [p["x"]["numbered"] for p in panels] == [False, True]
+    assert panels[0]["share"] == panels[1]["share"]
 
 
 def test_bars_bands_and_rules_are_read_back(axes):

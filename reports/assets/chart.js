@@ -1,6 +1,7 @@
 // One panel of a plot: curves of a printed figure drawn anew, to zoom in and point at.
 
 const NEAR = 24; // px within which a point counts as pointed at
+const APART = 70; // px between the marks of a line that has few
 const PER_INCH = 104; // px of a printed inch
 
 /** One panel: axes, traces, what is pointed at; `linked` are those with the same x. */
@@ -10,7 +11,7 @@ function chart(box, content, linked, name) {
   const drawing = svg("svg", { tabindex: 0, role: "group", "aria-label": `${name}${content.title ? `, ${content.title}` : ""}: ${axes.y.label} against ${axes.x.label || "the same"}` });
   const tip = make("div", { class: "tip", role: "status", hidden: "" });
   const bar = make("div", { class: "bar" });
-  const below = content.x.label ? 42 : small ? 3 : 10; // px, for ticks and label
+  const below = content.x.label ? 42 : content.x.numbered ? 24 : small ? 3 : 10; // px, for ticks and label
   const height = small ? 14 * content.traces.length + 6 + below : Math.min(Math.max(content.height * PER_INCH, 230), 460);
   let points = [], at = -1, scale = null, band = null;
   const up = { x: (v) => (axes.x.log ? Math.log10(v) : v), y: (v) => (axes.y.log ? Math.log10(v) : v) };
@@ -66,7 +67,7 @@ function chart(box, content, linked, name) {
   const reset = () => { home("x"); home("y"); share(); };
 
   function traced(t) { // path data and the points of one line
-    let path = "", marks = "", pen = false, last = 0;
+    let path = "", marks = "", pen = false, marked = [-Infinity, 0];
     t.x.forEach((x, i) => {
       const y = t.y[i];
       if (!inside("x", x) || !inside("y", y)) { pen = false; return; }
@@ -74,12 +75,14 @@ function chart(box, content, linked, name) {
       const p = scale.x(x), q = scale.y(y);
       path += !pen ? `M${p.toFixed(1)} ${q.toFixed(1)}` : t.step ? `H${p.toFixed(1)}V${q.toFixed(1)}` : `L${p.toFixed(1)} ${q.toFixed(1)}`;
       pen = true;
-      last = q;
       if (p < scale.left - 1 || p > scale.right + 1 || q < scale.top - 1 || q > scale.bottom + 1) return;
-      if (t.marker) marks += mark(t.marker, p, q, 0.62 * t.size);
+      if (t.marker && !(t.few && Math.hypot(p - marked[0], q - marked[1]) < APART)) {
+        marks += mark(t.marker, p, q, 0.62 * t.size);
+        marked = [p, q];
+      }
       if (t.marker !== "_" && t.marker !== "|") points.push({ p, q, t, i });
     });
-    return [path, marks, last];
+    return [path, marks];
   }
   function* drawn(t) {
     if (t.s >= 0 && hidden.has(t.s)) return;
@@ -109,7 +112,7 @@ function chart(box, content, linked, name) {
       if (!room("x", v)) continue;
       const p = scale.x(v).toFixed(1);
       if (!small) parts.push(svg("path", { d: `M${p} ${scale.top}V${scale.bottom}`, ...grid }));
-      if (axes.x.label) label(text, { x: p, y: scale.bottom + 17, "text-anchor": "middle" });
+      if (axes.x.numbered) label(text, { x: p, y: scale.bottom + 17, "text-anchor": "middle" });
     }
     for (const [v, text] of given("y", Math.max(2, Math.floor((scale.bottom - scale.top) / 45)))) {
       if (!room("y", v)) continue;
