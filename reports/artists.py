@@ -141,6 +141,7 @@ def rules(axes: Axes) -> Iterator[Data]:
 
 
 def texts(axes: Axes) -> Iterator[Data]:
+    """Yield the texts within the axes, placed by data or by parts of the axes."""
     for text in axes.texts:
         coords = getattr(text, "xycoords", "data")
         modes = coords if isinstance(coords, tuple) else (coords, coords)

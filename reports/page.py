@@ -19,6 +19,7 @@ from reports.layout import Cell, Page, Picture, short
 FIRST = 50  #: rows of a table that are in the page as written; its script has all
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
 _NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
+_LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
 _RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
 
 
@@ -66,9 +67,13 @@ def _policy(code: str) -> str:
 
 
 def breakable(text: str) -> Markup:
-    """Allow a line break after every slash of a case name, and none within 1e-8."""
+    """Allow a line break after every slash of a case name, and none within 1e-8.
+
+    What is written from right to left is isolated, so that it turns nothing around it.
+    """
     parts = str(Markup("/<wbr>").join(text.split("/")))  # which escapes them
-    return Markup(_NUMBER.sub(r'<span class="nb">\g<0></span>', parts))
+    kept = _NUMBER.sub(r'<span class="nb">\g<0></span>', parts)
+    return Markup(_LEFTWARDS.sub(r"<bdi>\g<0></bdi>", kept))
 
 
 def told(text: str, rows: Rows) -> Markup:

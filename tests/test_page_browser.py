@@ -226,6 +226,15 @@ def test_what_a_table_draws_anew_is_what_the_page_was_written_with(visit, folder
     assert page.evaluate(f"{bodies}.map((t) => t{clean})") == written
 
 
+def test_a_hostile_table_is_drawn_anew_as_it_was_written(visit, hostile):
+    page = visit(hostile)
+    rows = "[...document.querySelectorAll('tbody tr')].map((r) => r.innerText.trim())"
+    written = page.evaluate(rows)
+    page.evaluate("hidden.add(0); redraw(); hidden.clear(); redraw()")
+    assert page.evaluate(rows) == written
+    assert page.locator("bdi").count() > 3  # letters that run from right to left
+
+
 @pytest.mark.parametrize(("scheme", "paper"), [("light", 255), ("dark", 21)])
 def test_colours_follow_the_system_until_the_reader_chooses(
     visit, folder, scheme, paper

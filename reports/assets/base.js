@@ -74,7 +74,7 @@ function themes() {
 
 /** A button that shows and hides one solver everywhere. */
 function solverButton(solver, text, look) {
-  const button = make("button", { type: "button", class: "key" }, swatch(look), text);
+  const button = make("button", { type: "button", class: "key" }, swatch(look), text || "(no name)");
   const view = () => button.setAttribute("aria-pressed", String(!hidden.has(solver)));
   button.addEventListener("click", () => toggle(solver));
   views.push(view);

@@ -108,7 +108,7 @@ function chart(box, content, linked, name) {
     const label = (text, attributes) => parts.push(svg("text", attributes, text));
     const given = (axis, most) => axes[axis].ticks?.map(([v, n]) => [v, n]) ?? ticks(axes[axis].view, axes[axis].log, most).map((v) => [v, number(v)]);
     const room = (axis, v) => v >= axes[axis].view[0] && v <= axes[axis].view[1];
-    for (const [v, text] of given("x", Math.max(2, Math.floor((scale.right - scale.left) / 80)))) {
+    for (const [v, text] of given("x", Math.max(3, Math.floor((scale.right - scale.left) / 80)))) {
       if (!room("x", v)) continue;
       const p = scale.x(v).toFixed(1);
       if (!small) parts.push(svg("path", { d: `M${p} ${scale.top}V${scale.bottom}`, ...grid }));

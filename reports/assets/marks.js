@@ -64,7 +64,7 @@ function ticks([low, high], log, most) {
     const decades = [];
     for (let k = Math.floor(a); k <= Math.ceil(b); k++) if (k % step === 0) decades.push(k);
     const found = every(decades, b - a < 2.2 ? [1, 2, 5] : [1]);
-    if (found.length > 2) return found;
+    if (found.length > 1) return found;
   }
   const raw = (high - low) / most, size = 10 ** Math.floor(Math.log10(raw));
   const step = size * [1, 2, 5, 10].find((s) => s * size >= raw);

@@ -2,17 +2,19 @@
 
 const PAGE = 50; // rows, as many as the page was written with
 const NUMBER = /(\b\d[\d.]*e-\d+\b)/;
+const LEFTWARDS = /([\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+)/;
 const TEXT = 0, VALUE = 1, KIND = 2, SYMBOL = 3, AFTER = 4, TITLE = 5, RUNS = 6;
 
 const field = (cell, i) => (typeof cell === "string" ? (i === TEXT ? cell : undefined) : cell[i]) ?? null;
 const textOf = (cell) => [SYMBOL, TEXT, AFTER].map((i) => field(cell, i) ?? "").join(" ");
 
-/** Text that may break after slashes, and not within 1e-8. */
+/** Text that may break after slashes, and not within 1e-8; as the page's writer has it. */
 function breakable(text) {
-  return text.split("/").flatMap((part, i) => [
-    ...(i ? ["/", make("wbr")] : []),
-    ...part.split(NUMBER).map((t, j) => (j % 2 ? make("span", { class: "nb" }, t) : t)),
-  ]);
+  const split = (parts, pattern, wrap) => parts.flatMap((part) =>
+    typeof part === "string" ? part.split(pattern).map((t, i) => (i % 2 ? wrap(t) : t)) : [part]);
+  const lines = split([text], /(\/)/, (t) => t).flatMap((t) => (t === "/" ? ["/", make("wbr")] : [t]));
+  const kept = split(lines, NUMBER, (t) => make("span", { class: "nb" }, t));
+  return split(kept, LEFTWARDS, (t) => make("bdi", {}, t));
 }
 
 /** A table cell as the page's writer makes it. */
