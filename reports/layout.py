@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure
@@ -87,7 +87,13 @@ class Page:
 
 def source(*outcomes: Outcome) -> str:
     """Name the measurements behind a cell; `named` reads them back."""
-    return _RUN + ", ".join(short(r.run_id) for o in outcomes for r in o.records)
+    return sources(r for o in outcomes for r in o.records)
+
+
+def sources(records: Iterable[Record]) -> str:
+    """Name measurements one by one; empty if there are none."""
+    names = ", ".join(short(r.run_id) for r in records)
+    return _RUN + names if names else ""
 
 
 def named(title: str) -> list[str]:

@@ -161,6 +161,7 @@ def test_a_verdict_leaves_exactly_the_cases_that_have_it(visit, folder, records)
     wanted = set(names(records, status=Verdict.WRONG))
     assert 0 < len(wanted) < 50
     assert set(column(table(page, "verdicts"), "case")) == wanted
+    assert set(column(table(page, "cases"), "case")) == wanted
     errors = table(page, "errors")
     found = zip(column(errors, "case"), column(errors, "solver"), strict=True)
     assert set(found) == {
