@@ -38,16 +38,16 @@ def read_back(figure: Figure, labels: Mapping[str, str]) -> list[Data] | None:
     panels = [a for a in figure.axes if a.axison]
     if not panels or not all(map(_readable, panels)):
         return None
-    legends = dict.fromkeys(_legends(figure))
-    keys = [k for legend in legends for k in _keys(legend, labels)]
+    common = _legend(_legends(figure), labels)
     rows = [a.get_subplotspec() for a in panels]
     columns = len({None if spec is None else spec.colspan.start for spec in rows})
     groups = [tuple(sorted(map(id, _sharing(a)))) for a in panels]
     return [
-        _panel(a, labels, keys) | {"share": groups.index(group), "columns": columns}
-        | ({"keys": keys} if i == 0 else {})
+        _panel(a, labels, common["keys"])
+        | {"share": groups.index(group), "columns": columns}
+        | ({"common": common} if i == 0 else {})
         for i, (a, group) in enumerate(zip(panels, groups, strict=True))
-    ]  # fmt: skip
+    ]
 
 
 def _sharing(axes: Axes) -> list[Axes]:
@@ -63,7 +63,10 @@ def _readable(axes: Axes) -> bool:
     return kinds and curves and scales <= {"linear", "log"}
 
 
-def _panel(axes: Axes, labels: Mapping[str, str], keys: Sequence[Data]) -> Data:
+def _panel(axes: Axes, labels: Mapping[str, str], common: Sequence[Data]) -> Data:
+    inner = axes.get_legend()
+    own = _legend([] if inner is None else [inner], labels)
+    keys = [*own["keys"], *common]
     drawn = [{**t, "s": _solver(a, t, labels, keys)} for a, t in traces(axes)]
     owners: dict[str, set[int]] = {}
     for t in drawn:
@@ -79,6 +82,7 @@ def _panel(axes: Axes, labels: Mapping[str, str], keys: Sequence[Data]) -> Data:
         "traces": drawn,
         "rules": list(rules(axes)),
         "texts": list(texts(axes)),
+        "own": own,
     }
 
 
@@ -119,9 +123,17 @@ def _height(axes: Axes) -> float:
 
 
 def _legends(figure: Figure | SubFigure) -> list[Legend]:
-    inner = [a.get_legend() for a in figure.axes]
+    """List the legends of a figure and its parts, not those inside of axes."""
     parts = [legend for part in figure.subfigs for legend in _legends(part)]
-    return [*figure.legends, *(one for one in inner if one is not None), *parts]
+    return [*figure.legends, *parts]
+
+
+def _legend(legends: Sequence[Legend], labels: Mapping[str, str]) -> Data:
+    titles = dict.fromkeys(plain(one.get_title().get_text()) for one in legends)
+    return {
+        "title": ", ".join(filter(None, titles)),
+        "keys": [key for one in legends for key in _keys(one, labels)],
+    }
 
 
 def _keys(legend: Legend, labels: Mapping[str, str]) -> Iterator[Data]:

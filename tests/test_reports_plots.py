@@ -67,7 +67,7 @@ def test_a_line_without_a_label_belongs_to_the_key_that_looks_like_it(axes):
     axes.get_figure().legend(handles, list(LABELS.values()))
     panel = read(axes)
     assert [t["s"] for t in panel["traces"]] == [0, 1, 2]
-    assert [k["label"] for k in panel["keys"]] == ["a $b", "b", "b2"]
+    assert [k["label"] for k in panel["common"]["keys"]] == ["a $b", "b", "b2"]
 
 
 def test_bands_and_error_bars_belong_to_the_line_of_their_colour(axes):
@@ -84,7 +84,21 @@ def test_legends_of_parts_of_a_figure_are_keys_of_the_whole():
         lines = part.subplots().plot([1, 2], [1, 2], **look(1))
         part.legend(lines, [label])
     first, _ = read_back(figure, LABELS)
-    assert [key["label"] for key in first["keys"]] == ["b", "b2"]
+    assert [key["label"] for key in first["common"]["keys"]] == ["b", "b2"]
+
+
+def test_a_legend_within_axes_is_that_of_their_panel_only():
+    figure = Figure()
+    for axes, label in zip(figure.subplots(1, 2), ("b", "bound"), strict=True):
+        axes.plot([1, 2], [1, 2], label=label, **look(0))
+        axes.legend(title=f"of {label}")
+    panels = read_back(figure, LABELS)
+    assert [p["own"]["title"] for p in panels] == ["of b", "of bound"]
+    assert [[k["label"] for k in p["own"]["keys"]] for p in panels] == [
+        ["b"],
+        ["bound"],
+    ]
+    assert [p["traces"][0]["s"] for p in panels] == [1, -1]
 
 
 def test_numbers_under_an_axis_are_left_out_where_the_figure_leaves_them_out():

@@ -2,6 +2,7 @@
 
 const NEAR = 24; // px within which a point counts as pointed at
 const APART = 70; // px between the marks of a line that has few
+const LETTER = 6.2; // px, about as wide as one is
 const PER_INCH = 104; // px of a printed inch
 
 /** One panel: axes, traces, what is pointed at; `linked` are those with the same x. */
@@ -140,9 +141,10 @@ function chart(box, content, linked, name) {
       const place = (axis, k) => (t.inside[k] ? (axis === "x" ? scale.left + t.place[0] * (scale.right - scale.left) : scale.bottom - t.place[1] * (scale.bottom - scale.top)) : inside(axis, t.place[k]) ? scale[axis](t.place[k]) : NaN);
       const x = place("x", 0), y = place("y", 1);
       if (!(x >= scale.left - 1 && x <= scale.right + 1 && y >= scale.top - 1 && y <= scale.bottom + 1)) continue;
-      const end = t.align[0] === "right" || x > scale.right - 20;
+      const end = t.align[0] === "right" || x + LETTER * t.text.length > scale.right;
       const shift = t.align[1] === "top" ? 15 : t.align[1] === "bottom" || x > scale.right - 20 ? -4 : 0;
-      yield svg("text", { x: x + (end ? -3 : 3), y: y + shift, "text-anchor": end ? "end" : "start", ...(shift ? {} : { "dominant-baseline": "central" }), class: "remark" }, t.text);
+      const gap = t.inside[0] ? 3 : 8;
+      yield svg("text", { x: x + (end ? -gap : gap), y: y + shift, "text-anchor": end ? "end" : "start", ...(shift ? {} : { "dominant-baseline": "central" }), class: "remark" }, t.text);
     }
   }
 
