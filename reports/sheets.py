@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from harness import Record
+from reports.contest_sheets import contest_sheets
 from reports.data import RESIDUALS, Evidence, Outcome
 from reports.intervals import PowerLaw
 from reports.physics import spreads
@@ -22,7 +23,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
 
     measurements: one row per journal line. outcomes: the repeats of one solver on one
     case together, every time a median with its interval. energies, scaling: as in the
-    report.
+    report. contests, means: see `reports.contest_sheets`.
     """
     found = {
         "measurements": _frame(map(_measurement, evidence.records)),
@@ -43,6 +44,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
             for solver in ladder.solvers
         ),
     }
+    found |= contest_sheets(evidence)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
 
 
