@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
@@ -26,9 +25,9 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
     report. contests, means: see `reports.contest_sheets`.
     """
     found = {
-        "measurements": _frame(map(_measurement, evidence.records)),
-        "outcomes": _frame(map(_outcome, evidence.flat)),
-        "energies": _frame(
+        "measurements": pd.DataFrame(map(_measurement, evidence.records)),
+        "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
+        "energies": pd.DataFrame(
             {
                 "case": s.answers[0].physical,
                 "tol": s.answers[0].tol,
@@ -38,7 +37,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
             }
             for s in spreads(evidence.flat)
         ),
-        "scaling": _frame(
+        "scaling": pd.DataFrame(
             _law(ladder, solver)
             for ladder in ladders(evidence)
             for solver in ladder.solvers
@@ -46,19 +45,6 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
     }
     found |= contest_sheets(evidence)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
-
-
-def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
-    """Put rows together; a lone surrogate, which no file can hold, is spelt out."""
-    return pd.DataFrame(
-        {
-            name: value.encode(errors="backslashreplace").decode()
-            if isinstance(value, str)
-            else value
-            for name, value in row.items()
-        }
-        for row in rows
-    )
 
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:
