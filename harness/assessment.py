@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from harness.certificate import equilibrium
+from harness.exchange import equilibrium
 from harness.kkt import allowed
 from harness.mechanics import Exact, Extended, Mechanics, Real
 from harness.qp import QP, Matrix, Vector

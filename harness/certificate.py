@@ -20,6 +20,9 @@ says that  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²,  hence
 
 where no more than √(2g) is left of the right-hand side if u is û or u_λ.
 
+Errors are relative to ‖u*‖, of which the pair gives a lower bound, ‖û‖ − √(2g) or a
+like one. That differs from ‖û‖ only for answers that are as far off as they are large.
+
 Where contact alone holds a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
 its rigid motions R, or D(λ̂) = −∞; ‖·‖_K is a seminorm then, and of the rigid motion
 itself nothing is said.
@@ -28,12 +31,13 @@ itself nothing is said.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from harness.admissible import admissible, balanced
+from harness.exchange import equilibrium, exchanged, unconstrained_guess
 from harness.mechanics import Extended, Mechanics, Real
 from harness.solution import Solution
 
@@ -56,13 +60,14 @@ class Certificate:
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) ≥ 0
     claimed: float  #: bound (3) of the answer itself
+    least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, from the answer to the admissible point
     seminorm: bool  #: whether some body can move rigidly: nothing bounds that
 
     @property
     def gap(self) -> float:
-        """G = J(û) − D(λ̂)."""
-        return 0.5 * self.distance**2 + self.work
+        """The duality gap  g = J(û) − D(λ̂)."""
+        return 0.5 * self.distance * self.distance + self.work
 
     @property
     def pair(self) -> float:
@@ -71,12 +76,20 @@ class Certificate:
 
     @property
     def bound(self) -> float:
-        """Relative error in the energy norm of û, of u_λ and of the answer itself."""
-        return self._relative(max(self.pair, self.claimed))
+        """Largest relative error of û, of u_λ and of the answer, in the energy norm.
+
+        Infinite where the solution may be zero for all that is known.
+        """
+        return self._relative(self.error)
+
+    @property
+    def error(self) -> float:
+        """Largest error of û, of u_λ and of the answer itself."""
+        return max(self.pair, self.claimed)
 
     @property
     def parts(self) -> dict[str, float]:
-        """What the bound is made of, relative to ‖û‖; see `harness.judge.certified`."""
+        """What the bound is made of, as relative; see `harness.judge.certified`."""
         lengths = {
             "pair": self.pair,
             "distance": self.distance,
@@ -90,7 +103,7 @@ class Certificate:
     def _relative(self, length: float) -> float:
         if not length:
             return 0.0
-        return length / self.norm if self.norm else np.inf
+        return length / self.least if self.least > 0 else np.inf
 
 
 @np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
@@ -109,13 +122,22 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    best = min(_certificates(mechanics, s), key=lambda c: c.bound, default=None)
+    best = min(_certificates(mechanics, s), key=lambda c: c.error, default=None)
     if best is None:
         raise UncertifiableError(
             "no admissible pair near the answer: it penetrates beyond repair, or its "
             "multipliers balance no load"
         )
-    return best
+    if best.least >= best.error:
+        return best
+    return replace(best, least=max(best.least, _least_norm(mechanics)))
+
+
+def _least_norm(mechanics: Mechanics) -> float:
+    """Bound ‖u*‖ from below by a pair that owes nothing to an answer."""
+    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
+    found = proof(mechanics, u, u, lam, active)
+    return 0.0 if found is None else found.least
 
 
 def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate]:
@@ -150,35 +172,21 @@ def proof(
     work = float(lam @ (exact.c - exact.B @ feasible)) + _unbalanced(
         mechanics, lam, feasible - at_rest
     )
-    gap = 0.5 * (apart + left) ** 2 + work
-    rest = max(gap - 0.25 * max(apart - left, 0.0) ** 2, 0.0)
-    middle = mechanics.norm(claimed - (feasible + at_rest) / 2) + left / 2
+    total, nearest = apart + left, apart - left
+    middle = (feasible + at_rest) * Real(0.5)
+    gap = 0.5 * total * total + work
+    around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
+    norms = [mechanics.norm(v) for v in (feasible, at_rest, middle)]
+    pair = np.sqrt(2 * gap)
     found = Certificate(
-        u=feasible, multipliers=lam, equilibrium=at_rest, norm=mechanics.norm(feasible),
-        distance=apart + left, work=work, claimed=middle + float(np.sqrt(rest)),
+        u=feasible, multipliers=lam, equilibrium=at_rest, norm=norms[0],
+        distance=total, work=work,
+        claimed=mechanics.norm(claimed - middle) + float(around),
+        least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
         moved=mechanics.norm(claimed - feasible),
         seminorm=mechanics.inverse.kernel.shape[1] > 0,
     )  # fmt: skip
-    return found if np.isfinite(found.pair) else None
-
-
-def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
-    """Solve  K u = force  on the free components, zero on the others.
-
-    Returns u and the energy norm of what one refinement left undone, √(rᵀK⁺r) with the
-    residual r, in extended precision.
-    """
-    K, held, solve = mechanics.exact.K, mechanics.exact.held, mechanics.inverse
-    R = solve.kernel
-    u = np.zeros(force.size, dtype=Real)
-    for _ in range(3):
-        r = force - K @ u
-        r[held] = 0
-        r = r - R @ (R.T @ r)
-        step = solve(r.astype(np.float64))
-        left = float(np.sqrt(abs(r @ step)))
-        u = u + step
-    return u - step, left
+    return found if np.isfinite(found.error) else None
 
 
 def _unbalanced(mechanics: Mechanics, lam: Extended, apart: Extended) -> float:

@@ -85,7 +85,7 @@ class Record:
     complementarity: float | None = None
     gap: float | None = None
     energy_bound: float | None = None  #: certified relative error, energy norm
-    #: what it is made of, relative to ‖û‖ too; see `harness.judge.certified`
+    #: what it is made of, as relative; see `harness.judge.certified`
     certificate: Mapping[str, float] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI

@@ -204,11 +204,21 @@ def sentences(evidence: Evidence, solver: str) -> list[str]:
             worst = max((o.worst or 0.0 for o in tried), default=0.0)
             missed = [
                 f"verified on {_all(len(tried))} at tol "
-                f"{tolerance(tol)}; worst residual {power(worst)}"
+                f"{tolerance(tol)}; worst residual {power(worst)}{_certified(tried)}"
             ]
         missed += _unclaimed(tried) + _declined(at_tol)
         said.append(f"{name}: {'; '.join(missed)}.")
     return said
+
+
+def _certified(tried: Sequence[Outcome]) -> str:
+    """Say how accurate the answers are for sure, where all that can be is certified."""
+    bounds = [o.largest("energy_bound") for o in tried]
+    known = [bound for bound in bounds if bound is not None]
+    if not known:
+        return ""
+    of = "" if len(known) == len(tried) else f" of the {len(known)} that have a bound"
+    return f", certified energy error{of} at most {power(max(known))}"
 
 
 def _all(count: int) -> str:

@@ -75,7 +75,7 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
     return bool(
         np.hypot(of_u, of_equilibrium) <= ROUNDED * found.pair + 2 * slack
         and max(of_u, of_equilibrium, of_answer)
-        <= ROUNDED * max(found.pair, found.claimed) + slack
+        <= ROUNDED * min(found.error, found.bound * problem.exact.norm) + slack
         and (found.multipliers >= 0).all()
         and (problem.mechanics.exact.B @ found.u <= problem.mechanics.exact.c).all()
     )  # fmt: skip
@@ -215,3 +215,42 @@ def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
     case = build(parse(name, PROBLEMS), family, reference_solution)
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
     assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("size", [1e160, 1e300])
+def test_answers_beyond_all_numbers_have_no_certificate_or_an_honest_one(name, size):
+    problem = known(name)
+    s = problem.solution()
+    for far in (replace(s, x=size * (1 + s.x)), replace(s, z=size * (1 + s.z))):
+        try:
+            found = certify(problem.mechanics, far)
+        except UncertifiableError:
+            continue
+        assert found.bound >= 1
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_dwarfs_the_solution_is_not_measured_by_itself(name):
+    """An error of ten times the solution is not 90 % of the answer."""
+    problem = known(name)
+    s = problem.solution()
+    found = certify(problem.mechanics, replace(s, x=-10 * s.x, z=0 * s.z))
+    assert found.bound * problem.exact.norm >= problem.error(-10 * s.x.astype(Real))
+
+
+def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
+    mechanics = known(CASES[0]).mechanics
+    fresh = reference_point(mechanics, reference_solution, tmp_path)
+    (stored,) = tmp_path.iterdir()
+    wrong = ~fresh.active
+    for content in (
+        {"active": wrong}, {"active": wrong[:3]}, {"active": wrong * 1.0}, {"u": wrong},
+    ):  # fmt: skip
+        with stored.open("wb") as file:
+            np.savez(file, **content)
+        again = reference_point(mechanics, reference_solution, tmp_path)
+        assert (again.active == fresh.active).all()
+        assert again.bound < 1e-8
+    stored.write_bytes(b"PK")
+    assert reference_point(mechanics, reference_solution, tmp_path).bound < 1e-8
