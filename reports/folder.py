@@ -29,6 +29,7 @@ from reports.summary import dateline, summary
 from reports.sweeps import accuracy
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
+from reports.worth import worth
 
 FORMATS = ("html", "md", "tex", "csv")
 
@@ -82,6 +83,7 @@ def compose(evidence: Evidence) -> Page:
         replace(times(evidence), pictures=_accuracy(evidence)),
         precision(evidence),
         accuracy(evidence),
+        worth(evidence),
         iterations(evidence),
         convergence(evidence),
         errors(evidence),
