@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from harness import QP, Solution, cli
 from harness.environment import capture
 from harness.experiment import save_experiment
+from harness.kkt import VERIFIED_FACTOR
 from harness.plugin import Fields
 from harness.supervisor import ONE_THREAD
 from harness.workbench import Workbench
@@ -29,18 +31,36 @@ def main() -> None:
         solvers=SOLVERS,
         reference=reference_solution,
         report=_report,
+        compare=_compare,
         plot=_plot,
         vtu=_vtu,
         series=_series,
         paper=_paper,
+        validation=_validation,
     )
     sys.exit(cli.main(workbench, sys.argv[1:]))
 
 
-def _report(folder: Path, formats: Sequence[str]) -> list[Path]:
+def _report(
+    folder: Path, formats: Sequence[str], *, factor: float = VERIFIED_FACTOR
+) -> list[Path]:
     from reports import write_report  # late: workers must not carry matplotlib
 
-    return write_report(folder, formats)
+    return write_report(folder, formats, factor)
+
+
+def _compare(
+    before: Path, after: Path, formats: Sequence[str], *, factor: float
+) -> tuple[list[str], list[Path]]:
+    from reports import write_comparison
+
+    return write_comparison(before, after, formats, factor)
+
+
+def _validation(folder: Path, data: Mapping[str, Any]) -> list[Path]:
+    from reports.validation import write_validation
+
+    return write_validation(folder, data)
 
 
 def _plot(fields: Fields, path: Path) -> None:

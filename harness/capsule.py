@@ -62,7 +62,7 @@ def open_capsule(
         cases = steps_up_to(text, name, families) if in_sequence else (name,)
         spec = _with_options(record, spec, solvers)
     except InputError as e:
-        raise InputError(f"{record.run_id}: {e}{_needs(environment)}") from None
+        raise InputError(f"{record.run_id}: {e}{plugins_needed(environment)}") from None
     time_limit, memory_limit = limits(text)
     return Capsule(
         record=record,
@@ -151,7 +151,7 @@ def _with_options(
     return changed
 
 
-def _needs(environment: Mapping[str, Any]) -> str:
+def plugins_needed(environment: Mapping[str, Any]) -> str:
     """Remind of the plug-ins that a measurement was made with."""
     plugins = environment.get("plugins") or ()
     options = " ".join(f"--plugin {name}" for name in plugins)

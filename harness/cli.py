@@ -15,8 +15,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from harness import commands, examine, one, processes
+from harness import commands, examine, one, processes, validate
 from harness.errors import InputError
+from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
 
@@ -109,6 +110,9 @@ def _parser() -> argparse.ArgumentParser:
     _add_run_options(add("run", "measure a suite; continues a run", commands.run))
     _add_solve_options(add("solve", "one solver on one case, once", one.solve))
     _add_export_options(add("export", "one QP as a file", one.export))
+    _add_validate_options(
+        add("validate", "do all answers of a folder agree", validate.validate)
+    )
     _add_report_options(add("report", "report on a result folder", commands.report))
     _add_replay_options(add("replay", "one measurement again", commands.replay))
     _add_test_options(
@@ -147,14 +151,34 @@ def _add_solve_options(command: _Parser) -> None:
 
 def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE")
-    command.add_argument("file", metavar="FILE.npz|mat", type=Path)
+    command.add_argument("file", metavar="FILE.npz|mat|parquet", type=Path)
     _add_plugin(command)
+
+
+def _add_validate_options(command: _Parser) -> None:
+    command.add_argument("folder", metavar="DIR", type=Path)
+    _add_plugin(command)
+    _add_json(command)
 
 
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
+        "other",
+        metavar="DIR2",
+        type=Path,
+        nargs="?",
+        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+    )
+    command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
+    )
+    command.add_argument(
+        "--factor",
+        metavar="F",
+        type=float,
+        default=VERIFIED_FACTOR,
+        help="verified: every residual within F times the tolerance; default: 10",
     )
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from harness import show
 from harness.block import Opens, Unbuilt
 from harness.capsule import block_of, open_capsule
+from harness.checked import positive
 from harness.cluster import on_cluster
 from harness.describe import in_a_line, solvers_page
 from harness.doctor import as_json, examine, load_advice, render
@@ -136,13 +137,21 @@ def _engine(
 
 
 def report(workbench: Workbench, options: Namespace) -> int:
-    """Write the report on a result folder."""
+    """Write the report on a result folder, or what changed between two."""
     formats = options.format.split(",")
     for form in formats:
         if form not in FORMATS:
             raise unknown("format", form, FORMATS, where="--format")
-    for file in workbench.report(options.folder, formats):
-        print(file)
+    factor = positive("--factor", options.factor)
+    if options.other is None:
+        for file in workbench.report(options.folder, formats, factor=factor):
+            print(file)
+        return 0
+    said, written = workbench.compare(
+        options.folder, options.other, formats, factor=factor
+    )
+    pages = [file for file in written if file.suffix == ".html"]
+    print(*said, *(pages or written), sep="\n")
     return 0
 
 

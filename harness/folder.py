@@ -16,9 +16,10 @@ from harness.environment import VOLATILE
 from harness.errors import InputError, some
 from harness.suite import Suite
 
-#: all that a run writes, which `fresh` deletes and nothing else
-_FOLDERS = ("journal", "vectors", "cases", "environments", "report")
+#: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
+_FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
+_VERDICT = "validation.json"  #: of `mortarbench validate`
 
 
 def refuse_foreign(folder: Path) -> None:
@@ -34,7 +35,8 @@ def refuse_foreign(folder: Path) -> None:
         return
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
-    taken = [name for name in _FOLDERS + _FILES if os.path.lexists(folder / name)]
+    ours = (*_FOLDERS, *_FILES, _VERDICT)
+    taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
             f"{folder} holds {some(taken)} but is no result folder (no suite.toml with "
@@ -103,7 +105,7 @@ def claim(
     if fresh:
         for name in _FOLDERS:
             shutil.rmtree(out / name, ignore_errors=True)
-        for name in _FILES:
+        for name in (*_FILES, _VERDICT):
             (out / name).unlink(missing_ok=True)
     remedy = "choose another --out or use --fresh"
     suite_file, environment_file = out / "suite.toml", out / "environment.json"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 from harness import checked
 from harness.errors import InputError, some, unknown
@@ -14,10 +16,15 @@ from harness.plugin import Family
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 
 
-def cold_cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName, ...]:
-    """All cold cases in the order written; one that two blocks share is kept once."""
+def cold_cases(
+    blocks: object, families: Mapping[str, Family], folder: Path
+) -> tuple[CaseName, ...]:
+    """All cold cases in the order written; one that two blocks share is kept once.
+
+    folder : of the suite; a path that leads nowhere from here is sought there
+    """
     found: dict[str, CaseName] = {}
-    for block in _blocks(blocks, families):
+    for block in _blocks(blocks, families, folder):
         if block.along is None:
             for case in block.cases:
                 found.setdefault(canonical(case, block.family), case)
@@ -25,11 +32,14 @@ def cold_cases(blocks: object, families: Mapping[str, Family]) -> tuple[CaseName
 
 
 def sequences(
-    blocks: object, families: Mapping[str, Family]
+    blocks: object, families: Mapping[str, Family], folder: Path
 ) -> tuple[tuple[CaseName, ...], ...]:
-    """Group the cases that differ in the key of their sequence only, in its order."""
+    """Group the cases that differ in the key of their sequence only, in its order.
+
+    folder : as for `cold_cases`
+    """
     found: dict[str, tuple[CaseName, ...]] = {}
-    for block in _blocks(blocks, families):
+    for block in _blocks(blocks, families, folder):
         if block.along is None:
             continue
         steps: dict[str, list[CaseName]] = {}
@@ -47,7 +57,9 @@ class _Block:
     along: str | None  #: the key of a sequence
 
 
-def _blocks(blocks: object, families: Mapping[str, Family]) -> Iterator[_Block]:
+def _blocks(
+    blocks: object, families: Mapping[str, Family], folder: Path
+) -> Iterator[_Block]:
     """Read the tables under problems, one by one."""
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
@@ -63,11 +75,20 @@ def _blocks(blocks: object, families: Mapping[str, Family]) -> Iterator[_Block]:
             along = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
             cases = [
-                assemble(family, point, checked.text("forms", form))
+                assemble(family, _located(point, folder), checked.text("forms", form))
                 for point in _grid(params, table.get("zip", []))
                 for form in forms
             ]
             yield _Block(family=family, cases=cases, along=along)
+
+
+def _located(point: dict[str, object], folder: Path) -> dict[str, object]:
+    """Take a path that leads nowhere from here to be relative to the suite."""
+    match point:
+        case {"path": str(text)} if (beside := folder / text).is_file():
+            if not Path(text).is_file():
+                return {**point, "path": os.path.relpath(beside)}
+    return point
 
 
 def _along(key: object, params: object) -> str | None:

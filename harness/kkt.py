@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.qp import QP, Matrix, Vector
-from harness.record import Verdict
+from harness.record import Record, Verdict
 from harness.solution import Solution, Status
 
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance asked for
@@ -124,27 +124,55 @@ def _scales(
     return _Scales(X, S, max(_sup(energies), floor_E, key=_nan_first))
 
 
-def verdict(claimed: Status, residuals: Residuals, tol: float) -> Verdict:
+def allowed(tol: float, factor: float = VERIFIED_FACTOR) -> float:
+    """Return the largest residual that verification allows: factor·tol, at most 0.1."""
+    return min(factor * tol, 0.1)
+
+
+def verdict(
+    claimed: Status,
+    residuals: Residuals,
+    tol: float,
+    factor: float = VERIFIED_FACTOR,
+) -> Verdict:
     """Judge a point by its residuals; the claim decides only how a failure is called.
 
-    Verified: every residual ≤ 10·tol, whatever was claimed. A refuted claim of success
-    is `inaccurate` while at least half of the digits asked for are there (worst
-    residual ≤ √(10·tol)), and `wrong` beyond. A residual above 0.1 verifies nothing,
-    whatever the tolerance.
+    Verified: every residual ≤ factor·tol, whatever was claimed. A refuted claim of
+    success is `inaccurate` while at least half of the digits asked for are there (worst
+    residual ≤ √(factor·tol)), and `wrong` beyond. A residual above 0.1 verifies
+    nothing, whatever the tolerance.
     """
-    allowed = min(VERIFIED_FACTOR * tol, 0.1)
+    most = allowed(tol, factor)
     if claimed is Status.DECLINED:
         return Verdict.DECLINED
-    if residuals.worst <= allowed:
+    if residuals.worst <= most:
         return Verdict.VERIFIED
     match claimed:
         case Status.SOLVED:
-            close = residuals.worst <= max(allowed, np.sqrt(allowed))
+            close = residuals.worst <= max(most, np.sqrt(most))
             return Verdict.INACCURATE if close else Verdict.WRONG
         case Status.INFEASIBLE:
             return Verdict.INFEASIBLE_CLAIM
         case _:
             return Verdict(claimed.value)
+
+
+def rejudged(record: Record, factor: float) -> Verdict:
+    """Judge a stored measurement anew, at factor·tol instead of 10·tol.
+
+    Claim and residuals decide. Where they do not explain the stored status (a limit, a
+    crash, a sequence that had ended before), it was decided by something else, and
+    stands.
+    """
+    if record.claimed is None:
+        return record.status
+    stored = (getattr(record, name) for name in Residuals._fields)
+    residuals = Residuals(*(np.inf if r is None else r for r in stored))
+    tol = record.tol if record.accuracy is None else record.accuracy
+    claimed = Status(record.claimed)
+    if verdict(claimed, residuals, tol) is not record.status:
+        return record.status
+    return verdict(claimed, residuals, tol, factor)
 
 
 def _sup(v: Vector) -> float:

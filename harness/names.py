@@ -24,7 +24,11 @@ from harness.plugin import Family, Value
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _TOO_LARGE = 2**63  #: integers from here on fit into no array
 _SHOWN = 40  #: characters of a wrong value
-_CALLED = {int: "integer", float: "finite number", str: "text"}
+_CALLED = {
+    int: "an integer, such as 4",
+    float: "a finite number, such as 0.5",
+    str: "text",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,4 +176,4 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
         case int() | float() if kind is float and abs(value) <= sys.float_info.max:
             return float(value)
     shown = f"{value!r}" if len(f"{value!r}") <= _SHOWN else f"{value!r:.{_SHOWN}}…"
-    raise InputError(f"{where}={shown} is no {_CALLED[kind]}")
+    raise InputError(f"{where}={shown}; expected {_CALLED[kind]}")

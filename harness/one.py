@@ -17,6 +17,7 @@ from harness.history import History
 from harness.judge import blank, has_point, plain
 from harness.matfile import save_mat
 from harness.names import CaseName, canonical, parse
+from harness.parquetfile import save_parquet
 from harness.plugin import Case, Fields
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict, finite
@@ -97,7 +98,7 @@ def _draw(
 
 def export(workbench: Workbench, options: Namespace) -> int:
     """Write the QP of one case for other people's solvers."""
-    _check_writable(options.file, (".npz", ".mat"))
+    _check_writable(options.file, (".npz", ".mat", ".parquet"))
     workbench = workbench.with_files(options.plugin)
     name = parse(options.case, workbench.families)
     case = _built(workbench, name)
@@ -110,10 +111,13 @@ def export(workbench: Workbench, options: Namespace) -> int:
         "scale": case.scale,
         "constant": case.constant,
     }
-    if options.file.suffix == ".mat":
-        save_mat(options.file, case.qp, plain(meta), case.matrices)
-    else:
-        save_qp(options.file, case.qp, plain(meta))
+    match options.file.suffix:
+        case ".mat":
+            save_mat(options.file, case.qp, plain(meta), case.matrices)
+        case ".parquet":
+            save_parquet(options.file, case.qp, plain(meta))
+        case _:
+            save_qp(options.file, case.qp, plain(meta))
     print(options.file)
     return 0
 

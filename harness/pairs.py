@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -38,9 +39,15 @@ def paired_ratio(a: Mapping[int, float], b: Mapping[int, float]) -> Ratio | None
     if n < 2:
         return None
     logs = np.log([a[i] / b[i] for i in blocks])
-    half = t.ppf(0.5 + COVERAGE / 2, n - 1) * logs.std(ddof=1) / np.sqrt(n)
+    half = _student(n) * logs.std(ddof=1) / np.sqrt(n)
     low, value, high = np.exp(logs.mean() + np.array([-half, 0.0, half]))
     return Ratio(float(value), float(low), float(high), n)
+
+
+@cache
+def _student(n: int) -> float:
+    """Half-width of the interval from n values, in errors of their mean."""
+    return float(t.ppf(0.5 + COVERAGE / 2, n - 1))
 
 
 def widest(times: Mapping[str, Mapping[int, float]]) -> float | None:

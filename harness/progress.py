@@ -16,7 +16,9 @@ from rich.progress import (
 )
 from rich.progress import Progress as Bar
 
-from harness.record import Record
+from harness.record import Record, Verdict
+
+_REASON = 120  #: characters of why a solver declined
 
 
 class Progress(Protocol):
@@ -91,6 +93,8 @@ class _Lines:
             return
         seconds = record.total_seconds
         took = "" if seconds is None else f" in {seconds:.3g} s"
+        if record.status is Verdict.DECLINED and record.message:
+            took = f": {record.message[:_REASON]}"
         self.warn(
             f"{self._done}/{self._total} {record.solver} on {record.case}: "
             f"{record.status}{took}"

@@ -60,13 +60,7 @@ def save_qp(
         When the file cannot be written.
 
     """
-    P, maker = qp.P, {}
-    if recipe and isinstance(P, Recipe):
-        maker = {"maker": P.maker}
-        qp = replace(qp, P=csc_array(P.shape))
-    arrays, dense = _arrays(qp, structure=recipe)
-    if maker:
-        arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
+    arrays, dense, maker = _parts(qp, recipe=recipe)
     digest = digest_of(arrays)
     arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
     try:
@@ -76,9 +70,21 @@ def save_qp(
     return digest
 
 
-def qp_digest(qp: QP) -> str:
-    """Name the numbers of a QP by 16 hex digits; an operator P is multiplied out."""
-    return digest_of(_arrays(qp, structure=False)[0])
+def qp_digest(qp: QP, *, recipe: bool = False) -> str:
+    """Name the numbers of a QP by 16 hex digits, as `save_qp` does."""
+    return digest_of(_parts(qp, recipe=recipe)[0])
+
+
+def _parts(
+    qp: QP, *, recipe: bool
+) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
+    """Take a QP apart; also tell which matrices are dense, and who makes P."""
+    P = qp.P
+    if not (recipe and isinstance(P, Recipe)):
+        return *_arrays(qp, structure=recipe), {}
+    arrays, dense = _arrays(replace(qp, P=csc_array(P.shape)), structure=True)
+    arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
+    return arrays, dense, {"maker": P.maker}
 
 
 def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:

@@ -213,6 +213,12 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
     return f"{text} {unit}".rstrip()
 
 
+def legible(text: str) -> str:
+    """Make foreign text fit for a terminal: one line, and nothing that steers it."""
+    line = " ".join(text.split())
+    return "".join(c if c.isprintable() else "\ufffd" for c in line)
+
+
 def say(text: str) -> None:
     """Say something on stderr, beside the results."""
     with suppress(BrokenPipeError):  # nobody listens: no reason to stop

@@ -92,8 +92,8 @@ def load_suite(
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
             solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
-            cases=cold_cases(table["problems"], families),
-            sequences=sequences(table["problems"], families),
+            cases=cold_cases(table["problems"], families, path.parent),
+            sequences=sequences(table["problems"], families, path.parent),
             precision=_between("precision", table["precision"]),
             max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
             budget=checked.positive("budget", table["budget"]),
@@ -120,7 +120,7 @@ def steps_up_to(
         When no sequence has it.
 
     """
-    for steps in sequences(_toml(text).get("problems"), families):
+    for steps in sequences(_toml(text).get("problems"), families, Path()):
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")

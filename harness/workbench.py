@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from harness.block import Commands
 from harness.errors import InputError, unknown
@@ -14,7 +15,25 @@ from harness.plugin import Family, Fields, Reference, Solver
 from harness.registry import Plugin, SolverSpec, load_plugin, merged
 
 SUITES = Path(__file__).parents[1] / "suites"  #: of the checkout
-FORMATS = ("html", "md", "tex", "csv")  #: of a report
+FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
+
+
+class Reporter(Protocol):
+    """Writes the report on a result folder, and returns the files."""
+
+    def __call__(
+        self, folder: Path, formats: Sequence[str], *, factor: float = ...
+    ) -> list[Path]:
+        """Report; verdicts are those at factor·tol."""
+
+
+class Comparer(Protocol):
+    """Writes what changed between two folders; returns a verdict and the files."""
+
+    def __call__(
+        self, before: Path, after: Path, formats: Sequence[str], *, factor: float
+    ) -> tuple[list[str], list[Path]]:
+        """Compare; verdicts are those at factor·tol."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,12 +43,15 @@ class Workbench:
     families: Mapping[str, Family]
     solvers: Mapping[str, Solver]
     reference: Reference
-    report: Callable[[Path, Sequence[str]], list[Path]]  #: result folder, formats
+    report: Reporter
     plot: Callable[[Fields, Path], None]
     vtu: Callable[[Fields, Path], None]
     series: Callable[[Sequence[tuple[float, Fields]], Path], object]  #: of load steps
     paper: Callable[[Path, bool, Callable[[str], None]], list[Path]]
     """Measure and write the paper's figures: folder, quick?, progress."""
+    compare: Comparer = lambda *_, **__: ([], [])
+    #: writes the page of a cross-validation: result folder, `harness.agreement.as_data`
+    validation: Callable[[Path, Mapping[str, Any]], list[Path]] = lambda *_: []
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)

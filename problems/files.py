@@ -1,4 +1,4 @@
-"""QPs from files, ``file:PATH``: our exports, Maros-Mészáros .mat files, QPS texts."""
+"""QPs from files, ``file:PATH``: exports, Maros-Mészáros .mat files, QPS, Parquet."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from harness import QP, Case, InputError, Reference, Solution, Value
 from harness.checked import located
 from harness.errors import unknown
 from harness.matfile import matrix, read_mat, to_qp, vector
+from harness.parquetfile import load_parquet
 from harness.qpfile import load_qp
 from problems.content import check_digest, digest
 from problems.qps import parse_qps
@@ -27,7 +28,7 @@ Loaded = tuple[QP, float, float]
 
 @dataclass(frozen=True)
 class FromFile:
-    """Any QP from a file: npz, mat (ours or Maros-Mészáros) or QPS text.
+    """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
 
     The digest of the file's content is a parameter of the case, so that records say
     what was measured and a changed file is not taken for it.
@@ -88,6 +89,11 @@ def _mat(path: Path) -> Loaded:
         return one_sided(given), 1.0, given.r
 
 
+def _parquet(path: Path) -> Loaded:
+    qp, meta = load_parquet(path)
+    return _with_units(qp, meta)
+
+
 def _qps(path: Path) -> Loaded:
     try:
         text = path.read_text("utf-8")
@@ -99,7 +105,8 @@ def _qps(path: Path) -> Loaded:
 
 
 _LOADERS: dict[str, Callable[[Path], Loaded]] = {
-    ".npz": _npz, ".mat": _mat, ".qps": _qps, ".mps": _qps, ".sif": _qps
+    ".npz": _npz, ".mat": _mat, ".parquet": _parquet,
+    ".qps": _qps, ".mps": _qps, ".sif": _qps,
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from harness import InputError, Record, Verdict
 from harness.journal import read_journal
-from harness.kkt import VERIFIED_FACTOR
+from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
 from reports.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
@@ -37,6 +37,7 @@ class Outcome:
     """All repeats of one solver on one case at one tolerance."""
 
     records: tuple[Record, ...]  #: at least one
+    factor: float = VERIFIED_FACTOR  #: verified: every residual ≤ this times tol
 
     @property
     def first(self) -> Record:
@@ -62,7 +63,7 @@ class Outcome:
     def allowed(self) -> float:
         """The largest residual that verification allows, as `harness.kkt.verdict`."""
         at = self.first.tol if self.first.accuracy is None else self.first.accuracy
-        return min(VERIFIED_FACTOR * at, 0.1)
+        return allowed(at, self.factor)
 
     @property
     def solver(self) -> str:
@@ -158,6 +159,7 @@ class Evidence:
     records: tuple[Record, ...]  #: in the order of the report
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
+    factor: float = VERIFIED_FACTOR  #: at which the records are judged
 
     @property
     def name(self) -> str:
@@ -180,7 +182,11 @@ class Evidence:
             row = grouped.setdefault((r.case, r.tol), {})
             row.setdefault(r.solver, []).append(r)
         return {
-            key: {s: Outcome(records=tuple(row[s])) for s in self.solvers if s in row}
+            key: {
+                s: Outcome(records=tuple(row[s]), factor=self.factor)
+                for s in self.solvers
+                if s in row
+            }
             for key, row in grouped.items()
         }
 
@@ -190,8 +196,10 @@ class Evidence:
         return tuple(o for row in self.outcomes.values() for o in row.values())
 
 
-def read_evidence(directory: Path) -> Evidence:
+def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
+
+    factor : verdicts are those at factor·tol; at 10 they are those of the journal
 
     Raises
     ------
@@ -208,15 +216,22 @@ def read_evidence(directory: Path) -> Evidence:
     try:
         return Evidence(
             directory=directory,
-            records=arrange(map(_apart, records)),
+            records=arrange(_apart(_judged(r, factor)) for r in records),
             environment=json.loads(environment.read_text("utf-8"))
             if environment.exists()
             else {},
             suite=tomllib.loads(suite.read_text("utf-8")) if suite.exists() else {},
+            factor=factor,
         )
     except (json.JSONDecodeError, tomllib.TOMLDecodeError) as e:
         what = environment if isinstance(e, json.JSONDecodeError) else suite
         raise InputError(f"{what}: malformed: {e}") from None
+
+
+def _judged(record: Record, factor: float) -> Record:
+    if factor == VERIFIED_FACTOR:
+        return record
+    return record.but(status=rejudged(record, factor))
 
 
 def _apart(record: Record) -> Record:

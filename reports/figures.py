@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
 from reports.scaling import Ladder
 from reports.wording import clean, exponent
@@ -161,13 +161,18 @@ def log_log(axes: Axes, xlabel: str, ylabel: str) -> None:
     axes.grid(visible=True, which="major", color="#8a93a0", alpha=0.3, linewidth=0.4)
     axes.set_axisbelow(True)
     for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        decades = np.log10(high / low)
-        axis.set_minor_formatter(NullFormatter())
-        if decades < 1.8:
-            few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
-            axis.set_major_locator(few)
-            axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        log_ticks(axis)
+
+
+def log_ticks(axis: Axis) -> None:
+    """Label a logarithmic axis so that labels leave each other room."""
+    low, high = axis.get_view_interval()
+    decades = np.log10(high / low)
+    axis.set_minor_formatter(NullFormatter())
+    if decades < 1.8:
+        few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
+        axis.set_major_locator(few)
+        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
 
 
 def _slopes(axes: Axes) -> None:
@@ -200,10 +205,10 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
             _scatter(axes, [o for o in mine if o.verified], style=style)
             refuted = {**style, "markerfacecolor": "none"}
             _scatter(axes, [o for o in mine if not o.verified], style=refuted)
-        axes.axhline(VERIFIED_FACTOR, color=INK, linewidth=0.8)
+        axes.axhline(evidence.factor, color=INK, linewidth=0.8)
         axes.annotate(
             "verified below",
-            (0.995, VERIFIED_FACTOR),
+            (0.995, evidence.factor),
             xycoords=("axes fraction", "data"),
             xytext=(0, -3),
             textcoords="offset points",

@@ -9,36 +9,49 @@ from pathlib import Path
 
 from harness import Fields, InputError
 from harness.errors import unknown
+from harness.journal import read_journal
+from harness.kkt import VERIFIED_FACTOR
 from harness.store import load_fields
 from reports.cases import cases
+from reports.contests import contests
+from reports.conventions import standing
 from reports.courses import convergence
 from reports.data import Evidence, Outcome, read_evidence
-from reports.figures import accuracy_figure, save, scaling_figure
-from reports.latex import latex
+from reports.figures import accuracy_figure, scaling_figure
+from reports.growth import growth
 from reports.layout import Page, Picture, Section
-from reports.markdown import markdown
+from reports.means import means
 from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
-from reports.page import html
+from reports.parquet import write_records
+from reports.performance import profiles
 from reports.physics import agreement, physics
 from reports.precision import precision
+from reports.ranking import ranking
+from reports.ratios import ratios
 from reports.results import claims, errors, iterations
 from reports.scaling import Ladder, ladders, scaling
 from reports.setting import definitions, environment
 from reports.sheets import sheets
 from reports.summary import dateline, summary
 from reports.sweeps import accuracy
+from reports.tally import tally
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
 from reports.worth import worth
+from reports.writing import RENDERED, write_page, write_text
 
-FORMATS = ("html", "md", "tex", "csv")
+FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 
-def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
+def write_report(
+    directory: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
+) -> list[Path]:
     """Write DIR/report from DIR's journal; the same journal gives the same bytes.
 
     html: index.html. md: report.md. tex, csv: tables/. Figures (pdf, svg, png) go to
-    figures/ along with html, md or tex.
+    figures/ along with html, md or tex. parquet: records.parquet, the journal.
+
+    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
 
     Raises
     ------
@@ -49,39 +62,36 @@ def write_report(directory: Path, formats: Sequence[str]) -> list[Path]:
     for name in formats:
         if name not in FORMATS:
             raise unknown("report format", name, FORMATS)
-    evidence = read_evidence(directory)
+    evidence = read_evidence(directory, factor)
     target = directory / "report"
-    written: list[Path] = []
-    if {"html", "md", "tex"} & set(formats):
-        page = compose(evidence)
-        if "html" in formats:
-            written.append(_write(target / "index.html", html(page)))
-        if "md" in formats:
-            written.append(_write(target / "report.md", markdown(page)))
-        if "tex" in formats:
-            written += [
-                _write(target / "tables" / f"{s.name}.tex", latex(s.tables))
-                for s in page.sections
-                if s.tables
-            ]
-        written += _figures(page, target / "figures")
+    rendered = RENDERED & set(formats)
+    written = write_page(compose(evidence), target, formats) if rendered else []
     if "csv" in formats:
         written += [
-            _write(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
+            write_text(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
             for name, frame in sheets(evidence).items()
         ]
+    if "parquet" in formats:
+        records = read_journal(directory)
+        written.append(write_records(target / "records.parquet", records))
     return written
 
 
 def compose(evidence: Evidence) -> Page:
     """Put the report together, summary first."""
     found = ladders(evidence)
+    standings = [standing(c) for c in contests(evidence)]
     sections = (
         summary(evidence),
         cases(evidence),
+        tally(evidence),
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
+        ratios(evidence),
         precision(evidence),
+        means(standings),
+        ranking(standings),
+        profiles(standings, evidence.solvers),
         accuracy(evidence),
         worth(evidence),
         iterations(evidence),
@@ -89,10 +99,11 @@ def compose(evidence: Evidence) -> Page:
         errors(evidence),
         agreement(evidence),
         _grown(found, evidence),
+        growth(found),
         physics(evidence),
         deformed(evidence),
         environment(evidence),
-        definitions(),
+        definitions(evidence.factor),
     )
     return Page(
         title=clean(evidence.name),
@@ -171,19 +182,3 @@ def _caption(outcome: Outcome, fields: Fields) -> str:
         f"({limits[0] / 1e9:.3g} GPa), since stresses may be singular at clamped and "
         f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
     )
-
-
-def _figures(page: Page, folder: Path) -> list[Path]:
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = [p for section in page.sections for p in section.pictures]
-    return [
-        save(p.figure, folder / f"{p.name}.{ending}")
-        for p in pictures
-        for ending in ("pdf", "svg", "png")
-    ]
-
-
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
-    return path

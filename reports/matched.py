@@ -30,6 +30,7 @@ from scipy.optimize import isotonic_regression
 from harness import Verdict
 from reports.data import Outcome
 from reports.intervals import COVERAGE, Interval
+from reports.resampling import limits
 
 RESAMPLES = 400
 SMALLEST = 1e-17  #: errors below, zero among them, count as this
@@ -58,8 +59,8 @@ def counts(outcome: Outcome) -> bool:
 def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
     """Interpolate the time of answers that are proven to be within `error`.
 
-    The interval is a percentile bootstrap over the repeats of each tolerance, seeded by
-    the names of the measurements; a single repeat has none.
+    The interval is a bootstrap over the repeats of each tolerance, seeded by the names
+    of the measurements, as wide as few repeats demand; a single one has none.
 
     outcomes : of one solver on one case, at all tolerances
     """
@@ -79,9 +80,8 @@ def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
     value = time_at(error, errors, np.array([np.median(t) for t in samples]))
     drawn = [_medians(t, o) for t, o in zip(samples, points, strict=True)]
     times = [time_at(error, errors, t) for t in np.transpose(drawn)]
-    tail = (1 - COVERAGE) / 2
-    low, high = np.quantile(times, (tail, 1 - tail))
     fewest = min(t.size for t in samples)
+    low, high = limits(np.array(times), fewest) if fewest > 1 else (value, value)
     return Matched(
         "between", Interval(value, float(low), float(high), COVERAGE, fewest)
     )

@@ -16,6 +16,7 @@ from harness.suite import NULL
 from reports.data import Evidence, Outcome
 from reports.intervals import median_interval
 from reports.layout import Cell, Section, Table, case_cells, name_cell, source
+from reports.ratios import by_repeat
 from reports.wording import ABSENT, clean, plural, seconds
 
 _PARTS = 3  #: the canary's drift compares the last third with the first
@@ -55,14 +56,10 @@ def _ratios(evidence: Evidence) -> list[tuple[Outcome, Outcome, Ratio]]:
             twin = row.get(null.solver.replace(NULL, "", 1))
             if twin is None or not (null.verified and twin.verified):
                 continue
-            ratio = paired_ratio(_by_repeat(null), _by_repeat(twin))
+            ratio = paired_ratio(by_repeat(null), by_repeat(twin))
             if ratio is not None:
                 found.append((twin, null, ratio))
     return found
-
-
-def _by_repeat(outcome: Outcome) -> dict[int, float]:
-    return {r.repeat: r.total_seconds for r in outcome.records if r.total_seconds}
 
 
 def _held(found: Sequence[tuple[Outcome, Outcome, Ratio]]) -> str:

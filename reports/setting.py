@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence
 from reports.layout import Cell, Section, Table
 from reports.summary import flatten
@@ -29,7 +28,7 @@ def _settings(evidence: Evidence) -> Table:
     tols = sorted({r.tol for r in evidence.records}, reverse=True)
     limits = {
         "tolerances asked for": ", ".join(map(tolerance, tols)),
-        "verified if every residual ≤": f"{VERIFIED_FACTOR:g} × tolerance",
+        "verified if every residual ≤": f"{evidence.factor:g} × tolerance",
         "repeats, each prepared afresh": 1 + max(r.repeat for r in evidence.records),
         "time limit in s": suite.get("time_limit"),
         "memory limit in MiB": suite.get("memory_limit"),
@@ -73,9 +72,8 @@ def _plain(value: Any) -> str:
             return clean(str(value), 400)
 
 
-def definitions() -> Section:
+def definitions(factor: float) -> Section:
     """Define residuals, verdicts and energies, and say what the report cannot show."""
-    factor = f"{VERIFIED_FACTOR:g}"
     return Section(
         name="definitions",
         title="Definitions and limitations",
@@ -98,10 +96,10 @@ def definitions() -> Section:
             "the wrong sign; one on an absent bound has the wrong sign.",
             "Complementarity: the largest |multiplier × slack| / E.",
             "Gap: |primal objective − dual objective| / E.",
-            f"Verified: every residual ≤ {factor} × tol (and ≤ 0.1), whatever was "
+            f"Verified: every residual ≤ {factor:g} × tol (and ≤ 0.1), whatever was "
             "claimed. "
             "Inaccurate: success was claimed and refuted, but at least half of the "
-            f"digits are there (worst residual ≤ √({factor} × tol)). Wrong: refuted "
+            f"digits are there (worst residual ≤ √({factor:g} × tol)). Wrong: refuted "
             "beyond that.",
             "Failures keep the name of their cause: iteration, time or memory limit, "
             "crashed (the process died), failed (it raised or gave up), declined (it "

@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from harness import Record
+from reports.contest_sheets import contest_sheets
 from reports.data import RESIDUALS, Evidence, Outcome
 from reports.intervals import PowerLaw
 from reports.physics import spreads
@@ -21,7 +22,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
 
     measurements: one row per journal line. outcomes: the repeats of one solver on one
     case together, every time a median with its interval. energies, scaling: as in the
-    report.
+    report. contests, means: see `reports.contest_sheets`.
     """
     found = {
         "measurements": pd.DataFrame(map(_measurement, evidence.records)),
@@ -42,6 +43,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
             for solver in ladder.solvers
         ),
     }
+    found |= contest_sheets(evidence)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
 
 

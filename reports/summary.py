@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from harness import Verdict
+from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell
 from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
@@ -52,7 +53,9 @@ def summary(evidence: Evidence) -> Section:
             f"Warning: the measurements come from {len(digests)} different "
             f"environments ({listing(digests)}); their times are not comparable."
         )
-    notes = (_judged(evidence), _busy(evidence), _unequal(evidence))
+    notes = (
+        _judged(evidence), _at_factor(evidence), _busy(evidence), _unequal(evidence),
+    )  # fmt: skip
     prose += [text for text in notes if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
     return Section(
@@ -119,17 +122,34 @@ def _judged(evidence: Evidence) -> str:
     )
 
 
+def _at_factor(evidence: Evidence) -> str:
+    """Say so if verdicts are not those that the journal holds."""
+    if evidence.factor == VERIFIED_FACTOR:
+        return ""
+    return (
+        f"Verdicts here are those at {evidence.factor:g} × tolerance, recomputed from "
+        f"the stored claims and residuals; the journal holds those at "
+        f"{VERIFIED_FACTOR:g} × tolerance."
+    )
+
+
 def _busy(evidence: Evidence) -> str:
     """Warn of a machine that other programs used when the measurements began."""
-    now = evidence.environment.get("now")
-    load = now.get("load") if isinstance(now, Mapping) else None
-    if not isinstance(load, int | float) or load <= QUIET_LOAD:
+    load = busy_with(evidence)
+    if load is None:
         return ""
     return (
         f"Warning: the machine was not idle when the measurements began (load average "
         f"{load:.2f}; quiet is at most {QUIET_LOAD}): times may be too long, and their "
         "scatter is not that of the solvers alone."
     )
+
+
+def busy_with(evidence: Evidence) -> float | None:
+    """Load average when the measurements began; None if low, or not known."""
+    now = evidence.environment.get("now")
+    load = now.get("load") if isinstance(now, Mapping) else None
+    return load if isinstance(load, int | float) and load > QUIET_LOAD else None
 
 
 def _unequal(evidence: Evidence) -> str:

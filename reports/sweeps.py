@@ -11,7 +11,6 @@ from matplotlib.lines import Line2D
 
 from harness import Verdict
 from harness.discretisation import read_discretisation
-from harness.kkt import VERIFIED_FACTOR
 from reports.certified import certified_picture, certified_sweeps, matched_table
 from reports.data import Evidence, Outcome
 from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_log, look
@@ -137,10 +136,11 @@ def _figure(
         legend = LEGEND_LINE * -(-len(names) // LEGEND_COLUMNS)
         figure = Figure(figsize=(6.9, 0.3 + legend + 2.6 * lines))
         grid = figure.subplots(lines, columns, squeeze=False).ravel()
-        for axes, ((case, at), row) in zip(grid, swept.items(), strict=False):
+        for axes, ((case, _), row) in zip(grid, swept.items(), strict=False):
             for solver, outcomes in row.items():
                 _curve(axes, outcomes, look(solvers.index(solver)))
-            axes.axhline(VERIFIED_FACTOR * at, color=INK, linewidth=0.8)
+            allowed = next(iter(row.values()))[0].allowed
+            axes.axhline(allowed, color=INK, linewidth=0.8)
             axes.set_title(legible(case))
             log_log(axes, "median total time in s", "worst residual")
         for axes in grid[len(swept) :]:

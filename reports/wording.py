@@ -117,6 +117,11 @@ def exponent(fit: PowerLaw) -> str:
     return f"{p:.{d}f} [{low:.{d}f}, {high:.{d}f}]"
 
 
+def bracketed(value: float, low: float, high: float) -> str:
+    """Print a number and its interval, three digits each: "1.43 [0.890, 2.57]"."""
+    return f"{significant(value)} [{significant(low)}, {significant(high)}]"
+
+
 def span(least_most: tuple[int, int] | None) -> str:
     """Print a count, or its range where repeats differ."""
     if least_most is None:

@@ -24,6 +24,11 @@ SOLVERS = load_plugin(WELLS).solvers
 FAMILIES = load_plugin(WELLS).problems
 
 
+def report(folder, formats, *, factor=10.0):
+    name = "index" if factor == 10 else f"index-{factor:g}"
+    return [folder / f"{name}.{f}" for f in formats]
+
+
 def paper(out, quick, say):
     say("Figure 1")
     return [out / f"index-{quick}.html", out / "figure1.pdf"]
@@ -41,7 +46,7 @@ def workbench(tmp_path):
         families=FAMILIES,
         solvers=SOLVERS,
         reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
-        report=lambda folder, formats: [folder / f"index.{f}" for f in formats],
+        report=report,
         plot=lambda fields, path: path.write_bytes(b"picture"),
         vtu=lambda fields, path: path.write_bytes(b"grid"),
         series=lambda states, path: path.write_bytes(b"series"),
@@ -188,8 +193,42 @@ def test_an_exported_qp_is_the_emitted_one_and_says_whose_it_is(cli, tmp_path):
 def test_report_names_the_files_that_it_wrote(cli):
     code, out, _ = cli("report", "folder", "--format", "md,tex")
 
-    assert (code, out.splitlines()) == (0, ["folder/index.md", "folder/index.tex"])
-    assert len(cli("report", "folder")[1].splitlines()) == 4
+    assert (code, out.splitlines()) == (
+        0,
+        ["folder/index.md", "folder/index.tex"],
+    )
+    assert len(cli("report", "folder")[1].splitlines()) == 5
+
+
+def test_report_judges_at_the_factor_that_is_asked_for(cli):
+    assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
+        0, "folder/index-2.5.md\n", "",
+    )  # fmt: skip
+
+
+def compare(before, after, formats, *, factor):
+    said = [f"{before.name} and {after.name} at {factor:g}", "nothing changed"]
+    return said, [after / f"{form}.{form}" for form in formats]
+
+
+def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(workbench, capsys):
+    bench = replace(workbench, compare=compare)
+    argv = ["report", "one", "two", "--factor", "3"]
+
+    assert main(bench, [*argv, "--format", "csv,html,md"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "one and two at 3", "nothing changed", "two/html.html",
+    ]  # fmt: skip
+    assert main(bench, [*argv, "--format", "csv,md"]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == ["two/csv.csv", "two/md.md"]
+
+
+@pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
+def test_a_factor_that_is_not_positive_is_refused(cli, factor):
+    code, out, err = cli("report", "folder", "--factor", factor)
+
+    assert (code, out) == (2, "")
+    assert f"--factor = {float(factor)}; expected a positive number" in err
 
 
 def test_doctor_describes_the_machine(cli):
@@ -310,7 +349,7 @@ def test_a_terminal_of_few_characters_is_enough(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_named(workbench, capsys):
-    def report(folder, formats):
+    def report(folder, formats, **_):
         raise PermissionError(13, "Permission denied", str(folder / "index.html"))
 
     assert main(replace(workbench, report=report), ["report", "here"]) == 2
@@ -352,7 +391,7 @@ WRONG = {
     ),
     "bad value": (
         ("export", "well/n=two/primal", "a.npz"),
-        "well: n='two' is no integer",
+        "well: n='two'; expected an integer, such as 4",
     ),
     "value out of range": (
         ("solve", "well/n=0/primal", "--solver", "exact"),
@@ -395,7 +434,7 @@ WRONG = {
     ),
     "absurd integer": (
         ("solve", f"well/n={5000 * '9'}/primal", "--solver", "exact"),
-        "… is no integer",
+        "…; expected an integer, such as 4",
     ),
     "nowhere to write": (("run", "tiny", "--out", ""), "--out is empty; expected a"),
     "nothing to draw": (
@@ -403,8 +442,8 @@ WRONG = {
         "well/dual has no bodies to draw; leave out --plot",
     ),
     "export format": (
-        ("export", "well/dual", "a.parquet"),
-        "'.parquet'; expected .npz or .mat",
+        ("export", "well/dual", "a.csv"),
+        "'.csv'; expected .npz or .mat or .parquet",
     ),
     "report format": (
         ("report", "folder", "--format", "md,htm"),

@@ -1,6 +1,7 @@
 """Bodies from gmsh files: the paper's benchmark, described by a user, is the same."""
 
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -248,6 +249,22 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
         build(f"{text}/dual")
     with pytest.raises(InputError, match=r"dual-bounds does not exist"):
         build(f"{text}/steps=1/dual-bounds")
+
+
+def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
+    """Its top is on rollers; the factor of the singular K exists all the same."""
+    there = Path(__file__).parents[1] / "suites" / "crossval"
+    shutil.copy(there / "punch.msh", tmp_path)
+    toml = (there / "punch.toml").read_text()
+    rollers = toml.replace('boundary = "side"', 'boundary = "top"')
+    rollers = rollers.replace(
+        'fix = ["x", "y"]\n\n[[loads]]', 'fix = ["x"]\n\n[[loads]]'
+    )
+    (tmp_path / "punch.toml").write_text(rollers.replace("steps = 2", "steps = 1"))
+
+    build(f"bodies:{tmp_path}/punch.toml/dual")
+    with pytest.raises(InputError, match="dual-bounds does not exist"):
+        build(f"bodies:{tmp_path}/punch.toml/dual-bounds")
 
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])

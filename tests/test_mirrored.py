@@ -59,7 +59,7 @@ def results(bodies, primal, form):
     """Solve the emitted QP in `form`: u in m, and what it means in SI."""
     case = contact_case(
         bodies, primal, form, floating=lambda: floating(bodies),
-        clamped=lambda: clamped(bodies),
+        clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
     s = SMALBE().prepare(case.qp, 1e-12)()

@@ -183,14 +183,23 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + "params = 3", "problems[0]: params = 3; expected a table"),
         (MINIMAL + "params = { n = [] }", "problems[0]: params.n is empty; expected"),
         (MINIMAL + "params = { k = 1 }", "problems[0]: well: unknown key 'k'; "),
-        (MINIMAL + "params = { n = 2.0 }", "problems[0]: well: n=2.0 is no integer"),
-        (MINIMAL + "params = { n = '4' }", "problems[0]: well: n='4' is no integer"),
-        (MINIMAL + "params = { n = true }", "problems[0]: well: n=True is no integer"),
+        (
+            MINIMAL + "params = { n = 2.0 }",
+            "problems[0]: well: n=2.0; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = '4' }",
+            "problems[0]: well: n='4'; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = true }",
+            "problems[0]: well: n=True; expected an integer, such as 4",
+        ),
         (f"repeats = {5000 * '9'}\n" + MINIMAL, "an integer with too many digits"),
         (f"time_limit = {400 * '9'}\n" + MINIMAL, "time_limit = 999"),
         (
             MINIMAL + f"params = {{ n = {20 * '9'} }}",
-            "problems[0]: well: n=99999999999999999999 is no integer",
+            "problems[0]: well: n=99999999999999999999; expected an integer, such as 4",
         ),
         (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
@@ -374,15 +383,32 @@ def shipped(name):
     return load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
 
 
-def test_crossval_has_every_family_with_a_known_answer_and_many_solvers():
+def test_crossval_has_every_family_in_every_form_and_many_solvers():
     crossval = shipped("crossval")
 
+    assert crossval.tolerances == (1e-8,)
     assert len(crossval.cases) >= 40
     assert len(crossval.solvers) >= 10
-    known = {"beam-ring", "contact-patch", "hertz-plane", "hertz-cylinder", "obstacle"}
     assert {(c.family, c.form) for c in crossval.cases} == {
-        (name, form) for name in known for form in problems.PROBLEMS[name].forms
+        (name, form)
+        for name, family in problems.PROBLEMS.items()
+        for form in family.forms
     }
+
+
+def paths_of(suite):
+    return [c.params["path"] for c in suite.cases if "path" in c.params]
+
+
+def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    elsewhere = paths_of(shipped("crossval"))
+    monkeypatch.chdir(Path(__file__).parents[1] / "suites")
+    here = paths_of(shipped("crossval"))
+
+    assert set(here) == {"crossval/punch.toml", "crossval/hs76.qps"}
+    assert all(path.endswith(name) for path, name in zip(elsewhere, here, strict=True))
+    assert all((tmp_path / path).is_file() for path in elsewhere)
 
 
 def test_the_suite_of_the_load_path_is_one_sequence_per_form():

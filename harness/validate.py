@@ -1,0 +1,129 @@
+"""The command `validate`: do the answers that a result folder holds agree."""
+
+from __future__ import annotations
+
+import json
+import os
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from harness.agreement import as_data
+from harness.crossval import brief
+from harness.errors import InputError
+from harness.show import aligned, legible, say
+from harness.validation import validated
+from harness.workbench import Workbench
+
+_MOST = 12  #: entries of a list on the terminal; the page has them all
+
+
+def validate(workbench: Workbench, options: Namespace) -> int:
+    """Cross-validate a result folder; 1 if a claim is refuted or answers disagree."""
+    workbench = workbench.with_files(options.plugin)
+    found = validated(options.folder, workbench.families, workbench.reference, say)
+    data = as_data(found, options.folder.resolve().name)
+    if not (data["counts"]["answers"] or found.false_claims):
+        why = found.not_validated[0].text if found.not_validated else "none is a claim"
+        raise InputError(f"{options.folder}: no stored answer can be judged: {why}")
+    target = options.folder / "validation.json"
+    temporary = target.with_suffix(".tmp")
+    temporary.write_text(json.dumps(data, allow_nan=False) + "\n", "utf-8")
+    os.replace(temporary, target)
+    pages = workbench.validation(options.folder, data)
+    if options.json:
+        verdict = {k: v for k, v in data.items() if k != "problems"}
+        print(json.dumps(verdict, allow_nan=False))
+    else:
+        print(as_text(data))
+        for page in pages:
+            print(page)
+    return 0 if found.agreed else 1
+
+
+def as_text(data: Mapping[str, Any]) -> str:
+    """Lay out one screen: the verdict, a row per solver, what is wrong."""
+    parts = [legible(data["headline"]), _solvers(data["solvers"])]
+    entries = {
+        "Refuted claims": [_wrong(d) for d in data["disagreements"]],
+        "Apart without a culprit": [
+            f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
+            f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
+            for d in data["unresolved"]
+        ],
+        "Certificates contradicted (a fault of ours)": list(
+            map(_listed, data["contradictions"])
+        ),
+        "Not validated": _together(data["not_validated"]),
+        "Without a reference": [
+            f"{d['problem']}: {d['text']}" for d in data["without_reference"]
+        ],
+    }
+    parts += [_list(title, lines) for title, lines in entries.items() if lines]
+    small = [
+        f"{data['counts'][key]} {words}"
+        for key, words in (
+            ("remarks", "stand out from the other solvers, within what they claim"),
+            ("unanswered", "measurements ended without an answer"),
+        )
+        if data["counts"][key]
+    ]
+    return "\n\n".join([*parts, *(["; ".join(small) + "."] if small else [])])
+
+
+def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Lay out a row per solver; certified errors, relative, in the energy norm."""
+    head = [
+        "solver", "tol", "answers", "refuted", "unanswered", "error: median", "worst",
+        "penetration/h", "balance", "primal-dual", "from smalbe",
+    ]  # fmt: skip
+    keys = (
+        "error_median", "error_worst", "penetration", "balance", "primal_dual",
+        "from_ours",
+    )  # fmt: skip
+    lines = [
+        [
+            legible(row["solver"]),
+            f"{row['tol']:g}",
+            *(str(row[key]) for key in ("answers", "refuted", "unanswered")),
+            *(_e(row[key]) for key in keys),
+        ]
+        for row in rows
+    ]
+    return aligned([head, *lines], right=range(1, len(head)))
+
+
+def _wrong(d: Mapping[str, Any]) -> str:
+    error = f"; error {_e(d['error'])}" if d["error"] is not None else ""
+    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {_reasons(d)}{error}"
+
+
+def _reasons(d: Mapping[str, Any]) -> str:
+    return "; ".join(d["reasons"])
+
+
+def _listed(d: Mapping[str, Any]) -> str:
+    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {d['text']}"
+
+
+def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say once what concerns all answers to a case."""
+    counted: dict[tuple[str, str], int] = {}
+    for d in listed:
+        key = (d["case"], d["text"])
+        counted[key] = counted.get(key, 0) + 1
+    return [f"{case} ({n} answers): {text}" for (case, text), n in counted.items()]
+
+
+def _list(title: str, lines: Sequence[str]) -> str:
+    shown = [f"  {legible(line)}" for line in lines[:_MOST]]
+    more = len(lines) - _MOST
+    if more > 0:
+        shown.append(f"  … and {more} more, see the page")
+    return "\n".join([f"{title}:", *shown])
+
+
+def _e(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return brief(value) if value else "0"

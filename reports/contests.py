@@ -1,0 +1,193 @@
+"""Who solved which case in what time: what means, ranks and profiles are made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from harness import Record, Verdict
+from reports.data import Evidence
+from reports.wording import clean, listing, plural, tolerance
+
+CASES = 6  #: with fewer no two solvers can be told apart, see reports.resampling
+LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
+
+_KIND = ["sweep", "mode", "form", "at"]  # what cases of one contest share
+_CELL = [*_KIND, "case", "solver"]
+
+Times = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Contest:
+    """Cases of one form at one accuracy, and the solvers that were measured on each.
+
+    Null arms take no part. Times are medians of prepare + solve over the repeats; in a
+    sweep of tolerances, those of the cheapest answer that counts.
+    """
+
+    title: str
+    cases: tuple[str, ...]
+    solvers: tuple[str, ...]
+    times: Times  #: (cases, solvers) s; inf unless every repeat was verified
+    claimed: Times  #: the same; inf unless every repeat was claimed to be solved
+    stopped: Times  #: s after which time ran out; NaN where that was not the end
+    limit: float  #: s per measurement; the longest one, where the suite has no limit
+    notes: tuple[str, ...] = ()  #: what takes no part, and why
+
+    @cached_property
+    def solved(self) -> NDArray[np.bool_]:
+        """(cases, solvers) whether verified."""
+        return np.isfinite(self.times)
+
+    @cached_property
+    def shift(self) -> float:
+        """Shift of geometric means: the median over cases of the best time, ≤ 10 s."""
+        best = self.times.min(axis=1)
+        return float(min(LARGEST_SHIFT, np.median(best[np.isfinite(best)])))
+
+    @cached_property
+    def horizon(self) -> float:
+        """The limit, or the longest time of an answer if that is longer; s."""
+        both = np.concatenate([self.times, self.claimed])
+        return float(max(self.limit, both[np.isfinite(both)].max()))
+
+
+def contests(evidence: Evidence) -> tuple[Contest, ...]:
+    """Group what was measured by form and accuracy; groups of few cases are left out.
+
+    Forms are apart, since the primal and the dual QP of one problem are two problems to
+    a solver; so are cold solves and sequences. At least `CASES` cases, two solvers and
+    one verified answer make a contest.
+    """
+    rows = [_row(r) for r in evidence.records if not r.arm]
+    if not rows:
+        return ()
+    outcomes = _outcomes(pd.DataFrame(rows))
+    limit = _limit(evidence, outcomes)
+    found = []
+    for _, group in outcomes.groupby(_KIND, sort=False):
+        title = _title(*group[_KIND].iloc[0])
+        contest = _contest(title, group, evidence.solvers, limit)
+        if contest is not None:
+            found.append(contest)
+    return tuple(found)
+
+
+def _row(r: Record) -> dict[str, Any]:
+    """Take of a record what a contest asks for."""
+    return {
+        "sweep": r.accuracy is not None,
+        "mode": r.mode,
+        "form": r.form,
+        "at": r.tol if r.accuracy is None else r.accuracy,
+        "case": r.case,
+        "solver": r.solver,
+        "tol": r.tol,
+        "seconds": np.nan if r.total_seconds is None else r.total_seconds,
+        "verified": r.status is Verdict.VERIFIED,
+        "claimed": r.claimed == "solved",
+        "late": r.status is Verdict.TIME_LIMIT,
+        "declined": r.status is Verdict.DECLINED,
+    }
+
+
+def _outcomes(records: pd.DataFrame) -> pd.DataFrame:
+    """Put repeats together, then the tolerances of a sweep: one row per cell."""
+    records["late"] |= records["verified"]  # one repeat in time is no answer yet
+    repeats = records.groupby([*_CELL, "tol"], sort=False).agg(
+        seconds=("seconds", "median"),
+        verified=("verified", "all"),
+        claimed=("claimed", "all"),
+        late=("late", "all"),
+        declined=("declined", "all"),
+    )
+    time = repeats["seconds"]
+    timed = time > 0
+    late = repeats["late"] & ~repeats["verified"]
+    columns = pd.DataFrame(
+        {
+            "times": time.where(repeats["verified"] & timed, np.inf),
+            "claimed": time.where(repeats["claimed"] & timed, np.inf),
+            "stopped": time.fillna(np.inf).where(late, np.nan),  # inf: at the limit
+            "declined": repeats["declined"].astype(float),
+            "longest": time,
+        }
+    )
+    return (
+        columns.groupby(level=_CELL, sort=False)
+        .agg(
+            times=("times", "min"),
+            claimed=("claimed", "min"),
+            stopped=("stopped", "max"),
+            declined=("declined", "min"),
+            longest=("longest", "max"),
+        )
+        .reset_index()
+    )
+
+
+def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
+    """Take the suite's limit of time, or else the longest measurement."""
+    asked = evidence.suite.get("time_limit")
+    if isinstance(asked, int | float) and asked > 0:
+        return float(asked)
+    longest = float(outcomes["longest"].max())
+    return longest if longest > 0 else 1.0
+
+
+def _contest(
+    title: str, group: pd.DataFrame, order: tuple[str, ...], limit: float
+) -> Contest | None:
+    """Keep the solvers with at least half of the cases, and cases that they all had."""
+    cases = np.array(list(dict.fromkeys(group["case"])), dtype=object)
+    met = set(group["solver"])
+    solvers = np.array([s for s in order if s in met], dtype=object)
+
+    def matrix(name: str) -> Times:
+        wide = group.pivot(index="case", columns="solver", values=name)
+        return wide.reindex(index=cases, columns=solvers).to_numpy(dtype=float)
+
+    times, declined = matrix("times"), matrix("declined")
+    seen = ~np.isnan(times)
+    refused = (declined == 1).sum(axis=0) == seen.sum(axis=0)
+    rare = ~refused & (2 * seen.sum(axis=0) < len(cases))
+    taken = ~(refused | rare)
+    complete = seen[:, taken].all(axis=1)
+    part = np.ix_(complete, taken)
+    if complete.sum() < CASES or taken.sum() < 2 or not np.isfinite(times[part]).any():
+        return None
+    stopped = matrix("stopped")[part]
+    return Contest(
+        title=title,
+        cases=tuple(cases[complete]),
+        solvers=tuple(solvers[taken]),
+        times=times[part],
+        claimed=matrix("claimed")[part],
+        stopped=np.where(np.isinf(stopped), limit, stopped),
+        limit=limit,
+        notes=_left_out([*solvers[refused]], [*solvers[rare]], int((~complete).sum())),
+    )
+
+
+def _left_out(refused: list[str], rare: list[str], cases: int) -> tuple[str, ...]:
+    """Say what takes no part."""
+    notes = []
+    if refused:
+        notes.append(f"Declined all of them: {listing(refused, 6)}.")
+    if rare:
+        notes.append(f"Measured on fewer than half of them: {listing(rare, 6)}.")
+    if cases:
+        notes.append(f"Not measured by all, left out: {plural(cases, 'case')}.")
+    return tuple(notes)
+
+
+def _title(sweep: bool, mode: str, form: str, at: float) -> str:
+    parts = [clean(form, 24)] * bool(form) + [mode] * (mode != "cold")
+    accuracy = f"{'accuracy' if sweep else 'tol'} {tolerance(at)}"
+    return ", ".join([*parts, accuracy])

@@ -1,0 +1,50 @@
+"""Put a page into files."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from reports.figures import save
+from reports.latex import latex
+from reports.layout import Page
+from reports.markdown import markdown
+from reports.page import html
+
+RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
+
+
+def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]:
+    """Write a page in those of the formats that show one, and its figures.
+
+    html: index.html. md: report.md. tex: tables/SECTION.tex. Figures go to figures/.
+    """
+    written: list[Path] = []
+    if "html" in formats:
+        written.append(write_text(target / "index.html", html(page)))
+    if "md" in formats:
+        written.append(write_text(target / "report.md", markdown(page)))
+    if "tex" in formats:
+        written += [
+            write_text(target / "tables" / f"{s.name}.tex", latex(s.tables))
+            for s in page.sections
+            if s.tables
+        ]
+    return written + _figures(page, target / "figures")
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a file; folders are made, lines end alike everywhere."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path
+
+
+def _figures(page: Page, folder: Path) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = [p for section in page.sections for p in section.pictures]
+    return [
+        save(p.figure, folder / f"{p.name}.{ending}")
+        for p in pictures
+        for ending in ("pdf", "svg", "png")
+    ]

@@ -1,0 +1,441 @@
+"""What changed between two result folders: what was planted is found, no more."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from harness import InputError, Record, Verdict
+from harness.journal import Journal
+from reports import write_comparison
+from reports.changes import compare, mean_of, mean_ratio, relative_ratio, side
+from reports.comparison import compose
+from reports.comparison_words import verdict_lines
+from reports.data import Evidence, arrange
+from reports.markdown import markdown
+
+SOLVERS = ("one", "two", "three")
+
+
+def record(solver="one", case=0, repeat=0, **changes):
+    defaults = dict(
+        run_id=f"{solver}-{case}-{repeat}", case=f"box/n={case}/dual", family="box",
+        params={"n": case}, form="dual", sizes={"variables": 10 + case}, solver=solver,
+        options={"max_iter": 100}, tol=1e-6, repeat=repeat, block=repeat,
+        status=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.01,
+        primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11, objective=-0.5,
+        quantities={"energy": -1234.5}, qp="abc", environment="e1",
+        canary_seconds=1e-5, started="2026-11-21T10:00:00+00:00",
+    )  # fmt: skip
+    return Record(**(defaults | changes))
+
+
+def suite(seed, cases=12, repeats=5, scatter=0.05, **slower):
+    """Make a run of all solvers whose times scatter; those named take longer."""
+    rng = np.random.default_rng(seed)
+    return [
+        record(
+            solver, case, repeat,
+            total_seconds=0.001 * (1 + case) * slower.get(solver, 1.0)
+            * float(np.exp(rng.normal(0, scatter))),
+            canary_seconds=1e-5 * float(np.exp(rng.normal(0, 0.01))),
+        )
+        for solver in SOLVERS
+        for case in range(cases)
+        for repeat in range(repeats)
+    ]  # fmt: skip
+
+
+@pytest.fixture
+def changed(tmp_path):
+    """Compare two lists of records."""
+
+    def make(before, after, **more):
+        one, two = (
+            Evidence(directory=tmp_path / n, records=arrange(r), **more)
+            for n, r in (("a", before), ("b", after))
+        )
+        return compare(one, two)
+
+    return make
+
+
+def only(c):
+    (pair,) = c.pairs
+    return pair
+
+
+# times
+
+
+def test_a_planted_regression_is_found_in_the_solver_that_has_it(changed):
+    c = changed(suite(1), suite(2, two=1.2))
+    means = {s: mean_ratio(c.of(s)) for s in SOLVERS}
+
+    assert [side(means[s]) for s in SOLVERS] == [0, 1, 0]
+    assert means["two"].value == pytest.approx(1.2, rel=0.03)
+    assert means["two"].low < 1.2 < means["two"].high
+    slower = [p for p in c.pairs if p.change > 0]
+    assert sum(p.after.solver == "two" for p in slower) >= 11
+    assert sum(p.after.solver != "two" for p in slower) <= 2
+    assert any(re.search("two on box/n=.* times as long", n) for n in verdict_lines(c))
+    relative = {s: relative_ratio(c, s) for s in SOLVERS}
+    assert relative["two"].low < 1.2 < relative["two"].high
+    assert relative["one"].value == pytest.approx(1.2**-0.5, rel=0.05)  # of two others
+
+
+def test_the_other_way_round_it_is_an_improvement(changed):
+    one, two = suite(1), suite(2, two=1.2)
+    there, back = changed(one, two), changed(two, one)
+
+    assert [p.change for p in there.pairs] == [-p.change for p in back.pairs]
+    for a, b in zip(there.pairs, back.pairs, strict=True):
+        assert a.ratio.value * b.ratio.value == pytest.approx(1)
+
+
+@pytest.mark.parametrize("repeats", [3, 5, 10])
+def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats):
+    """600 cells, 5 % nominal: 18 to 42 are within three standard deviations."""
+    named = cells = 0
+    for seed in range(0, 20, 2):
+        first = suite(seed, cases=20, repeats=repeats)
+        c = changed(first, suite(seed + 1, cases=20, repeats=repeats))
+        named += sum(p.change != 0 for p in c.pairs)
+        cells += len(c.pairs)
+
+    assert cells == 600
+    assert 14 <= named <= 46
+
+
+@pytest.mark.parametrize("cells", [4, 8, 30])
+def test_the_interval_over_cells_covers_as_it_says(cells):
+    """400 draws: 20 misses expected, 7 to 33 within three standard deviations."""
+    rng = np.random.default_rng(cells)
+    missed = sum(
+        side(mean_of(rng.normal(0, 0.1, cells), [f"{i}-{n}" for n in range(cells)]))
+        != 0
+        for i in range(400)
+    )
+    assert 7 <= missed <= 40
+
+
+def test_one_repeat_in_each_folder_names_no_change_of_a_cell(changed):
+    c = changed(suite(1, repeats=1), suite(2, repeats=1, two=1.2))
+
+    assert all(p.ratio is None and p.change == 0 for p in c.pairs)
+    assert side(mean_ratio(c.of("two"))) == 1  # over twelve cells it can be told
+
+
+def test_only_repeats_that_both_have_are_paired(changed):
+    before = [record(repeat=i) for i in range(3)]
+    after = [record(repeat=i, total_seconds=0.02) for i in range(1, 5)]
+    pair = only(changed(before, after))
+
+    assert pair.ratio.pairs == 2
+    assert pair.ratio.value == pytest.approx(2)
+
+
+def test_an_unverified_answer_has_no_time_to_compare(changed):
+    before = [record(repeat=i) for i in range(3)]
+    after = [r.but(status=Verdict.WRONG, total_seconds=1e-6) for r in before]
+    c = changed(before, after)
+
+    assert only(c).ratio is None
+    assert mean_ratio(c.pairs) is None
+    assert "✗ wrong" in markdown(compose(c))
+
+
+def test_sequences_are_compared_with_sequences(tmp_path):
+    def folder(name, seconds):
+        out = tmp_path / name
+        with Journal(out, "j") as journal:
+            for mode, factor in (("cold", 1), ("sequence", seconds)):
+                for i in range(3):
+                    journal.append(
+                        record(repeat=i, run_id=f"{mode}{i}", mode=mode,
+                               total_seconds=0.01 * factor)
+                    )  # fmt: skip
+        return out
+
+    folder("a", 1.0)
+    folder("b", 3.0)
+    write_comparison(tmp_path / "a", tmp_path / "b", ["csv"])
+    frame = pd.read_csv(tmp_path / "b/report/against-a/tables/changes.csv")
+
+    assert dict(zip(frame.solver, frame.ratio.round(6), strict=True)) == {
+        "one": 1.0, "one (sequence)": 3.0,
+    }  # fmt: skip
+
+
+def test_a_solver_is_not_set_against_its_own_null_arm(changed):
+    def run(seed, **slower):
+        first = [r for r in suite(seed, **slower) if r.solver != "three"]
+        twin = [
+            replace(r, solver="one (A/A)", run_id=f"null-{r.run_id}", arm="null")
+            for r in first
+            if r.solver == "one"
+        ]
+        return first + twin
+
+    c = changed(run(1), run(2, one=1.5))
+    assert relative_ratio(c, "one").value == pytest.approx(1.5, rel=0.05)
+
+
+# conditions
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Write two result folders with environments; returns their paths."""
+
+    def make(one, two, before=None, after=None):
+        for name, environment, records in (("a", one, before), ("b", two, after)):
+            out = tmp_path / name
+            digest = environment["digest"]
+            with Journal(out, "j") as journal:
+                for r in records or suite(1, cases=4, repeats=3):
+                    journal.append(r.but(environment=digest))
+            (out / "environment.json").write_text(json.dumps(environment))
+        return tmp_path / "a", tmp_path / "b"
+
+    return make
+
+
+HERE = {
+    "digest": "e1", "machine": {"cpu": "fast"}, "threads": {}, "cholmod": {},
+    "versions": {"osqp": "1.0"}, "source": {"commit": "aaa"}, "now": {"load": 0.1},
+}  # fmt: skip
+
+
+def test_another_version_on_the_same_machine_is_what_one_compares(folders):
+    other = HERE | {"digest": "e2", "versions": {"osqp": "1.1"}}
+    after = suite(2, cases=4, repeats=3, two=1.5)
+    said, _ = write_comparison(*folders(HERE, other, after=after), ["csv"])
+
+    assert said[0] == (
+        "The machine is the same; what differs is versions.osqp. A change below may be "
+        "due to that, or to the run."
+    )
+    assert any("two: 1.5" in line and "slower" in line for line in said)
+
+
+def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folders):
+    other = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
+    after = suite(2, cases=4, repeats=3, one=9.0, two=9.0, three=9.0)
+    a, b = folders(HERE, other, after=after)
+    said, _ = write_comparison(a, b, ["md", "csv"])
+
+    assert said[0].startswith("Environments differ (machine.cpu)")
+    assert "Times of 0 of 12 cells are compared" in said[0]
+    assert said[1].startswith("Times: no cell")
+    assert not any("slower" in line for line in said)
+    frame = pd.read_csv(b / "report/against-a/tables/changes.csv")
+    assert frame.ratio.isna().all()
+    assert "~~" in (b / "report/against-a/report.md").read_text()  # struck out
+
+
+def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
+    busy = HERE | {"now": {"load": 3.0}}
+    a, b = folders(HERE, busy)
+    said, _ = write_comparison(a, b, ["md"])
+
+    _, dateline, *_ = (b / "report/against-a/report.md").read_text().split("\n\n")
+    assert dateline == "before: 2026-11-21, after: 2026-11-21 · fast"
+
+    assert said[0] == "The environments are the same: machine, versions and code."
+
+
+def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
+    before = [record(repeat=i) for i in range(3)]
+    other = changed(before, [r.but(environment="e2") for r in before])
+
+    assert only(changed(before, before)).ratio is not None
+    assert only(other).ratio is None
+    assert verdict_lines(other)[0].startswith("Environments differ")
+
+
+def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
+    """Half of the cells moved to a slower node: they alone have no ratio."""
+    after = [
+        r.but(environment="n2", total_seconds=9.0) if r.params["n"] >= 2 else r
+        for r in suite(2, cases=4, repeats=3)
+    ]
+    a, b = folders(HERE, HERE)
+    (b / "journal/j.jsonl").unlink()
+    with Journal(b, "j") as journal:
+        for r in after:
+            journal.append(r)
+    (b / "environments").mkdir()
+    node = HERE | {"digest": "n2", "machine": {"cpu": "slow"}}
+    (b / "environments/n2.json").write_text(json.dumps(node))
+    said, _ = write_comparison(a, b, ["csv"])
+    frame = pd.read_csv(b / "report/against-a/tables/changes.csv")
+
+    assert "Times of 6 of 12 cells are compared" in said[0]
+    assert set(frame.case[frame.ratio.isna()]) == {"box/n=2/dual", "box/n=3/dual"}
+
+
+def test_options_that_differ_under_one_label_are_listed(changed):
+    before = [record(repeat=i) for i in range(3)]
+    after = [r.but(options={"max_iter": 200}) for r in before]
+    page = markdown(compose(changed(before, after)))
+
+    assert re.search(r"\| one\.max\\_iter \| 100 \| 200 \|", page)
+
+
+def test_another_qp_under_the_same_name_is_flagged(changed):
+    before = [record(repeat=i) for i in range(3)]
+    bits = changed(before, [r.but(qp="xyz") for r in before])
+    sizes = changed(before, [r.but(qp="xyz", sizes={"variables": 99}) for r in before])
+
+    for c in (bits, sizes):
+        assert "1 cell had another QP" in markdown(compose(c))
+    assert only(bits).ratio is not None
+    assert only(sizes).ratio is None
+    assert "another QP" not in markdown(compose(changed(before, before)))
+    old = [r.but(qp=None) for r in before]  # a journal from before there were digests
+    assert only(changed(old, before)).same_qp
+
+
+# verdicts, iterations, answers
+
+
+def test_lost_verdicts_are_worse_and_named_first(changed):
+    before = suite(1, cases=2, repeats=3)
+    after = [
+        r.but(status=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
+        for r in suite(2, cases=2, repeats=3, three=3.0)
+    ]
+    c = changed(before, after)
+    named = [line for line in verdict_lines(c) if line.startswith("  two on")]
+
+    assert named == ["  two on box/n=1/dual at 1e-6: verified before, inaccurate after"]
+    assert [p.turn for p in c.pairs if p.turn] == [1]
+    assert [p.turn for p in changed(after, before).pairs if p.turn] == [-1]
+    points = compose(c).sections[0].points
+    assert points[0].startswith("two on")
+    assert "three on" in points[1]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "changed_"),
+    [((7, 7, 7), (7, 7, 7), False), ((7, 7, 7), (8, 8, 8), True),
+     ((7, 9, 8), (9, 11, 10), False), ((7, 9, 8), (10, 11, 10), True),
+     ((7, 7, 7), (None, None, None), False)],
+)  # fmt: skip
+def test_iterations_changed_if_no_repeat_agrees(changed, before, after, changed_):
+    one, two = (
+        [record(repeat=i, iterations=n) for i, n in enumerate(counts)]
+        for counts in (before, after)
+    )
+    assert only(changed(one, two)).other_iterations is changed_
+
+
+@pytest.mark.parametrize(
+    ("energy", "status", "other"),
+    [
+        (-1234.5 * (1 + 1e-6), Verdict.VERIFIED, False),  # within 4 · 10 · tol
+        (-1234.5 * (1 + 1e-4), Verdict.VERIFIED, True),
+        (-1000.0, Verdict.WRONG, False),  # no answer at all
+    ],
+)
+def test_verified_answers_that_differ_are_named(changed, energy, status, other):
+    after = record(quantities={"energy": energy}, status=status)
+    c = changed([record()], [after])
+
+    assert only(c).other_answer is other
+    assert any("another answer" in line for line in verdict_lines(c)) is other
+
+
+def test_objectives_stand_in_where_there_is_no_energy(changed):
+    one = record(quantities={}, objective=-0.5)
+    assert only(changed([one], [one.but(objective=-0.6)])).other_answer
+    zero = one.but(objective=1e-25)
+    assert not only(changed([zero], [zero.but(objective=3e-25)])).other_answer
+
+
+def test_cells_in_one_folder_only_are_listed_not_compared(changed):
+    c = changed([record(), record("gone")], [record(), record("new"), record(case=1)])
+    page = markdown(compose(c))
+
+    assert [p.after.solver for p in c.pairs] == ["one"]
+    assert [o.solver for o in c.only_before] == ["gone"]
+    assert sorted((o.solver, o.case) for o in c.only_after) == [
+        ("new", "box/n=0/dual"), ("one", "box/n=1/dual"),
+    ]  # fmt: skip
+    assert "1 cell before, 2 after" in page
+
+
+# files
+
+
+def test_all_formats_are_written_beside_the_later_report_the_same_each_time(folders):
+    a, b = folders(HERE, HERE)
+    formats = ["html", "md", "tex", "csv", "parquet"]
+    _, written = write_comparison(a, b, formats)
+    bytes_ = {path: path.read_bytes() for path in written}
+    _, again = write_comparison(a, b, formats)
+
+    assert written[0] == b / "report/against-a/index.html"
+    assert {p.suffix for p in written} == {
+        ".html", ".md", ".tex", ".csv", ".parquet", ".pdf", ".svg", ".png",
+    }  # fmt: skip
+    assert {path: path.read_bytes() for path in again} == bytes_
+    assert not (a / "report").exists()
+    target = b / "report/against-a/tables"
+    one = pd.read_csv(target / "changes.csv")
+    two = pd.read_parquet(target / "changes.parquet")
+    assert len(one) == len(two) == 12
+    np.testing.assert_allclose(one.ratio, two.ratio, rtol=1e-12)
+
+
+def test_verdicts_are_those_at_the_factor(folders):
+    before = [record(repeat=i, dual=5e-7) for i in range(3)]
+    after = [record(repeat=i, dual=5e-6) for i in range(3)]
+    a, b = folders(HERE, HERE, before, after)
+
+    assert "Verdicts: 0 worse" in " ".join(write_comparison(a, b, ["csv"])[0])
+    for one, two, found in ((a, b, "1 worse, 0"), (b, a, "0 worse, 1"), (b, b, "0 w")):
+        said, _ = write_comparison(one, two, ["csv"], 1.0)
+        assert f"Verdicts at 1 × tolerance: {found}" in " ".join(said)
+
+
+def test_a_folder_that_is_none_is_refused(folders, tmp_path):
+    a, _ = folders(HERE, HERE)
+    with pytest.raises(InputError, match="no such folder"):
+        write_comparison(a, tmp_path / "none", ["csv"])
+    with pytest.raises(InputError, match="no such folder"):
+        write_comparison(tmp_path / "none", a, ["csv"])
+
+
+def test_a_canary_that_moved_says_that_the_machine_did(changed):
+    before = suite(1)
+    after = [
+        replace(r, canary_seconds=1.1 * r.canary_seconds)
+        for r in suite(2, one=1.1, two=1.1, three=1.1)
+    ]
+    c = changed(before, after)
+    (table,) = compose(c).sections[0].tables
+    rows = {row[0].text: row for row in table.rows}
+
+    assert rows["canary"][2].value == pytest.approx(1.1, rel=0.01)
+    assert rows["canary"][3].text == rows["all"][3].text == "slower"
+    assert any(
+        line.startswith("All solvers changed alike") for line in verdict_lines(c)
+    )
+    assert all(side(relative_ratio(c, s)) == 0 for s in SOLVERS)
+
+
+def test_a_change_of_one_solver_is_not_blamed_on_the_machine(changed):
+    c = changed(suite(1), suite(2, two=1.5))
+    assert not any("changed alike" in line for line in verdict_lines(c))
+
+
+def test_a_busy_machine_is_warned_of(folders):
+    busy = HERE | {"now": {"load": 3.0}}
+    said, _ = write_comparison(*folders(HERE, busy), ["csv"])
+    assert said[1].startswith("Warning: the machine was not idle")
+    assert "3.00 after" in said[1]

@@ -1,0 +1,176 @@
+"""Verdicts at another factor follow from what the journal stores."""
+
+import json
+from dataclasses import asdict
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness import Record, Status, Verdict
+from harness.cli import main
+from harness.journal import Journal, read_journal
+from harness.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
+from harness.workbench import Workbench
+from problems import PROBLEMS
+from reports.data import read_evidence
+from reports.folder import compose, write_report
+from solvers import SOLVERS
+from solvers.reference import reference_solution
+
+sizes = st.one_of(
+    st.floats(0, 1, allow_nan=False),
+    st.floats(-12, 0).map(lambda e: 10.0**e),
+    st.sampled_from([np.inf, np.nan]),
+)
+residuals = st.builds(Residuals, sizes, sizes, sizes, sizes)
+tolerances = st.floats(-10, 0).map(lambda e: 10.0**e)
+
+
+def record(claimed, found, tol, **changes):
+    """Make a record as a journal gives it back: NaN and inf are null there."""
+    status = verdict(claimed, found, changes.get("accuracy") or tol)
+    made = Record(
+        run_id="r", case="box/dual", family="box", params={}, form="dual", sizes={},
+        solver="a", options={}, tol=tol, repeat=0, block=0, status=status,
+        claimed=claimed.value, **found._asdict(),
+    )  # fmt: skip
+    return Record.from_json(made.but(**changes).to_json())
+
+
+@given(st.sampled_from(list(Status)), residuals, tolerances)
+def test_at_ten_every_stored_status_comes_back(claimed, found, tol):
+    stored = record(claimed, found, tol)
+
+    assert rejudged(stored, VERIFIED_FACTOR) is stored.status
+
+
+@given(
+    st.sampled_from(list(Status)), residuals, tolerances,
+    st.lists(st.floats(-3, 4).map(lambda e: 10.0**e), min_size=2, max_size=5),
+)  # fmt: skip
+def test_a_smaller_factor_never_verifies_more(claimed, found, tol, factors):
+    stored = record(claimed, found, tol)
+    verified = [rejudged(stored, f) is Verdict.VERIFIED for f in sorted(factors)]
+
+    assert all(small <= large for small, large in pairwise(verified))
+
+
+@pytest.mark.parametrize(
+    ("worst", "factor", "expected"),
+    [
+        (5e-6, 10, Verdict.VERIFIED),
+        (5e-6, 1, Verdict.INACCURATE),
+        (5e-6, 1e-7, Verdict.WRONG),  # beyond √(1e-13) = 3e-7
+        (5e-4, 10, Verdict.INACCURATE),
+        (5e-4, 1000, Verdict.VERIFIED),
+        (0.5, 1e9, Verdict.WRONG),  # above 0.1 nothing is verified
+    ],
+)
+def test_the_verdict_is_that_of_the_residuals_at_the_factor(worst, factor, expected):
+    stored = record(Status.SOLVED, Residuals(1e-9, worst, 0.0, 1e-9), 1e-6)
+
+    assert rejudged(stored, factor) is expected
+
+
+def test_a_sweep_is_judged_at_its_accuracy_not_at_what_was_asked_for():
+    stored = record(Status.SOLVED, Residuals(0, 5e-6, 0, 0), 1e-2, accuracy=1e-6)
+
+    assert rejudged(stored, 10) is Verdict.VERIFIED
+    assert rejudged(stored, 1) is Verdict.INACCURATE
+
+
+@pytest.mark.parametrize("factor", [0.01, 10, 1e6])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"status": Verdict.MEMORY_LIMIT},  # an answer, but beyond the limit
+        {"status": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
+        {"status": Verdict.TIME_LIMIT, "claimed": None},
+    ],
+)
+def test_what_no_residual_decided_stands(changes, factor):
+    stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).but(**changes)
+
+    assert rejudged(stored, factor) is changes["status"]
+
+
+def test_an_answer_without_a_claim_of_success_keeps_the_name_of_its_failure():
+    stored = record(Status.ITERATION_LIMIT, Residuals(0, 5e-6, 0, 0), 1e-6)
+
+    assert stored.status is Verdict.VERIFIED
+    assert rejudged(stored, 1) is Verdict.ITERATION_LIMIT
+
+
+def judge(folder, factor):
+    evidence = read_evidence(folder, factor)
+    return {(o.case, o.solver): o.verdict for o in evidence.flat}, evidence
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A result folder with one answer of a worst residual of 4·tol."""
+    stored = record(Status.SOLVED, Residuals(1e-9, 4e-6, 0, 1e-9), 1e-6)
+    with Journal(tmp_path, "test") as journal:
+        journal.append(stored)
+    return tmp_path
+
+
+def test_the_report_judges_at_the_factor_and_says_so(folder):
+    page = compose(judge(folder, 1.0)[1])
+    tables = [asdict(t) for s in page.sections for t in s.tables]
+    text = json.dumps(tables, ensure_ascii=False)
+
+    assert "1 × tolerance" in text
+    assert "dual 4.0e-6 > 1.0e-6" in text
+    assert "recomputed" in " ".join(page.sections[0].prose)
+    assert "≤ 1 × tol" in " ".join(page.sections[-1].points)
+
+
+def test_a_report_as_stored_says_nothing_of_recomputing(folder):
+    verdicts, evidence = judge(folder, VERIFIED_FACTOR)
+
+    assert set(verdicts.values()) == {Verdict.VERIFIED}
+    assert "recomputed" not in " ".join(compose(evidence).sections[0].prose)
+
+
+def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
+    import pandas as pd
+
+    write_report(folder, ["parquet"], 0.1)
+
+    assert pd.read_parquet(folder / "report/records.parquet").status[0] == "verified"
+    assert read_journal(folder)[0].status is Verdict.VERIFIED
+
+
+def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
+    """Of a real run, verified and refuted answers: no status is taken from the line."""
+    monkeypatch.chdir(tmp_path)
+    bench = Workbench(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=lambda out, formats: [], plot=None, vtu=None, series=None, paper=None,
+    )  # fmt: skip
+    (tmp_path / "s.toml").write_text(
+        'name = "s"\ntolerances = [1e-3, 1e-8]\nrepeats = 1\ntime_limit = 60\n'
+        'solvers = ["smalbe", "clarabel", '
+        '{ name = "osqp", label = "few", options = { max_iter = 20 } }]\n'
+        '[[problems]]\nfamily = "beam-ring"\nforms = ["primal", "dual"]\n'
+        "params = { Nr = 2, Nh = 1, steps = 1 }\n"
+    )
+    assert main(bench, ["run", "s.toml", "--out", "out"]) == 0
+    records = read_journal(tmp_path / "out")
+    found = {
+        verdict(
+            Status(r.claimed),
+            Residuals(*(np.inf if v is None else v for v in
+                        (r.primal, r.dual, r.complementarity, r.gap))),
+            r.tol,
+        )
+        is r.status
+        for r in records
+    }  # fmt: skip
+
+    assert found == {True}
+    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.status for r in records}

@@ -1,0 +1,423 @@
+"""Means, ranks and shares over cases, against truths known without the code."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from reports.censoring import restricted_mean
+from reports.contests import Contest
+from reports.conventions import (
+    EVERY,
+    USUAL,
+    Convention,
+    common_cases,
+    geometric_means,
+    standing,
+)
+from reports.growth import growth_of
+from reports.profiles import curve, performance_ratios, share, solved_within
+from reports.ranking import panel, ranks
+from reports.resampling import firsts, limits, told_apart, weights
+
+INF = np.inf
+
+
+def contest(times, *, claimed=None, limit=60.0, solvers=None):
+    times = np.asarray(times, dtype=float)
+    cases, count = times.shape
+    return Contest(
+        title="dual, tol 1e-6",
+        cases=tuple(f"case {i}" for i in range(cases)),
+        solvers=tuple(solvers or (f"s{i}" for i in range(count))),
+        times=times,
+        claimed=times if claimed is None else np.asarray(claimed, dtype=float),
+        stopped=np.full_like(times, np.nan),
+        limit=limit,
+    )
+
+
+def lognormal(rng, shape, scatter=1.0):
+    return 0.01 * rng.lognormal(0, scatter, shape)
+
+
+# ---- means
+
+
+def test_the_shifted_geometric_mean_by_hand():
+    found = contest([[1, 1], [3, 1], [7, 1]])
+    assert found.shift == 1.0  # the median of the best times
+    assert geometric_means(found, USUAL) == pytest.approx([3, 1])  # ∛(2·4·8) − 1
+
+
+def test_a_convention_changes_the_shift_by_a_factor():
+    found = geometric_means(contest([[1, 1], [3, 1], [7, 1]]), Convention(shift=10.0))
+    assert found == pytest.approx([(11 * 13 * 17) ** (1 / 3) - 10, 1])
+
+
+def test_a_failure_is_charged_so_many_limits():
+    found = contest([[1, 1], [1, 1], [INF, 1]], limit=5)
+    assert geometric_means(found, Convention(penalty=3.0))[0] == pytest.approx(3)
+    one = geometric_means(found, Convention(penalty=1.0))[0]
+    assert one == pytest.approx((2 * 2 * 6) ** (1 / 3) - 1)
+
+
+def test_the_shift_follows_the_time_scale_up_to_ten_seconds():
+    rng = np.random.default_rng(11)
+    times = lognormal(rng, (9, 3))
+    assert contest(1e-3 * times).shift == pytest.approx(1e-3 * contest(times).shift)
+    assert contest(1e6 * times).shift == 10.0
+
+
+def test_milliseconds_are_not_averaged_arithmetically():
+    times = lognormal(np.random.default_rng(12), (500, 2), scatter=2.0)
+    mean = geometric_means(contest(times), USUAL)
+    arithmetic, geometric = times.mean(axis=0), np.exp(np.log(times).mean(axis=0))
+    assert (mean < 0.4 * arithmetic).all()
+    assert (mean > geometric).all()
+
+
+def test_common_cases_leave_out_solvers_that_solve_little():
+    times = np.ones((8, 3))
+    times[0, 1] = times[1, 0] = INF
+    times[2:, 2] = INF  # solves two of eight
+    rows, columns = common_cases(contest(times))
+    assert list(columns) == [True, True, False]
+    assert list(np.flatnonzero(~rows)) == [0, 1]
+    found = geometric_means(contest(times), Convention(common=True))
+    assert found[:2] == pytest.approx([1, 1])
+    assert np.isnan(found[2])
+
+
+@pytest.mark.parametrize("factor", [1e-3, 250.0])
+def test_ranks_do_not_depend_on_the_unit_of_time(factor):
+    rng = np.random.default_rng(13)
+    times = lognormal(rng, (15, 6))
+    times[rng.random(times.shape) < 0.15] = INF
+    one, other = contest(times), contest(factor * times, limit=60 * factor)
+    assert other.shift < 10
+    a, b = panel(one), panel(other)
+    assert (a.usual == b.usual).all()
+    for name, changed in a.single.items():
+        np.testing.assert_array_equal(changed.ranks, b.single[name].ranks)
+    np.testing.assert_allclose(standing(one).ratios, standing(other).ratios)
+    assert (standing(one).tiers == standing(other).tiers).all()
+
+
+def test_the_order_of_the_solvers_does_not_matter():
+    times = lognormal(np.random.default_rng(14), (12, 5))
+    turned = contest(times[:, ::-1])
+    assert (panel(contest(times)).usual[::-1] == panel(turned).usual).all()
+    assert (
+        standing(contest(times)).faster[::-1, ::-1] == standing(turned).faster
+    ).all()
+
+
+# ---- intervals
+
+
+@pytest.mark.parametrize("cases", [5, 10, 40])
+def test_intervals_of_a_mean_cover_at_their_nominal_rate(cases):
+    rng = np.random.default_rng(15)
+    drawn = weights([str(i) for i in range(cases)])
+    low, high = limits(drawn @ rng.normal(3, 1, (cases, 3000)), cases)
+    assert np.mean((low <= 3) & (high >= 3)) == pytest.approx(0.95, abs=0.025)
+
+
+def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate():
+    """Times far above the shift: the ratio of means is that of the medians."""
+    rng = np.random.default_rng(16)
+    hits = []
+    for _ in range(300):
+        times = rng.lognormal(0, 1, (25, 1)) * rng.lognormal(0, 0.5, (25, 2))
+        anchor = np.full((25, 1), 1e-9)  # makes the shift small, and leads
+        found = standing(contest(np.hstack([anchor, times * [1, 1.5]])))
+        draws = found.draws[:, 2] / found.draws[:, 1]
+        low, high = limits(draws, 25)
+        hits.append(low <= 1.5 <= high)
+    assert np.mean(hits) == pytest.approx(0.95, abs=0.035)  # > 2.5 σ
+
+
+def test_a_constant_ratio_has_no_uncertainty():
+    found = standing(contest(np.full((6, 2), 2.0) * [1, 3]))
+    assert [float(part[1]) for part in found.ratios] == pytest.approx([3, 3, 3])
+    assert found.faster.tolist() == [[False, True], [False, False]]
+    assert found.tiers.tolist() == [1, 2]
+    assert found.first.tolist() == [1, 0]
+
+
+def test_the_same_cases_are_drawn_alike():
+    names = ["a", "b", "c", "d", "e"]
+    assert (weights(names) == weights(names)).all()
+    assert not (weights(names) == weights(names[::-1])).all()
+    assert weights(names).sum(axis=1) == pytest.approx(1)
+
+
+# ---- ties
+
+
+@pytest.mark.parametrize(("cases", "solvers"), [(6, 3), (12, 20), (30, 8)])
+@pytest.mark.parametrize("failing", [0.0, 0.1])
+def test_equal_solvers_are_told_apart_once_in_twenty_sets_at_most(
+    cases, solvers, failing
+):
+    rng = np.random.default_rng(17)
+    names = [str(i) for i in range(cases)]
+    found = 0
+    for _ in range(250):
+        logs = rng.normal(0, 1, (cases, 1)) + rng.exponential(0.5, (cases, solvers))
+        logs[rng.random(logs.shape) < failing] = 9.0
+        found += told_apart(logs, names).any()
+    assert found / 250 <= 0.05 + 3 * (0.05 * 0.95 / 250) ** 0.5
+
+
+def test_five_cases_tell_nobody_apart_and_six_do():
+    logs = np.log([[1.0, 100.0]] * 6)
+    assert not told_apart(logs[:5], list("abcde")).any()
+    assert told_apart(logs, list("abcdef")).tolist() == [[False, True], [False, False]]
+
+
+def test_two_failures_do_not_hide_who_is_slower_on_all_cases():
+    rng = np.random.default_rng(27)
+    logs = rng.normal(0, 1, (12, 1)) + rng.normal(0, 0.3, (12, 8))
+    logs[:, 3] += 1.5
+    logs[:2, 3] = 16
+    faster = told_apart(logs, [str(i) for i in range(12)])
+    assert np.delete(faster[:, 3], 3).all()
+    assert faster.sum() == 7
+
+
+def test_who_fails_twice_is_not_told_to_be_slower_if_faster_otherwise():
+    """The mean says slower, 18 of 20 cases say faster."""
+    rng = np.random.default_rng(28)
+    logs = rng.normal(0, 0.2, (20, 2))
+    logs[:, 1] -= 0.7
+    logs[:2, 1] = 9
+    assert logs[:, 1].mean() > logs[:, 0].mean()
+    assert not told_apart(logs, [str(i) for i in range(20)]).any()
+
+
+def test_equal_solvers_share_one_tier_and_every_rank():
+    times = lognormal(np.random.default_rng(18), (30, 1)) * np.ones((1, 4))
+    found = standing(contest(times))
+    assert found.tiers.tolist() == [1, 1, 1, 1]
+    assert found.spans == [(1, 4)] * 4
+    assert found.first == pytest.approx([0.25] * 4)
+    assert panel(found.contest).usual.tolist() == [1, 1, 1, 1]
+    assert not panel(found.contest).turned.any()
+
+
+def test_a_faster_pair_makes_a_tier_of_its_own():
+    rng = np.random.default_rng(19)
+    times = rng.lognormal(0, 2, (40, 1)) * rng.lognormal(0, 0.1, (40, 4))
+    found = standing(contest(times * [1, 1, 3, 3]))
+    assert found.tiers.tolist() == [1, 1, 2, 2]
+    assert found.spans == [(1, 2), (1, 2), (3, 4), (3, 4)]
+    assert found.first[2:].tolist() == [0, 0]
+
+
+def test_shares_of_firsts_add_up_and_ties_share_one():
+    logs = np.array([[0.0, 0.0, 1.0], [2.0, 1.0, 3.0]])
+    assert firsts(logs).tolist() == [0.25, 0.75, 0]
+
+
+def test_solvers_that_solve_nothing_tie_at_the_end():
+    times = np.ones((6, 4)) * [1, 2, INF, INF]
+    assert panel(contest(times)).usual.tolist() == [1, 2, 3, 3]
+    assert standing(contest(times)).tiers[2] == standing(contest(times)).tiers[3]
+
+
+# ---- conventions
+
+
+def test_there_is_a_convention_for_each_shift_penalty_and_gate():
+    assert len(set(EVERY)) == 18
+    assert USUAL in EVERY
+
+
+def test_a_liar_ranks_first_only_if_it_is_believed():
+    honest = np.full(8, 1.0)
+    times = np.column_stack([honest, np.full(8, INF)])
+    claimed = np.column_stack([honest, np.full(8, 0.01)])
+    found = panel(contest(times, claimed=claimed))
+    assert found.usual.tolist() == [1, 2]
+    assert found.single["claimed"].ranks.tolist() == [2, 1]
+    assert found.single["claimed"].turned.any()
+    assert not found.single["10 limits"].turned.any()
+
+
+def test_a_penalty_that_turns_two_solvers_is_found():
+    """One fails once and is fast otherwise: three limits or ten decide."""
+    fast = np.full(5, 1.0)
+    fast[0] = INF
+    steady = np.full(5, 4.0)
+    found = panel(contest(np.column_stack([fast, steady]), limit=60))
+    assert found.single["1 limit"].ranks.tolist() == [1, 2]
+    assert found.single["10 limits"].ranks.tolist() == [2, 1]
+    assert found.turned[0, 1]
+    assert found.turned[1, 0]
+
+
+def test_ranks_leave_out_what_is_not_compared():
+    np.testing.assert_array_equal(ranks(np.array([2.0, np.nan, 1.0])), [2, np.nan, 1])
+
+
+# ---- profiles
+
+BY_HAND = np.array([[1, 2], [4, 2], [INF, 3], [INF, INF]])
+
+
+def test_a_performance_profile_by_hand():
+    ratios = performance_ratios(BY_HAND)
+    assert ratios.tolist() == [[1, 2], [2, 1], [INF, 1], [INF, INF]]
+    assert solved_within(ratios[:, 0], [1, 1.9, 2, 1e9]).value.tolist() == [
+        0.25, 0.25, 0.5, 0.5,
+    ]  # fmt: skip
+    assert solved_within(ratios[:, 1], [1, 2]).value.tolist() == [0.5, 0.75]
+
+
+def test_a_data_profile_by_hand():
+    found = curve(BY_HAND[:, 0], 0.5, 60)
+    assert found.at.tolist() == [0.5, 1, 4, 60]
+    assert found.share.value.tolist() == [0, 0.25, 0.5, 0.5]
+
+
+def test_a_failure_is_never_counted_as_solved_whatever_the_factor():
+    """Charged 1000 s it would be, from τ = 1000/0.1 on."""
+    times = np.array([[0.1, INF]] * 4 + [[0.1, 0.1]])
+    ratios = performance_ratios(times)
+    anywhere = np.concatenate([np.geomspace(1, 1e300, 50), [np.finfo(float).max]])
+    assert (solved_within(ratios[:, 1], anywhere).value == 0.2).all()
+    assert curve(ratios[:, 1], 1, 1e300).share.value.max() == 0.2
+
+
+def test_profiles_of_many_cases_are_thinned_not_changed():
+    values = np.random.default_rng(20).lognormal(3, 1, 5000)
+    thin = curve(values, values.min(), values.max())
+    assert thin.at.size == 200
+    exact = [(values <= at).mean() for at in thin.at]
+    assert thin.share.value == pytest.approx(exact)
+
+
+def test_a_further_solver_may_turn_two_profiles():
+    """Gould and Scott: why pairs are drawn as pairs."""
+    a, b, third = [1, 1, 9, 9, 9], [3, 3, 3, 3, 3], [9, 9, 2, 2, 2]
+    two = performance_ratios(np.column_stack([a, b]))
+    three = performance_ratios(np.column_stack([a, b, third]))
+    best = [(ratios == 1).mean(axis=0)[:2].tolist() for ratios in (two, three)]
+    assert best == [[0.4, 0.6], [0.4, 0.0]]
+
+
+@pytest.mark.parametrize("cases", [5, 23])
+def test_bands_of_shares_cover_at_least_at_their_rate(cases):
+    counts = np.arange(cases + 1)
+    found = share(counts, cases)
+    for p in (0.01, 0.2, 0.5, 0.83, 0.99):
+        held = (found.low <= p) & (p <= found.high)
+        assert binom.pmf(counts, cases, p)[held].sum() >= 0.95
+
+
+def test_a_share_of_all_is_not_certain():
+    found = share([0, 12], 12)
+    assert found.high[0] == pytest.approx(1 - 0.025 ** (1 / 12))
+    assert found.low[1] == pytest.approx(0.025 ** (1 / 12))
+    assert (found.low[0], found.high[1]) == (0, 1)
+
+
+# ---- time limits
+
+
+def test_the_restricted_mean_by_hand():
+    """S is 3/4 from 1 to 3, where one of two is left, 3/8 to 4, then 0."""
+    nan = np.nan
+    found = restricted_mean(
+        np.array([1, INF, 3, 4.0]), np.array([nan, 2, nan, nan]), 5.0
+    )
+    assert found.mean.value == pytest.approx(1 + 2 * 3 / 4 + 3 / 8)
+    assert (found.solved, found.stopped, found.never) == (3, 1, 0)
+
+
+def test_without_early_censoring_it_is_the_mean_of_times_cut_at_the_limit():
+    times = np.random.default_rng(21).exponential(2, 30)
+    late = times > 4
+    stopped = np.where(late, 4.0, np.nan)
+    found = restricted_mean(np.where(late, INF, times), stopped, 4.0)
+    cut = np.minimum(times, 4)
+    half = 2.045 * cut.std(ddof=1) / np.sqrt(30)  # Student's, 29 degrees of freedom
+    assert found.mean.value == pytest.approx(cut.mean())
+    assert found.mean.high - found.mean.value == pytest.approx(half, rel=1e-3)
+    assert late.sum() == found.stopped > 0
+
+
+def test_a_refuted_answer_is_never_solved_and_a_late_one_may_be():
+    times, nan = np.array([1, 1, 1, INF, 5.0]), np.nan
+    refuted = restricted_mean(times, np.full(5, nan), 10.0).mean.value
+    late = restricted_mean(times, np.array([nan, nan, nan, 2, nan]), 10.0).mean.value
+    assert refuted == pytest.approx((1 + 1 + 1 + 10 + 5) / 5)
+    assert late == pytest.approx(1 + 4 * 2 / 5)  # the late one weighs with the last
+
+
+def test_the_restricted_mean_covers_the_truth_under_early_censoring():
+    rng = np.random.default_rng(22)
+    truth, hits = 1 - np.exp(-2), []
+    for _ in range(600):
+        times, ends = rng.exponential(1, 40), rng.uniform(0.5, 4, 40)
+        late = times > ends
+        found = restricted_mean(
+            np.where(late, INF, times), np.where(late, ends, np.nan), 2.0
+        )
+        hits.append(found.mean.low <= truth <= found.mean.high)
+    assert np.mean(hits) == pytest.approx(0.95, abs=0.03)
+
+
+# ---- growth
+
+
+def test_growth_is_detected_once_in_twenty_where_there_is_none():
+    rng = np.random.default_rng(23)
+    n = np.geomspace(100, 1e5, 6)
+    found = [growth_of(n, 30 * rng.lognormal(0, 0.1, 6)).grows for _ in range(2000)]
+    assert np.mean(found) == pytest.approx(0.05, abs=0.015)  # 3 σ
+
+
+def test_planted_growth_is_detected_and_bounded():
+    n = np.array([100, 400, 1600, 6400])
+    found = growth_of(n, 5 * n**0.25)
+    assert found.grows
+    assert (found.exponent, found.most) == pytest.approx((0.25, 0.25))
+
+
+def test_constant_counts_do_not_grow_for_sure():
+    found = growth_of([100, 400, 1600, 6400], [13, 13, 13, 13])
+    assert (found.exponent, found.most, found.p_value) == (0, 0, 1)
+    assert found.at(1000) == (pytest.approx(13),) * 3 + (0.95, 4)
+
+
+def test_falling_counts_do_not_grow():
+    found = growth_of([100, 400, 1600, 6400], [40, 30, 25, 20])
+    assert found.p_value > 0.99
+    assert found.most < 0
+
+
+def test_three_sizes_make_no_test():
+    with pytest.raises(ValueError, match="four different sizes"):
+        growth_of([1, 2, 3, 3], [1, 2, 3, 3])
+
+
+def test_nothing_is_predicted_beyond_the_measured_sizes():
+    n = np.array([100, 400, 1600, 6400])
+    found = growth_of(n, 2e-6 * n**1.5)
+    assert found.at(800).value == pytest.approx(2e-6 * 800**1.5)
+    for outside in (99, 6401):
+        with pytest.raises(ValueError, match="outside of the measured"):
+            found.at(outside)
+
+
+def test_predictions_cover_a_further_measurement_at_their_rate():
+    rng = np.random.default_rng(24)
+    n = np.geomspace(100, 1e5, 5)
+    hits = []
+    for _ in range(1500):
+        noise = rng.lognormal(0, 0.2, 6)
+        found = growth_of(n, 1e-6 * n**1.2 * noise[:5]).at(1e4)
+        hits.append(found.low <= 1e-6 * 1e4**1.2 * noise[5] <= found.high)
+    assert np.mean(hits) == pytest.approx(0.95, abs=0.017)
