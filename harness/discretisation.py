@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import log2, sqrt
 from pathlib import Path
@@ -113,18 +113,21 @@ def discretisation_errors(
     reference: Reference,
     folder: Path,
     budget: float,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
     names : forms of one physical case count once
     folder : the result folder; its ``references`` keep what was solved
     budget : seconds after which no mesh is begun
+    tell : is told of each case that begins
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
     for name in names:
         family = families[name.family]
         physical = canonical(name, family).removesuffix(f"/{name.form}")
         if physical not in found:
+            tell(f"finer meshes of {physical}")
             left = _Halving(family, reference, folder / "references", end)
             levels = tuple(left.levels(name))
             singular = getattr(family, "singular", "")
@@ -194,7 +197,7 @@ class _Halving:
             growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else GROWTH
             if sizes and self._refused(growth * sizes[-1]):
                 return
-            if perf_counter() > self._end:
+            if not perf_counter() < self._end:
                 self.why = "the time that was allowed had been used up"
                 return
             level = self._level(params, form, first=not sizes)
@@ -236,7 +239,7 @@ class _Halving:
         except UnsolvedError as e:
             self.why = f"{text} has no reference solution: {e}"
             return None
-        except Exception as e:  # the family's code
+        except (Exception, SystemExit) as e:  # the family's code
             self.why = unbuilt(text, e)
             return None
         root = sqrt(abs(mechanics.scale))
