@@ -44,6 +44,7 @@ FILE = "discretisation.json"  #: in the result folder
 SCHEMA = 1
 MOST_UNKNOWNS = 200_000  #: of a mesh that is solved
 GROWTH = 4.0  #: of the unknowns by halving, until it is known better
+POWER = 1.5  #: of the unknowns that the time of a reference solve grows like
 LEVELS = 3  #: two halvings, where they are affordable
 SLOWEST = 0.5  #: q below which nothing is extrapolated
 ROUNDING = 1e-8  #: of u: slender bodies in doubles, where certificates say less
@@ -119,7 +120,7 @@ def discretisation_errors(
 
     names : forms of one physical case count once
     folder : the result folder; its ``references`` keep what was solved
-    budget : seconds after which no mesh is begun
+    budget : seconds; a mesh that would take longer than what is left is not begun
     tell : is told of each case that begins
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
@@ -192,19 +193,23 @@ class _Halving:
             self.why = "its family does not say which mesh is the next finer one"
             return
         sizes: list[int] = []
+        seconds = 0.0
         params: Mapping[str, object] = name.params
         while len(sizes) < LEVELS:
             growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else GROWTH
             if sizes and self._refused(growth * sizes[-1]):
                 return
-            if not perf_counter() < self._end:
-                self.why = "the time that was allowed had been used up"
+            left = self._end - perf_counter()
+            if not left > seconds * growth**POWER:
+                self.why = "the next mesh would take more time than was left"
                 return
+            start = perf_counter()
             level = self._level(params, form, first=not sizes)
             if level is None:
                 return
             yield level
             sizes.append(level.unknowns)
+            seconds = perf_counter() - start
             params = refined(assemble(self._family, params, form).params)
 
     def _refused(self, size: float) -> bool:

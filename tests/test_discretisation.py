@@ -5,6 +5,7 @@ its elements. The patch test's solution is in every finite element space.
 """
 
 import json
+from time import sleep
 from types import SimpleNamespace
 
 import numpy as np
@@ -242,6 +243,28 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
     assert f"{MOST_UNKNOWNS:,}" in large[0].note
     assert "time" in late[0].note
     assert late[0].levels == large[0].levels == ()
+
+
+def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
+    """The first one takes a twentieth of a second, the next eight times that."""
+    obstacle = PROBLEMS["obstacle"]
+
+    def build(*given):
+        sleep(0.05)
+        return obstacle.build(*given)
+
+    slow = SimpleNamespace(
+        name="obstacle", defaults=obstacle.defaults, forms=obstacle.forms,
+        refined=obstacle.refined, build=build,
+    )  # fmt: skip
+    (found,) = discretisation_errors(
+        [parse("obstacle/n=4/primal", PROBLEMS)], {"obstacle": slow},
+        reference_solution, tmp_path, 0.4,
+    )  # fmt: skip
+
+    assert found.kind == "unknown"
+    assert "more time than was left" in found.note
+    assert len(found.levels) <= 1
 
 
 def replace_build(family, error):
