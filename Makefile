@@ -9,7 +9,7 @@ BIN := .venv/bin
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
-.PHONY: help setup demo test bench docs weaknesses size check clean
+.PHONY: help setup browser demo test bench docs weaknesses size crowd check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -20,10 +20,16 @@ setup: .venv/.ready  ## make .venv: system packages, Python packages
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 
+browser: setup .venv/.browser  ## chromium and its driver, for the tests of the report's page
+
+.venv/.browser: .venv/.ready
+	@tools/setup.sh $(PYTHON) browser
+	@touch $@
+
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
-test: setup check  ## check, then run the tests
+test: setup browser check  ## check, then run the tests
 	$(BIN)/pytest -q
 
 bench: setup  ## time our own kernels (pytest-benchmark)
@@ -38,6 +44,9 @@ weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
 
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py
+
+crowd: setup  ## time, memory and size of reports up to 50 000 measurements
+	$(BIN)/python benchmarks/crowd.py
 
 check: setup  ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

@@ -172,13 +172,18 @@ def _refutations(a: Answer) -> Iterable[str]:
         yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
     if a.assessment is None or a.doubt is None:
         return
-    for what, error in (
-        ("displacement", a.assessment.error),
-        ("contact forces", a.assessment.equilibrium_error),
-    ):
-        if error is not None and error - a.doubt > a.energy_allowed:
-            most = brief(a.energy_allowed)
-            yield f"{what} off by {brief(error)} > {most} (energy norm)"
+    plain = a.assessment.equilibrium_error is None  # a QP without mechanics
+    off = [
+        f"{what} off by {brief(error)}"
+        for what, error in (
+            ("x" if plain else "displacement", a.assessment.error),
+            ("contact forces", a.assessment.equilibrium_error),
+        )
+        if error is not None and error - a.doubt > a.energy_allowed
+    ]
+    if off:
+        most = brief(a.energy_allowed)
+        yield f"{', '.join(off)} in the energy norm, allowed {most}"
     if a.assessment.pulls:
         yield f"multipliers pull at rows {some(map(str, a.assessment.pulls))}"
 

@@ -108,6 +108,8 @@ class Record:
     def from_json(cls, line: str) -> Self:
         """Parse what `to_json` wrote; fields that we do not know are ignored.
 
+        A lone surrogate, which no file can hold, is spelt out.
+
         Raises
         ------
         ValueError
@@ -116,6 +118,8 @@ class Record:
 
         """
         row = json.loads(line)
+        if "\\ud" in line:  # or the half of a pair that is whole
+            row = _spelt(row)
         if not isinstance(row, dict) or row.get("schema") != SCHEMA:
             raise ValueError(f"not a journal line of schema {SCHEMA}")
         known = {f.name: str(f.type) for f in fields(cls)}
@@ -135,6 +139,19 @@ def _json_types(annotation: str) -> set[type]:
     """List what JSON gives for a field with that annotation, e.g. "float | None"."""
     kinds = [kind.partition("[")[0] for kind in annotation.split(" | ")]
     return set().union(*(_JSON_TYPES[kind] for kind in kinds))
+
+
+def _spelt(data: Any) -> Any:
+    """Spell out the lone surrogates inside nested plain data."""
+    match data:
+        case str():
+            return data.encode(errors="backslashreplace").decode()
+        case dict():
+            return {_spelt(k): _spelt(v) for k, v in data.items()}
+        case list():
+            return [_spelt(v) for v in data]
+        case _:
+            return data
 
 
 def finite(data: Any) -> Any:

@@ -77,7 +77,7 @@ def as_text(data: Mapping[str, Any]) -> str:
     """Lay out one screen: the verdict, a row per solver, what is wrong."""
     parts = [legible(data["headline"]), _solvers(data["solvers"])]
     entries = {
-        "Refuted claims": [_wrong(d) for d in data["disagreements"]],
+        "Refuted claims": _refuted(data["disagreements"]),
         "Apart without a culprit": [
             f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
             f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
@@ -123,6 +123,20 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
         for row in rows
     ]
     return aligned([head, *lines], right=range(1, len(head)))
+
+
+def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List every claim, or, of very many, the worst of each solver."""
+    if len(wrong) <= _MOST:
+        return list(map(_wrong, wrong))
+    own: dict[str, list[Mapping[str, Any]]] = {}
+    for d in wrong:
+        own.setdefault(d["solver"], []).append(d)
+    return [
+        f"{_wrong(max(claims, key=lambda d: d['error'] or 0.0))}"
+        + (f" (the worst of {len(claims)})" if len(claims) > 1 else "")
+        for claims in own.values()
+    ]
 
 
 def _wrong(d: Mapping[str, Any]) -> str:

@@ -9,12 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from harness.crossval import Problem, brief, compared
 from harness.errors import InputError
 from harness.journal import read_journal
 from harness.judge import has_point
+from harness.mistaken import recognised, suspects, true_forces
 from harness.plugin import Case, Family, Reference
+from harness.qp import Vector
 from harness.qpfile import qp_digest
 from harness.rebuilt import rebuilt
 from harness.record import Record, Verdict
@@ -71,6 +74,16 @@ class _Folder:
         return self.path / "references"
 
 
+class _Part(NamedTuple):
+    """What came of one physical case."""
+
+    problems: list[Problem]
+    lost: list[Listed]  #: answers that could not be judged
+    false: list[Listed]  #: claims without a point that are not so
+    suspects: dict[str, Vector]  #: see `harness.mistaken`
+    truths: dict[str, Vector]
+
+
 def validated(
     path: Path,
     families: Mapping[str, Family],
@@ -101,16 +114,15 @@ def validated(
         if r.vectors:
             twins.setdefault((r.solver, r.vectors), set()).add(r.case)
     folder = _Folder(path=path, families=families, reference=reference, twins=twins)
-    problems: list[Problem] = []
-    lost: list[Listed] = []
-    false_claims: list[Listed] = []
+    parts: list[_Part] = []
     groups = _groups(records)
     for number, (name, group) in enumerate(groups.items(), 1):
         tell(f"{name} ({number} of {len(groups)})")
-        found, missing, refuted = _group(folder, name, group)
-        problems += found
-        lost += missing
-        false_claims += refuted
+        parts.append(_group(folder, name, group))
+    false_claims = [claim for part in parts for claim in part.false]
+    refuted = {k: z for part in parts for k, z in part.suspects.items()}
+    truths = {k: z for part in parts for k, z in part.truths.items()}
+    problems = recognised((p for part in parts for p in part.problems), refuted, truths)
     return Validation(
         problems=tuple(problems),
         solvers=tuple(sorted({r.solver for r in records})),
@@ -120,7 +132,7 @@ def validated(
             for r in records
             if _silent(r) and r.run_id not in {x.run_id for x in false_claims}
         ),
-        not_validated=tuple(lost),
+        not_validated=tuple(x for part in parts for x in part.lost),
         declined=sum(r.status is Verdict.DECLINED for r in records),
     )
 
@@ -134,25 +146,24 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
     return groups
 
 
-def _group(
-    folder: _Folder, name: str, records: Sequence[Record]
-) -> tuple[list[Problem], list[Listed], list[Listed]]:
-    """Judge the answers to one physical case, and claims that there is none.
-
-    Returns what was found, answers that could not be judged, and claims without a
-    point that are false.
-    """
+def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
+    """Judge the answers to one physical case, and claims that there is none."""
     cases, lost = _built(folder, records)
     given, damaged = _given(folder, [r for r in records if r.case in cases], cases)
     lost += damaged
     by_numbers: dict[str, list[Given]] = {}
     for g in given:
         by_numbers.setdefault(_numbers(g), []).append(g)
-    problems = [
-        compared(_called(name, same, len(by_numbers)), same, folder.reference,
-                 folder.references)
-        for same in by_numbers.values()
-    ]  # fmt: skip
+    solve, kept = folder.reference, folder.references
+    problems: list[Problem] = []
+    forces: dict[str, Vector] = {}
+    truths: dict[str, Vector] = {}
+    for same in by_numbers.values():
+        p = compared(_called(name, same, len(by_numbers)), same, solve, kept)
+        problems.append(p)
+        forces |= suspects(p, same)
+        if (known := true_forces(p, same, solve, kept)) is not None:
+            truths[p.name] = known
     proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
     solvable = {a.case: p for p in proven for a in p.answers}
     elastic = next((p for p in proven if p.closed is not None), None)  # of all forms
@@ -161,7 +172,7 @@ def _group(
         for r in records
         if (text := _falsehood(r, solvable.get(r.case, elastic)))
     ]
-    return problems, lost, false
+    return _Part(problems, lost, false, forces, truths)
 
 
 def _built(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from reports.data import Evidence, Outcome
-from reports.layout import Cell, Section, Table, name_cell
+from reports.layout import Cell, Section, Table, name_cell, source
 from reports.wording import ABSENT, clean, plural
 
 _SIZES = ("variables", "equalities", "inequalities", "bounds")
@@ -12,9 +14,12 @@ _SIZES = ("variables", "equalities", "inequalities", "bounds")
 def cases(evidence: Evidence) -> Section:
     """List every case, one table per family; records hold defaults with the rest."""
     found: dict[str, Outcome] = {}
+    measured: dict[str, list[Outcome]] = {}
     for o in evidence.flat:
+        measured.setdefault(o.case, []).append(o)
         if o.case not in found or not found[o.case].first.sizes:
             found[o.case] = o
+    runs = {case: source(*outcomes) for case, outcomes in measured.items()}
     families = dict.fromkeys(o.first.family for o in found.values())
     return Section(
         name="cases",
@@ -24,13 +29,15 @@ def cases(evidence: Evidence) -> Section:
             "family; here are all of them, and the sizes of the QP that solvers got.",
         ),
         tables=tuple(
-            _table(family, [o for o in found.values() if o.first.family == family])
+            _table(
+                family, [o for o in found.values() if o.first.family == family], runs
+            )
             for family in families
         ),
     )
 
 
-def _table(family: str, outcomes: list[Outcome]) -> Table:
+def _table(family: str, outcomes: list[Outcome], runs: Mapping[str, str]) -> Table:
     """Give every parameter that varies a column, and the caption the others."""
     keys = list(dict.fromkeys(k for o in outcomes for k in o.first.params))
     values = {k: [_value(o, k) for o in outcomes] for k in keys}
@@ -43,7 +50,7 @@ def _table(family: str, outcomes: list[Outcome]) -> Table:
             name_cell(o.case),
             Cell(text=clean(o.first.form, 24)),
             *(_parameter(o, k) for k in varying),
-            *(_size(o, name) for name in _SIZES),
+            *(_size(o, name, runs[o.case]) for name in _SIZES),
         )
         for o in outcomes
     ]
@@ -69,9 +76,11 @@ def _parameter(outcome: Outcome, key: str) -> Cell:
     return Cell(text=_value(outcome, key), value=number)
 
 
-def _size(outcome: Outcome, name: str) -> Cell:
+def _size(outcome: Outcome, name: str, runs: str) -> Cell:
     n = outcome.first.sizes.get(name)
-    return Cell() if n is None else Cell(text=clean(str(n), 24), value=_number(n))
+    if n is None:
+        return Cell()
+    return Cell(text=clean(str(n), 24), value=_number(n), title=runs)
 
 
 def _number(value: object) -> float | None:

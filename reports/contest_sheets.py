@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,8 @@ def _cells(contest: Contest) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "contest": contest.title,
-            "case": np.repeat(contest.cases, solvers),
-            "solver": np.tile(contest.solvers, cases),
+            "case": np.repeat(_spelt(contest.cases), solvers),
+            "solver": np.tile(_spelt(contest.solvers), cases),
             "seconds": contest.times.ravel(),
             "ratio": performance_ratios(contest.times).ravel(),
             "claimed_seconds": contest.claimed.ravel(),
@@ -62,7 +63,7 @@ def _means(standing: Standing) -> list[dict[str, Any]]:
         found = means_by(contest, convention)
         ranked = ranks(found)
         more = usual if convention == USUAL else {}
-        for i, solver in enumerate(contest.solvers):
+        for i, solver in enumerate(_spelt(contest.solvers)):
             rows.append(
                 {"contest": contest.title, "solver": solver}
                 | vars(convention)
@@ -70,3 +71,8 @@ def _means(standing: Standing) -> list[dict[str, Any]]:
                 | {name: values[i] for name, values in more.items()}
             )
     return rows
+
+
+def _spelt(names: Sequence[str]) -> list[str]:
+    """Spell out lone surrogates, which no file can hold."""
+    return [name.encode(errors="backslashreplace").decode() for name in names]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -17,10 +18,19 @@ from reports.wording import clean, listing, plural, tolerance
 CASES = 6  #: with fewer no two solvers can be told apart, see reports.resampling
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
-_KIND = ["sweep", "mode", "form", "at"]  # what cases of one contest share
-_CELL = [*_KIND, "case", "solver"]
+_CELL = ["kind", "case", "solver"]
 
 Times = NDArray[np.float64]
+Name = TypeVar("Name")
+
+
+class _Kind(NamedTuple):
+    """What the cases of one contest share."""
+
+    sweep: bool
+    mode: str
+    form: str
+    at: float  #: accuracy that answers are judged at
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,29 +75,40 @@ def contests(evidence: Evidence) -> tuple[Contest, ...]:
     a solver; so are cold solves and sequences. At least `CASES` cases, two solvers and
     one verified answer make a contest.
     """
-    rows = [_row(r) for r in evidence.records if not r.arm]
-    if not rows:
+    records = [r for r in evidence.records if not r.arm]
+    if not records:
         return ()
+    kinds = _numbered(map(_kind, records))
+    cases = _numbered(r.case for r in records)
+    solvers = _numbered(evidence.solvers)
+    rows = [
+        {"kind": kinds[_kind(r)], "case": cases[r.case], "solver": solvers[r.solver]}
+        | _row(r)
+        for r in records
+    ]
     outcomes = _outcomes(pd.DataFrame(rows))
     limit = _limit(evidence, outcomes)
-    found = []
-    for _, group in outcomes.groupby(_KIND, sort=False):
-        title = _title(*group[_KIND].iloc[0])
-        contest = _contest(title, group, evidence.solvers, limit)
-        if contest is not None:
-            found.append(contest)
-    return tuple(found)
+    groups = zip(kinds, outcomes.groupby("kind"), strict=True)
+    found = [
+        _contest(_title(kind), group, [*cases], evidence.solvers, limit)
+        for kind, (_, group) in groups
+    ]
+    return tuple(contest for contest in found if contest is not None)
 
 
-def _row(r: Record) -> dict[str, Any]:
+def _kind(r: Record) -> _Kind:
+    swept = r.accuracy is not None
+    return _Kind(swept, r.mode, r.form, r.tol if r.accuracy is None else r.accuracy)
+
+
+def _numbered(names: Iterable[Name]) -> dict[Name, int]:
+    """Give a number to each, in the order of occurrence: pandas takes not any name."""
+    return {name: number for number, name in enumerate(dict.fromkeys(names))}
+
+
+def _row(r: Record) -> dict[str, float]:
     """Take of a record what a contest asks for."""
     return {
-        "sweep": r.accuracy is not None,
-        "mode": r.mode,
-        "form": r.form,
-        "at": r.tol if r.accuracy is None else r.accuracy,
-        "case": r.case,
-        "solver": r.solver,
         "tol": r.tol,
         "seconds": np.nan if r.total_seconds is None else r.total_seconds,
         "verified": r.status is Verdict.VERIFIED,
@@ -142,21 +163,24 @@ def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
 
 
 def _contest(
-    title: str, group: pd.DataFrame, order: tuple[str, ...], limit: float
+    title: str,
+    group: pd.DataFrame,
+    cases: Sequence[str],
+    solvers: Sequence[str],
+    limit: float,
 ) -> Contest | None:
     """Keep the solvers with at least half of the cases, and cases that they all had."""
-    cases = np.array(list(dict.fromkeys(group["case"])), dtype=object)
-    met = set(group["solver"])
-    solvers = np.array([s for s in order if s in met], dtype=object)
+    wide = group.pivot(index="case", columns="solver")
+    present = np.array([cases[i] for i in wide.index], dtype=object)
+    met = np.array([solvers[i] for i in wide["times"].columns], dtype=object)
 
     def matrix(name: str) -> Times:
-        wide = group.pivot(index="case", columns="solver", values=name)
-        return wide.reindex(index=cases, columns=solvers).to_numpy(dtype=float)
+        return wide[name].to_numpy(dtype=float)
 
     times, declined = matrix("times"), matrix("declined")
     seen = ~np.isnan(times)
     refused = (declined == 1).sum(axis=0) == seen.sum(axis=0)
-    rare = ~refused & (2 * seen.sum(axis=0) < len(cases))
+    rare = ~refused & (2 * seen.sum(axis=0) < len(present))
     taken = ~(refused | rare)
     complete = seen[:, taken].all(axis=1)
     part = np.ix_(complete, taken)
@@ -165,13 +189,13 @@ def _contest(
     stopped = matrix("stopped")[part]
     return Contest(
         title=title,
-        cases=tuple(cases[complete]),
-        solvers=tuple(solvers[taken]),
+        cases=tuple(present[complete]),
+        solvers=tuple(met[taken]),
         times=times[part],
         claimed=matrix("claimed")[part],
         stopped=np.where(np.isinf(stopped), limit, stopped),
         limit=limit,
-        notes=_left_out([*solvers[refused]], [*solvers[rare]], int((~complete).sum())),
+        notes=_left_out([*met[refused]], [*met[rare]], int((~complete).sum())),
     )
 
 
@@ -187,7 +211,8 @@ def _left_out(refused: list[str], rare: list[str], cases: int) -> tuple[str, ...
     return tuple(notes)
 
 
-def _title(sweep: bool, mode: str, form: str, at: float) -> str:
-    parts = [clean(form, 24)] * bool(form) + [mode] * (mode != "cold")
-    accuracy = f"{'accuracy' if sweep else 'tol'} {tolerance(at)}"
+def _title(kind: _Kind) -> str:
+    parts = [clean(kind.form, 24)] * bool(kind.form)
+    parts += [kind.mode] * (kind.mode != "cold")
+    accuracy = f"{'accuracy' if kind.sweep else 'tol'} {tolerance(kind.at)}"
     return ", ".join([*parts, accuracy])

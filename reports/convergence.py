@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from harness import Vector
 from reports.figures import INK, STYLE, legible, look
 from reports.histories import Comparison, Course
+from reports.traces import behind
 from reports.wording import VERDICTS
 
 #: letter of a step, its name, and its mark; the others, CG above all, are bare
@@ -58,7 +59,8 @@ def active_set_figure(c: Comparison) -> Figure | None:
         figure, (axes,) = _panels(c, [2.2])
         for course, active in counts:
             style = _style(c, course)
-            axes.plot(c.work(course), active, drawstyle="steps-post", **style)
+            (line,) = axes.plot(c.work(course), active, drawstyle="steps-post", **style)
+            behind(line, [[course.record]])
         axes.set_ylabel("active bounds")
         axes.set_ylim(0, 1.06 * max(*(float(np.nanmax(n)) for _, n in counts), 1.0))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -102,7 +104,8 @@ def _strip(axes: Axes, c: Comparison, outer: Sequence[Course]) -> None:
     for row, course in enumerate(outer):
         ticks = c.work(course)[course.outer_ends]
         colour = _style(c, course)["color"]
-        axes.vlines(ticks, -row - 0.38, -row + 0.38, color=colour, linewidth=0.8)
+        ends = axes.vlines(ticks, -row - 0.38, -row + 0.38, color=colour, linewidth=0.8)
+        behind(ends, [[course.record]])
     axes.set(ylim=(-len(outer) + 0.4, 0.6), yticks=[])
     axes.set_ylabel("outer", rotation=0, ha="right", va="center", fontsize=8.5)
     axes.spines["left"].set_visible(False)
@@ -112,7 +115,8 @@ def _curves(axes: Axes, c: Comparison, drawn: Sequence[tuple[Course, Vector]]) -
     """Plot positive values on a logarithmic axis."""
     for course, values in drawn:
         seen = _positive(values)
-        axes.plot(c.work(course)[seen], values[seen], **_style(c, course))
+        (line,) = axes.plot(c.work(course)[seen], values[seen], **_style(c, course))
+        behind(line, [[course.record]])
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     floor = FLOOR * drawn[0][0].outcome.tol
@@ -129,7 +133,10 @@ def _mark_steps(axes: Axes, c: Comparison, course: Course, values: Vector) -> No
         at = np.flatnonzero(course.steps(letter) & _positive(values))
         points = np.column_stack([c.work(course)[at], values[at]])
         apart = _apart(axes.transData.transform(points) / point)
-        axes.plot(*points[apart].T, **_mark(marker, _style(c, course)["color"]))
+        (line,) = axes.plot(
+            *points[apart].T, **_mark(marker, _style(c, course)["color"])
+        )
+        behind(line, [[course.record]])
 
 
 def _apart(places: NDArray[np.float64]) -> list[int]:

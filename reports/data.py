@@ -105,9 +105,16 @@ class Outcome:
 
     def seconds(self, phase: str) -> Interval | None:
         """Median of prepare, solve or total time over the repeats that have one."""
-        values = [getattr(r, f"{phase}_seconds") for r in self.records]
-        times = [float(v) for v in values if v is not None]
-        return median_interval(times) if times else None
+        return self._intervals[phase]
+
+    @cached_property
+    def _intervals(self) -> dict[str, Interval | None]:
+        found: dict[str, Interval | None] = {}
+        for phase in ("prepare", "solve", "total"):
+            values = [getattr(r, f"{phase}_seconds") for r in self.records]
+            times = [float(v) for v in values if v is not None]
+            found[phase] = median_interval(times) if times else None
+        return found
 
     @cached_property
     def dualising(self) -> Interval | None:

@@ -14,11 +14,13 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import PlaceHolderLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from reports.data import Evidence, Outcome
 from reports.scaling import Ladder
+from reports.traces import behind
 from reports.wording import clean, exponent
 
 INK = "#20242a"  #: text and axes; the page replaces it by its own text colour
@@ -58,6 +60,7 @@ STYLE: Any = {
     "pdf.fonttype": 42,
 }
 LEGEND_LINE = 0.21  #: height of a line of a legend, inches
+CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
 _METADATA: dict[str, dict[str, Any]] = {
     ".pdf": {"CreationDate": None},
     ".svg": {"Date": None},
@@ -67,6 +70,7 @@ _METADATA: dict[str, dict[str, Any]] = {
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure in the format of the file's ending, the same bytes every time."""
     with rc_context(STYLE):
+        _lay_out(figure)
         figure.savefig(
             path,
             bbox_inches="tight",
@@ -76,6 +80,13 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def _lay_out(figure: Figure) -> None:
+    """Place axes and legends once, for every format alike."""
+    if not isinstance(figure.get_layout_engine(), PlaceHolderLayoutEngine | None):
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+
+
 def inline_svg(figure: Figure, name: str) -> str:
     """Draw a figure as an <svg> element that takes its ink from the page around it.
 
@@ -83,6 +94,7 @@ def inline_svg(figure: Figure, name: str) -> str:
     """
     buffer = StringIO()
     with rc_context(STYLE):
+        _lay_out(figure)
         figure.savefig(buffer, format="svg", facecolor="none", metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :].replace(INK, "currentColor")
@@ -124,12 +136,14 @@ def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
             style = look(solvers.index(solver))
             _times(left, ladder, solver, style=style)
             counted = [
-                (n, sum(o.iterations) / 2)
+                (n, sum(o.iterations) / 2, o.records)
                 for n, o in ladder.curve(solver)
                 if o.iterations is not None
             ]
             if counted:
-                right.plot(*zip(*counted, strict=True), **style)
+                n, its, runs = zip(*counted, strict=True)
+                (line,) = right.plot(n, its, **style)
+                behind(line, runs)
         log_log(left, "degrees of freedom $n$", "total time in s")
         _slopes(left)
         log_log(right, "degrees of freedom $n$", "iterations")
@@ -145,13 +159,16 @@ def _times(axes: Axes, ladder: Ladder, solver: str, *, style: dict[str, Any]) ->
     if not points:
         return
     n, t, low, high = np.array(points, dtype=float).T
+    runs = [o.records for _, o in ladder.curve(solver) if o.seconds("total")]
     law = ladder.time_law(solver)
     label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
-    axes.plot(n, t, label=label, **style)
-    axes.errorbar(
+    (line,) = axes.plot(n, t, label=label, **style)
+    _, caps, bars = axes.errorbar(
         n, t, yerr=[t - low, high - t], fmt="none", color=style["color"], capsize=2,
         elinewidth=0.7,
     )  # fmt: skip
+    for artist in (line, *caps, *bars):
+        behind(artist, runs)
 
 
 def log_log(axes: Axes, xlabel: str, ylabel: str) -> None:
@@ -199,9 +216,10 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
         names = list(dict.fromkeys(o.solver for o in shown))
         figure = Figure(figsize=(6.9, max(3.2, 0.5 + LEGEND_LINE * len(names))))
         axes = figure.subplots()
+        crowd = {"markersize": 2.6, "alpha": 0.5} if len(shown) > CROWDED else {}
         for index, solver in enumerate(evidence.solvers):
             mine = [o for o in shown if o.solver == solver]
-            style = look(index, line=False)
+            style = look(index, line=False) | crowd
             _scatter(axes, [o for o in mine if o.verified], style=style)
             refuted = {**style, "markerfacecolor": "none"}
             _scatter(axes, [o for o in mine if not o.verified], style=refuted)
@@ -231,9 +249,11 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
 def _scatter(axes: Axes, outcomes: list[Outcome], *, style: dict[str, Any]) -> None:
     """Plot (median time, worst residual / tolerance), zero raised to 1e-10."""
     points = [
-        (t.value, max((o.worst or 0.0) / o.tol, 1e-10))
+        (t.value, max((o.worst or 0.0) / o.tol, 1e-10), o.records)
         for o in outcomes
         if (t := o.seconds("total")) is not None
     ]
     if points:
-        axes.plot(*zip(*points, strict=True), alpha=0.85, **style)
+        x, y, runs = zip(*points, strict=True)
+        (line,) = axes.plot(x, y, **({"alpha": 0.85} | style))
+        behind(line, runs)

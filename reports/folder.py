@@ -40,6 +40,7 @@ from reports.wording import TIMED, clean, tolerance
 from reports.worth import worth
 from reports.writing import RENDERED, write_page, write_text
 
+MOST_LADDERS = 6  #: that are drawn; all are tabulated
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 
@@ -109,6 +110,8 @@ def compose(evidence: Evidence) -> Page:
         title=clean(evidence.name),
         dateline=dateline(evidence),
         sections=tuple(s for s in sections if s is not None),
+        records=evidence.records,
+        solvers=evidence.solvers,
     )
 
 
@@ -128,15 +131,20 @@ def _grown(found: Sequence[Ladder], evidence: Evidence) -> Section | None:
     section = scaling(found)
     if section is None:
         return None
+    drawn = sorted(found, key=lambda ladder: -ladder.answers)[:MOST_LADDERS]
+    rest = (
+        f" Of {len(found)} ladders, the {MOST_LADDERS} with most answers are drawn."
+        * (len(found) > MOST_LADDERS)
+    )
     pictures = tuple(
         Picture(
             name=f"scaling-{i}",
             caption=f"Growth of time and iterations: {ladder.title}. Bars: interval of "
             "the median. p: exponent of the time against n with its 95 % interval. "
-            f"{TIMED}",
+            f"{TIMED}{rest}",
             figure=scaling_figure(ladder, evidence.solvers),
         )
-        for i, ladder in enumerate(found, 1)
+        for i, ladder in enumerate((one for one in found if one in drawn), 1)
     )
     return replace(section, pictures=pictures)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -35,18 +37,21 @@ def median_interval(samples: Sequence[float]) -> Interval:
     .. [1] H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, §7.1
 
     """
-    x = np.sort(np.asarray(samples, dtype=float))
-    n = x.size
+    x = sorted(float(s) for s in samples)
+    n = len(x)
+    k, coverage = _order(n)
+    return Interval(
+        value=median(x), low=x[k - 1], high=x[n - k], coverage=coverage, samples=n
+    )
+
+
+@cache
+def _order(n: int) -> tuple[int, float]:
+    """Choose k for n samples, and say how often the interval covers."""
     k = np.arange(1, (n + 1) // 2 + 1)
     coverages = 1 - 2 * binom.cdf(k - 1, n, 0.5)
     best = max(int((coverages >= COVERAGE).sum()), 1)
-    return Interval(
-        value=float(np.median(x)),
-        low=float(x[best - 1]),
-        high=float(x[n - best]),
-        coverage=max(float(coverages[best - 1]), 0.0),
-        samples=n,
-    )
+    return best, max(float(coverages[best - 1]), 0.0)
 
 
 class PowerLaw(NamedTuple):

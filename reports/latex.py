@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import re
+
 from reports.layout import Cell, Table
+
+_NOT_IN_OT1 = "«»ÐðÞþ"
 
 _SPECIAL = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&",
     "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "|": r"\textbar{}", '"': r"\textquotedbl{}", "'": r"\textquotesingle{}",
+    "|": r"\textbar{}", '"': r"\symbol{34}", "'": r"\textquotesingle{}",
     "`": r"\textasciigrave{}", "–": "--", "—": "---", "…": r"\ldots{}",
     "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$", "·": r"$\cdot$",
     "±": r"$\pm$", "≈": r"$\approx$", "∞": r"$\infty$", "√": r"$\surd$",
     "½": r"$\frac12$", "µ": r"$\mu$", "λ": r"$\lambda$", "ν": r"$\nu$",
     "°": r"$^\circ$", "∅": r"$\emptyset$", "✓": r"$\surd$", "−": r"$-$",
+    "\0": "{}",
 }  # fmt: skip
 
 
@@ -65,13 +70,16 @@ def _cell(cell: Cell) -> str:
 
 
 def escaped(text: str) -> str:
-    """Escape for text mode; characters beyond Latin-1 are named, not printed.
+    """Escape for text mode; what the oldest font encoding lacks is named, not printed.
 
     A leading bracket is braced: after a row's end TeX would read an optional argument.
+    So are hyphens in a row, which TeX would join to dashes.
     """
-    safe = "".join(_SPECIAL.get(c) or _known(c) for c in text)
+    hyphens = re.sub("-(?=-)", "-\0", text)
+    safe = "".join(_SPECIAL.get(c) or _known(c) for c in hyphens)
     return f"{{}}{safe}" if safe.startswith(("[", "*")) else safe
 
 
 def _known(char: str) -> str:
-    return char if char.isascii() or "¡" <= char <= "ÿ" else f"U+{ord(char):04X}"
+    latin = "¡" <= char <= "ÿ" and char not in _NOT_IN_OT1
+    return char if char.isascii() or latin else f"U+{ord(char):04X}"

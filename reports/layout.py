@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
+from harness import Record
 from reports.data import Evidence, Outcome
 from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
+
+_RUN = "run "  #: before the run_ids in a title
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +22,7 @@ class Cell:
     symbol: str = ""  #: before the text, where the medium has it
     after: str = ""  #: small print behind the text
     kind: str = ""  #: a verdict, "best", "tied", "void" (not to be compared) or "total"
-    title: str = ""  #: shown when pointed at: where the number comes from
+    title: str = ""  #: shown when pointed at; run_ids as `source` names them are links
     value: float | None = None  #: what to sort by; the text, if None
 
 
@@ -32,6 +35,7 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     text_columns: int = 1  #: how many columns from the left hold names, not numbers
     notes: tuple[str, ...] = ()  #: what must be known to read it; after the caption
+    solver: str = ""  #: the only one that it is about: a reader may hide both
 
     def wordy(self, column: int) -> bool:
         """Whether a column holds words, which begin at the left, not numbers."""
@@ -46,7 +50,11 @@ class Table:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Picture:
-    """A figure, its file name without ending, and its caption."""
+    """A figure, its file name without ending, and its caption.
+
+    The page reads curves back from the figure (`reports.plots`) and draws them so that
+    one can zoom; what it cannot read, it shows as it is.
+    """
 
     name: str
     caption: str
@@ -73,11 +81,31 @@ class Page:
     dateline: str
     sections: tuple[Section, ...]
     footer: str = ""  #: where the numbers are, if not in a result folder
+    records: tuple[Record, ...] = ()  #: the measurements that its numbers come from
+    solvers: tuple[str, ...] = ()  #: of these, in the order of their looks in figures
 
 
-def source(outcome: Outcome) -> str:
-    """Name the measurements behind a cell."""
-    return clean("run " + ", ".join(outcome.run_ids), 400)
+def source(*outcomes: Outcome) -> str:
+    """Name the measurements behind a cell; `named` reads them back."""
+    return sources(r for o in outcomes for r in o.records)
+
+
+def sources(records: Iterable[Record]) -> str:
+    """Name measurements one by one; empty if there are none."""
+    names = ", ".join(short(r.run_id) for r in records)
+    return _RUN + names if names else ""
+
+
+def named(title: str) -> list[str]:
+    """List the run_ids, as `short` prints them, that `source` put into a title."""
+    before, run, names = title.rpartition(_RUN)
+    at_end = run and (not before or before.endswith(" "))
+    return names.split(", ") if at_end else []
+
+
+def short(run_id: str) -> str:
+    """Print a run_id; ours are short, those of a foreign journal may not be."""
+    return clean(run_id, 40)
 
 
 def verdict_cell(outcome: Outcome, after: str = "") -> Cell:

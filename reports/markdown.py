@@ -45,6 +45,8 @@ def _cell(cell: Cell) -> str:
 
 
 def escaped(text: str) -> str:
-    """Escape what Markdown or HTML would read as markup."""
+    """Escape what Markdown or HTML would read as markup, or make a link or list of."""
     safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return re.sub(r"([\\`*_\[\]|~#$])", r"\\\1", safe)
+    safe = re.sub(r"([\\`*_\[\]|~#$@])", r"\\\1", safe)
+    safe = re.sub(r"(:)(?=//)|(?<=www)(\.)", r"\\\g<0>", safe, flags=re.IGNORECASE)
+    return re.sub(r"^(\d*)([-+.)])(?=\s)", r"\1\\\2", safe)

@@ -113,14 +113,14 @@ def _spread_row(s: Spread) -> tuple[Cell, ...]:
     return (
         name_cell(first.physical),
         Cell(text=tolerance(first.tol), value=first.tol),
-        Cell(text=str(len(s.answers)), value=len(s.answers)),
+        Cell(text=str(len(s.answers)), value=len(s.answers), title=source(*s.answers)),
         Cell(
             text=significant(s.best.energy, s.digits),
             after=unit(s.best, "energy"),
             value=s.best.energy,
             title=source(s.best),
         ),
-        Cell(text=power(s.relative), value=s.relative),
+        Cell(text=power(s.relative), value=s.relative, title=source(*(s.pair or ()))),
         Cell(text=between, kind="words"),
     )
 

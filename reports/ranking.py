@@ -111,12 +111,16 @@ def _verdict(standing: Standing, ranked: Panel) -> str:
     told = (standing.faster | standing.faster.T) & upper
     turned = ranked.turned & upper
     n = len(standing.contest.solvers)
+    turns = (
+        f"conventions turn the order of {turned.sum()}, among them "
+        f"{(turned & told).sum()} that are told apart"
+        if turned.any()
+        else "no convention turns an order"
+    )
     return (
         f"{standing.contest.title}: {plural(n, 'solver')} in "
         f"{plural(int(standing.tiers.max()), 'tier')}; of "
-        f"{plural(n * (n - 1) // 2, 'pair')} {told.sum()} told apart; "
-        f"conventions turn the order of {turned.sum()}, among "
-        f"them {(turned & told).sum()} that are told apart."
+        f"{plural(n * (n - 1) // 2, 'pair')} {told.sum()} told apart; {turns}."
     )
 
 
@@ -144,7 +148,7 @@ def _row(standing: Standing, ranked: Panel, i: int) -> tuple[Cell, ...]:
         Cell(text=_range(low, high), value=low),
         *(_changed(changed, i) for changed in ranked.single.values()),
         Cell(text=_range(min(every), max(every)), value=min(every)),
-        Cell(text=_reading(ranked.turned[i], told), kind="words"),
+        Cell(text=_reading(ranked.turned[i], told, sure=low == high), kind="words"),
     )
 
 
@@ -156,12 +160,13 @@ def _changed(changed: Changed, i: int) -> Cell:
     return Cell(text=str(int(rank)), value=float(rank), kind=kind)
 
 
-def _reading(turned: NDArray[np.bool_], told: NDArray[np.bool_]) -> str:
-    if not turned.any():
-        return "the same under all"
+def _reading(turned: NDArray[np.bool_], told: NDArray[np.bool_], *, sure: bool) -> str:
+    """Say what the rank of a solver is worth; sure: it can have no other."""
     if (turned & told).any():
         return "depends on the convention"
-    return "turns inside the noise"
+    if turned.any():
+        return "turns inside the noise"
+    return "the same under all" if sure else "the same under all, inside the noise"
 
 
 def _range(low: int, high: int) -> str:

@@ -131,7 +131,9 @@ def firsts(draws: Array) -> Array:
 
 def _rng(cases: Sequence[str]) -> np.random.Generator:
     """Seed by names, so that the same cases are drawn alike everywhere."""
-    return np.random.default_rng(crc32("\n".join(cases).encode()))
+    return np.random.default_rng(
+        crc32("\n".join(cases).encode(errors="backslashreplace"))
+    )
 
 
 def _student(n: int) -> float:

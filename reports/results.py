@@ -13,6 +13,7 @@ from reports.layout import (
     case_cells,
     grid,
     source,
+    sources,
     verdict_cell,
 )
 from reports.wording import clean, power, span
@@ -132,6 +133,7 @@ def _counts(evidence: Evidence) -> list[Table]:
                     caption=f"Counts of {clean(solver, 40)}, first repeat.",
                     columns=("case", "tol", *heads),
                     rows=tuple(rows),
+                    solver=solver,
                 )
             )
     return tables
@@ -139,7 +141,11 @@ def _counts(evidence: Evidence) -> list[Table]:
 
 def _count(outcome: Outcome, name: str) -> Cell:
     n = outcome.first.counts.get(name)
-    return Cell() if n is None else Cell(text=clean(str(n), 24), value=_number(n))
+    if n is None:
+        return Cell()
+    return Cell(
+        text=clean(str(n), 24), value=_number(n), title=sources([outcome.first])
+    )
 
 
 def _number(value: object) -> float | None:

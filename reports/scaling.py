@@ -19,13 +19,18 @@ SIZES_NAMED = (
 SIZES = 3  #: fewer different sizes make no table
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Ladder:
     """Cases that differ in size only, and the verified answers on each."""
 
     title: str  #: family, the parameters held, form, tolerance
     solvers: tuple[str, ...]
     rungs: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+
+    @property
+    def answers(self) -> int:
+        """How many verified answers it rests on."""
+        return sum(len(row) for _, _, row in self.rungs)
 
     def curve(self, solver: str) -> list[tuple[int, Outcome]]:
         """Sizes n and verified answers of one solver, smallest first."""
@@ -143,8 +148,9 @@ def _tables(ladder: Ladder) -> tuple[Table, Table]:
         label = (Cell(text=head, kind="total"), Cell(text="", kind="total"))
         laws = [ladder.time_law(s, against) for s in ladder.solvers]
         growth = [ladder.iteration_law(s, against) for s in ladder.solvers]
-        times.append((*label, *map(_exponent, laws)))
-        counts.append((*label, *map(_exponent, growth)))
+        from_runs = [source(*(o for _, o in ladder.curve(s))) for s in ladder.solvers]
+        times.append((*label, *map(_exponent, laws, from_runs)))
+        counts.append((*label, *map(_exponent, growth, from_runs)))
     return (
         Table(
             caption=f"Total time against size: {ladder.title}.",
@@ -185,7 +191,7 @@ def _iterations(outcome: Outcome | None) -> Cell:
     return Cell(text=span(its), title=source(outcome), value=its[0] if its else None)
 
 
-def _exponent(law: PowerLaw | None) -> Cell:
+def _exponent(law: PowerLaw | None, runs: str) -> Cell:
     if law is None:
         return Cell(text=ABSENT, kind="total", title="fewer than three verified sizes")
-    return Cell(text=exponent(law), kind="total", value=law.exponent)
+    return Cell(text=exponent(law), kind="total", value=law.exponent, title=runs)

@@ -9,7 +9,7 @@ from typing import Any
 from harness import Verdict
 from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
-from reports.layout import Cell, Section, Table, name_cell
+from reports.layout import Cell, Section, Table, name_cell, sources
 from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
 
 QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
@@ -172,10 +172,15 @@ def _counts(evidence: Evidence) -> Table:
         made = len(mine) - count[Verdict.DECLINED]
         row = [name_cell(solver), Cell(text=str(made), value=made)]
         for verdicts in _GROUPS.values():
-            n = sum(count[v] for v in verdicts)
+            those = [r for r in mine if r.status in verdicts]
+            n = len(those)
             symbol, _ = VERDICTS[verdicts[0]]
             kind, symbol = (verdicts[0].value, symbol) if n else ("none", "")
-            row.append(Cell(text=str(n), symbol=symbol, kind=kind, value=n))
+            row.append(
+                Cell(
+                    text=str(n), symbol=symbol, kind=kind, value=n, title=sources(those)
+                )
+            )
         rows.append(tuple(row))
     return Table(
         caption="Measurements by verdict. Inaccurate and wrong: the solver claimed "
@@ -244,7 +249,7 @@ def dateline(evidence: Evidence) -> str:
     """Say when and on which machine, in one line."""
     days = sorted({r.started[:10] for r in evidence.records if r.started})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
-    return f"{when} · {machine(evidence.environment)}"
+    return f"{clean(when)} · {machine(evidence.environment)}"
 
 
 def machine(environment: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from reports.certified import certified_picture, certified_sweeps, matched_table
 from reports.data import Evidence, Outcome
 from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_log, look
 from reports.layout import Cell, Picture, Section, Table, name_cell, source
+from reports.traces import behind
 from reports.wording import ABSENT, TIMED, clean, seconds, tolerance
 
 LEGEND_COLUMNS = 4
@@ -154,15 +155,14 @@ def _figure(
 def _curve(axes: Axes, outcomes: Sequence[Outcome], style: dict[str, object]) -> None:
     """Join the answers of one solver; hollow where they are not verified."""
     points = [
-        (t.value, max(o.worst, _LEAST), o.verified)
+        (t.value, max(o.worst, _LEAST), o.records, o.verified)
         for o in outcomes
         if o.worst is not None and (t := o.seconds("total")) is not None
     ]
-    if not points:
-        return
-    x, y, _ = zip(*points, strict=True)
+    filled = [point for point in points if point[-1]]
     hollow = {**style, "markerfacecolor": "none"}
-    axes.plot(x, y, **hollow)  # type: ignore[arg-type]
-    filled = [(x, y) for x, y, verified in points if verified]
-    if filled:
-        axes.plot(*zip(*filled, strict=True), **{**style, "linestyle": "none"})  # type: ignore[arg-type]
+    for drawn, style_of in ((points, hollow), (filled, {**style, "linestyle": "none"})):
+        if drawn:
+            x, y, runs, _ = zip(*drawn, strict=True)
+            (line,) = axes.plot(x, y, **style_of)  # type: ignore[arg-type]
+            behind(line, runs)

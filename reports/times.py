@@ -57,7 +57,9 @@ def _dualised(evidence: Evidence) -> list[Table]:
 
 def _charged(row: Mapping[str, Outcome], solvers: Sequence[str]) -> tuple[Cell, ...]:
     """Make one row of the table of totals with dualising."""
-    own = next(o.dualising for o in row.values() if o.dualising is not None)
+    charged = next(o for o in row.values() if o.dualising is not None)
+    own = charged.dualising
+    assert own is not None
     totals = {s: o.with_dualising for s, o in row.items() if o.verified}
     ranked = [t for s, t in totals.items() if t is not None and not row[s].first.arm]
     best = min((t.value for t in ranked), default=None)
@@ -72,7 +74,8 @@ def _charged(row: Mapping[str, Outcome], solvers: Sequence[str]) -> tuple[Cell, 
         cells.append(
             Cell(text=seconds(total), kind=kind, value=total.value, title=title)
         )
-    return (*case_cells(row), Cell(text=seconds(own), value=own.value), *cells)
+    dualising = Cell(text=seconds(own), value=own.value, title=source(charged))
+    return (*case_cells(row), dualising, *cells)
 
 
 def _coverage(intervals: list[Interval | None]) -> str:

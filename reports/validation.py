@@ -17,11 +17,11 @@ from reports.compared import (
     tol_cell,
 )
 from reports.error_figure import error_figure
-from reports.figures import save
 from reports.layout import Cell, Page, Picture, Section, Table, name_cell
 from reports.markdown import markdown
 from reports.page import html
 from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
+from reports.writing import write_figures, write_text
 
 _FOOTER = (
     "All answers and all pairs are in validation.json beside the journal, at full "
@@ -58,14 +58,11 @@ _RULES = (
 def write_validation(directory: Path, data: Data) -> list[Path]:
     """Write DIR/report/validation.html and .md from the data of `validate`."""
     page, target = compose(data), directory / "report"
-    (target / "figures").mkdir(parents=True, exist_ok=True)
-    for picture in (p for section in page.sections for p in section.pictures):
-        for ending in ("pdf", "svg", "png"):
-            save(picture.figure, target / "figures" / f"{picture.name}.{ending}")
-    written = [target / "validation.html", target / "validation.md"]
-    for path, text in zip(written, (html(page), markdown(page)), strict=True):
-        path.write_text(text, encoding="utf-8", newline="\n")
-    return written
+    write_figures(page, target)
+    return [
+        write_text(target / "validation.html", html(page)),
+        write_text(target / "validation.md", markdown(page)),
+    ]
 
 
 def compose(data: Data) -> Page:
@@ -128,7 +125,7 @@ def _errors(data: Data) -> tuple[Picture, ...]:
         f"Certified error of every answer at tol {tolerance(tol)}. It is never below "
         "what is known of the reference. Beyond √(20t) no verified answer may lie."
     )
-    return (Picture(name="errors", caption=caption, figure=figure),)
+    return (Picture(name="validation-errors", caption=caption, figure=figure),)
 
 
 def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 import unicodedata
 from collections.abc import Sequence
+from functools import lru_cache
 
 from harness import Verdict
 from reports.intervals import Interval, PowerLaw
@@ -31,20 +33,29 @@ VERDICTS = {
     Verdict.DECLINED: ("○", "declined"),
 }
 
+_ACCENT = (
+    "[\u0300-\u036f\u0483-\u0489\u1ab0-\u1aff\u1dc0-\u1dff\u20d0-\u20ff\ufe20-\ufe2f]"
+)
+_PILED = re.compile(f"({_ACCENT}{{2}}){_ACCENT}+")
+
 _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 
 
+@lru_cache(1 << 16)
 def clean(text: str, limit: int = 96) -> str:
     """Make foreign text fit for a table: one line, no control characters, not longer.
 
-    The middle is left out of what is too long, since names differ at their ends.
+    The middle is left out of what is too long, since names differ at their ends. A
+    letter keeps two accents; one that has no letter to stand on gets a circle.
     """
     line = " ".join(text.split())
-    shown = "".join("\ufffd" if _invisible(c) else c for c in line)
-    if len(shown) <= limit:
-        return shown
-    tail = limit // 3
-    return f"{shown[: limit - tail - 1]}…{shown[-tail:]}"
+    if not line.isascii() or not line.isprintable():
+        visible = "".join("\ufffd" if _invisible(c) else c for c in line)
+        line = _PILED.sub(r"\1", unicodedata.normalize("NFC", visible))
+    if len(line) > limit:
+        tail = limit // 3
+        line = f"{line[: limit - tail - 1]}…{line[-tail:]}"
+    return f"◌{line[: limit - 1]}" if line and unicodedata.combining(line[0]) else line
 
 
 def _invisible(char: str) -> bool:

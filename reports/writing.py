@@ -30,7 +30,7 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
             for s in page.sections
             if s.tables
         ]
-    return written + _figures(page, target / "figures")
+    return written + write_figures(page, target)
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -40,7 +40,9 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
-def _figures(page: Page, folder: Path) -> list[Path]:
+def write_figures(page: Page, target: Path) -> list[Path]:
+    """Write the figures of a page to the folder figures/ in `target`."""
+    folder = target / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     pictures = [p for section in page.sections for p in section.pictures]
     return [

@@ -18,7 +18,7 @@ from harness.journal import Journal, read_journal
 from harness.judge import blank, judged
 from harness.measure import Measurement
 from harness.names import canonical, parse
-from harness.qpfile import qp_digest
+from harness.qpfile import qp_digest, save_qp
 from harness.record import Verdict
 from harness.references import reference_point
 from harness.registry import SolverSpec, load_plugin
@@ -183,6 +183,20 @@ def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_pat
     assert (wrong["solver"], wrong["case"]) == ("stale", f"{BEAM}/dual-bounds")
     assert wrong["error"] > 0.1
     assert any("the very point that it gave for" in r for r in wrong["reasons"])
+    assert f"its contact forces are those of {BEAM}/step=1" in wrong["reasons"]
+
+
+def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
+    """Two steps of one problem could share them; it is u that is wrong here."""
+    case, s = truths[2, "primal"]
+    answers = [("a", f"{BEAM}/primal", s), ("a", f"{BEAM}/step=1/primal",
+                                            truths[1, "primal"][1])]  # fmt: skip
+    answers.append(("off", f"{BEAM}/primal", disturbed(case, s, 1e-2)))
+
+    _, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    (wrong,) = verdict["disagreements"]
+    assert not any("contact forces are those" in r for r in wrong["reasons"])
 
 
 def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
@@ -368,6 +382,13 @@ def test_distances_are_those_of_the_energy_norm():
     d = V[0] - V[1]
     assert found[0, 1] == pytest.approx(np.sqrt(d @ K @ d))
     assert found[2, 0] == found[1, 2] == np.inf
+
+
+@pytest.mark.parametrize("recipe", [True, False])
+def test_a_qp_has_the_digest_that_a_run_writes_down(recipe, truths, tmp_path):
+    for case, _ in truths.values():
+        written = save_qp(tmp_path / "qp.npz", case.qp, {}, recipe=recipe)
+        assert qp_digest(case.qp, recipe=recipe) == written
 
 
 def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():

@@ -37,6 +37,11 @@ SHORTER = {
         "mortarbench run crossval --case 'contact-patch/*' --solver smalbe "
         "--solver clarabel"
     ),
+    "mortarbench run suites/crossval.toml --out out/crossval": (
+        "mortarbench run suites/crossval.toml --out out/crossval "
+        "--case 'contact-patch/*' --solver smalbe --solver clarabel"
+    ),
+    "mortarbench validate out/make-demo": "mortarbench validate out/demo",
     "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
     "mortarbench run mine.toml --out out/again": (
         "mortarbench run mine.toml --repeats 2 --out out/again"
@@ -104,6 +109,8 @@ PROMISED = {
     "howto": {
         "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
         "out/scaling/report/figures/scaling-1.pdf": "",
+        "out/crossval/validation.json": "",
+        "out/crossval/report/validation.html": r"No disagreement",
         "out/demo/report/report.md": r"1 × tolerance",
         "out/demo-again/report/against-demo/report.md": r"Verdicts: 0 worse",
         "out/own/report/report.md": r"claimed solved but inaccurate",

@@ -352,6 +352,7 @@ def test_every_dependency_is_pinned():
     named = [
         *project["project"]["dependencies"],
         *project["project"]["optional-dependencies"]["dev"],
+        *project["project"]["optional-dependencies"]["browser"],
         *project["build-system"]["requires"],
     ]
     wanted = {normal(re.match(r"[\w.-]+", requirement)[0]) for requirement in named}

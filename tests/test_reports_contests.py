@@ -8,6 +8,7 @@ import pytest
 from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
+from reports.contest_sheets import contest_sheets
 from reports.contests import contests
 from reports.conventions import standing
 from reports.data import Evidence, arrange
@@ -244,8 +245,16 @@ def test_equal_solvers_are_ties(record, evidence):
     ]
     found = section(compose(evidence(records)), "ranking")
     assert "4 solvers in 1 tier; of 6 pairs 0 told apart" in found.points[0]
-    assert {row["inside the noise"].text for row in rows(found.tables[0]).values()} == {
-        "1–4"
+    cells = rows(found.tables[0]).values()
+    assert {row["inside the noise"].text for row in cells} == {"1–4"}
+    assert all("inside the noise" in row["reading"].text for row in cells)
+
+
+def test_ranks_that_nothing_changes_are_said_to_be_so(record, evidence):
+    found = section(compose(evidence(crowd(record, 2))), "ranking")
+    assert found.points[0].endswith("1 told apart; no convention turns an order.")
+    assert {row["reading"].text for row in rows(found.tables[0]).values()} == {
+        "the same under all"
     }
 
 
@@ -408,7 +417,13 @@ def test_one_refuted_repeat_refutes_the_claim(record, evidence):
 
 
 def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
-    names = ("<script>x</script>", r"\input{a}$^_#&%", "| a |\n## b", "_$x^2", "ü漢")
+    names = (
+        "<script>x</script>",
+        r"\input{a}$^_#&%",
+        "| a |\n## b",
+        "_$x^2",
+        "ü漢",
+    )
     written = []
     for folder in (tmp_path / "one", tmp_path / "two"):
         with Journal(folder, "test") as journal:
@@ -427,6 +442,16 @@ def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
             bare = re.sub(r"\\[\\{}$&#%_]", "", line)
             assert bare.count("{") == bare.count("}"), line
             assert not re.search(r"[#%]|\\input|U\+03", bare), line
+
+
+def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
+    records = [record(s, case) for s in ("a\ud800", "b") for case in range(6)]
+    (found,) = contests(evidence(records))
+    assert set(found.solvers) == {"a\ud800", "b"}
+    assert standing(found).draws.shape[1] == 2
+    assert set(contest_sheets(evidence(records))["contests"]["solver"]) == {
+        r"a\ud800", "b",
+    }  # fmt: skip
 
 
 def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):

@@ -470,6 +470,8 @@ def test_the_folder_tells_suite_and_environment(measure, tmp_path):
 def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_path):
     measure(suite("honest"))
     (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "validation.json").write_text("{}")  # what was concluded from it
+    (tmp_path / "references").mkdir()
 
     other = suite("zero", text='name = "other"\n')
     with pytest.raises(InputError, match=r"holds another suite .* --fresh"):
@@ -481,6 +483,8 @@ def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_
     measure(other, digest="there", fresh=True)
     assert [r.solver for r in read_journal(tmp_path)] == ["zero"]
     assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "validation.json").exists()
+    assert not (tmp_path / "references").exists()
 
 
 def test_another_environment_is_refused_with_what_differs(measure):

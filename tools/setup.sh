@@ -1,17 +1,25 @@
 #!/usr/bin/env bash
 # Make .venv ready: system packages, virtual environment, pinned Python packages.
-# Usage: tools/setup.sh PYTHON   (called by make; does only what is missing)
+# Usage: tools/setup.sh PYTHON [browser]   (called by make; does only what is missing)
+# browser: what the tests of the report's page need besides, chromium and its driver
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1
+extra=${2:-}
 
 die() { echo "setup: $*" >&2; exit 1; }
 has_package() { dpkg-query -W -f='${Status}' "$1" 2>/dev/null | grep -q ' installed$'; }
 has_python() { "$python" -c "$1" >/dev/null 2>&1; }
 has_headers='import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")'
 
+has_chromium() { command -v chromium || command -v chromium-browser; }
+
 missing_packages() {
     local package
+    if [ "$extra" = browser ]; then
+        has_chromium >/dev/null || echo chromium
+        return
+    fi
     for package in libsuitesparse-dev libopenblas0-pthread gcc g++; do
         has_package "$package" || echo "$package"
     done
@@ -38,7 +46,8 @@ if command -v dpkg-query >/dev/null; then
     [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
 else
     echo "setup: no dpkg here; needed from this system: SuiteSparse 5.x with headers," \
-        "an optimised BLAS (OpenBLAS), a C and C++ compiler, Python headers"
+        "an optimised BLAS (OpenBLAS), a C and C++ compiler, Python headers;" \
+        "for the tests of the page: chromium"
 fi
 
 has_python 'import sys; assert sys.version_info >= (3, 11)' ||
@@ -51,4 +60,4 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
 # The variables pin what wheels are built with, too (new pip reads the second).
 echo "setup: installing Python packages into .venv"
 export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_BUILD_CONSTRAINT="$PWD/constraints.txt"
-.venv/bin/python -m pip install -q --disable-pip-version-check -e '.[fleet,dev]'
+.venv/bin/python -m pip install -q --disable-pip-version-check -e ".[${extra:-fleet,dev}]"

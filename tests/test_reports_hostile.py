@@ -1,0 +1,125 @@
+"""Names that no one should give break neither tables nor figures, in any format."""
+
+import csv
+import re
+import unicodedata
+
+import pytest
+
+from harness import Record, Verdict
+from harness.journal import Journal
+from reports import write_report
+from reports.latex import escaped as tex
+from reports.markdown import escaped as md
+from reports.wording import clean
+
+NAMES = (
+    "<b onmouseover=a()>&amp;</b><!--",
+    r"\end{table}\input|x$^^M%",
+    "=HYPERLINK(\"http://evil.example\")",
+    "\u202ertl \u0645\u0631\u062d\u0628\u0627 \u2066\u2069",
+    "z" + "\u0335\u0321\u0322" * 40 + "algo",
+    "\u0301begins with an accent",
+    "zero\u200bwidth\u200d\ufeff\u00ad",
+    "family 👨\u200d👩\u200d👧 and flag 🇨🇿",
+    "bell\x07 null\x00 escape\x1b[31m return\r\nnew\u2028line\u0085",
+    "lone \ud800 surrogate",
+    "1. - + # not a list",
+    "http://evil.example www.evil.example me@evil.example",
+    "", " ", "x" * 10_000,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("hostile")
+    with Journal(folder, "test") as journal:
+        for i, name in enumerate(NAMES):
+            for size in (10, 20, 40):
+                journal.append(Record(
+                    run_id=f"{i}-{size}{name}", case=f"{name}/{size}", family=name,
+                    params={name: size}, form=name, sizes={"variables": size},
+                    solver=name, options={name: name}, tol=1e-6, repeat=0, block=0,
+                    status=Verdict.WRONG if i % 2 else Verdict.VERIFIED, claimed=name,
+                    message=name, iterations=size, counts={name: 3},
+                    total_seconds=size / 1e4, primal=1e-9, dual=1e-9, gap=1e-9,
+                    complementarity=1e-9, quantities={"dofs": size, name: name},
+                    environment=name, started=name,
+                ))  # fmt: skip
+    write_report(folder, ["html", "md", "tex", "csv"])
+    return folder / "report"
+
+
+@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+def test_a_clean_name_is_one_short_line_that_hides_nothing(name):
+    shown = clean(name)
+    assert len(shown) <= 96
+    assert not re.search(r"[\n\r\x00-\x1f\x7f-\x9f\u2028\u2029]", shown)
+    assert not {"Cc", "Cf", "Cs"} & {unicodedata.category(c) for c in shown}
+    marks = "".join("m" if unicodedata.combining(c) else "." for c in shown)
+    assert "mmm" not in marks  # or they reach into the rows above and below
+    assert not marks.startswith("m")  # or it joins what stands before
+
+
+def test_names_that_differ_invisibly_do_not_look_the_same():
+    assert clean("solver\u200b") != clean("solver")
+
+
+def test_every_row_of_every_latex_table_has_its_columns(report):
+    for path in (report / "tables").glob("*.tex"):
+        columns = 0
+        for line in path.read_text("utf-8").splitlines():
+            if begun := re.search(r"\\begin\{tabular\}\{([lr]+)\}", line):
+                columns = len(begun[1])
+            if line.endswith(r"\\"):
+                body = line.removesuffix(r"\\")
+                assert len(re.findall(r"(?<!\\)&", body)) == columns - 1, line
+                assert not re.search(r"(?<!\\)[%#]", body), line
+            assert line.count(r"\end{table}") == (line == r"\end{table}"), line
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [
+        ('say "so"', r"say \symbol{34}so\symbol{34}"),  # OT1 has no \textquotedbl
+        ("a--b---c", r"a-{}-b-{}-{}-c"),  # no dashes that were not there
+        ("«þ»", "U+00ABU+00FEU+00BB"),  # OT1 has none of them
+        ("ünï", "ünï"),
+    ],
+)
+def test_latex_prints_what_is_there_with_no_further_package(name, printed):
+    assert tex(name) == printed
+
+
+def test_every_row_of_a_markdown_table_has_its_columns_and_links_nowhere(report):
+    text = (report / "report.md").read_text("utf-8")
+    for block in re.findall(r"(?:^\|.*\n)+", text, flags=re.MULTILINE):
+        counts = {len(re.findall(r"(?<!\\)\|", r)) for r in block.splitlines()}
+        assert len(counts) == 1
+    assert not re.search(r"<[a-z/!]", text)
+    assert not re.search(r"http://|www\.|\w@\w", text)
+
+
+@pytest.mark.parametrize("name", ["1. x", "1) x", "- x", "+ x"])
+def test_markdown_makes_no_list_of_a_name(name):
+    assert re.match(r"\d*\\[-+.)] x$", md(name))
+
+
+def test_markdown_leaves_numbers_alone():
+    assert [md(n) for n in ("-1.5e-3", "1.25", "3")] == ["-1.5e-3", "1.25", "3"]
+
+
+def test_csv_holds_every_name_as_it_was(report):
+    with (report / "tables" / "measurements.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    wanted = [n.replace("\ud800", r"\ud800") for n in NAMES]
+    assert len(rows) == 3 * len(NAMES)
+    assert {row["solver"] for row in rows} == set(wanted)
+
+
+def test_the_page_holds_no_character_that_hides(report):
+    text = (report / "index.html").read_text("utf-8")
+    hiding = {c for c in text if unicodedata.category(c) in {"Cf", "Cs", "Zl", "Zp"}}
+    controls = {c for c in text if unicodedata.category(c) == "Cc"}
+    assert hiding == set()
+    assert controls <= {"\n"}
