@@ -5,7 +5,7 @@ from harness.certificate import Certificate, UncertifiableError, certify
 from harness.errors import InputError
 from harness.kkt import Residuals, kkt_residuals, verdict
 from harness.limits import memory_limit_mib, too_large
-from harness.mechanics import Mechanics
+from harness.mechanics import Grid, Mechanics
 from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
@@ -19,6 +19,7 @@ __all__ = [
     "Chained",
     "Family",
     "Fields",
+    "Grid",
     "InputError",
     "Matrix",
     "Mechanics",

@@ -157,6 +157,13 @@ def _add_export_options(command: _Parser) -> None:
 
 def _add_validate_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument(
+        "--budget",
+        metavar="SECONDS",
+        type=float,
+        default=300.0,
+        help="for finer meshes, that tell discretisation errors; default: 300",
+    )
     _add_plugin(command)
     _add_json(command)
 

@@ -52,6 +52,15 @@ class Exact(NamedTuple):
     loose: Extended  #: (m,) estimate of the compliance of each row, B_i diag(K)⁻¹B_iᵀ
 
 
+class Grid(NamedTuple):
+    """The mesh behind the unknowns, which are numbered node by node."""
+
+    points: NDArray[np.float64]  #: (N, d)
+    cells: NDArray[np.int64]  #: (E, 2) segments or (E, 4) quadrilaterals, in turn
+    bodies: NDArray[np.int64]  #: (E,) body of each cell
+    lift: Vector  #: (n,) physical unknown − u, where boundary values are not zero
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanics:
     """Elastic bodies in contact, without dimensions, and the way back to them.
@@ -68,6 +77,9 @@ class Mechanics:
     mesh_size: float  #: of the contact side, in the lengths of `primal`
     #: rigid motions of single bodies (n, r), supports or not: to balance forces with
     rigid: NDArray[np.float64]
+    scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
+    constant: float = 0.0
+    grid: Grid | None = None  #: to compare meshes, see `harness.discretisation`
 
     @cached_property
     def inverse(self) -> Inverse:
@@ -86,6 +98,11 @@ class Mechanics:
             c=self.primal.h.astype(Real), held=held,
             loose=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
+
+    def energy(self, u: Extended) -> float:
+        """Return the potential energy of `u` (n,), SI, summed in extended precision."""
+        objective = 0.5 * (u @ (self.exact.K @ u)) - self.exact.f @ u
+        return float(self.scale * objective + self.constant)
 
     def norm(self, v: Extended) -> float:
         """Return the energy norm ‖v‖_K; a seminorm where bodies can move rigidly.

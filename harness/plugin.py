@@ -100,4 +100,8 @@ class Family(Protocol):
         starts, and ``complete(given) -> params`` where a default depends on another
         key. All raise `InputError` for values outside the family's range. One with
         ``path_suffix`` takes a file; see `harness.names`.
+
+        One with ``refined(params) -> params`` says which case has every cell halved,
+        for `harness.discretisation`; its mechanics have a grid. A text ``singular``
+        says why refinement has no limit of finite energy, where it has none.
         """

@@ -6,11 +6,17 @@ import json
 import os
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from harness.agreement import as_data
 from harness.crossval import brief
+from harness.discretisation import Discretisation, discretisation_errors
 from harness.errors import InputError
+from harness.journal import read_journal
+from harness.names import assemble
 from harness.show import aligned, legible, say
 from harness.validation import validated
 from harness.workbench import Workbench
@@ -31,14 +37,40 @@ def validate(workbench: Workbench, options: Namespace) -> int:
     temporary.write_text(json.dumps(data, allow_nan=False) + "\n", "utf-8")
     os.replace(temporary, target)
     pages = workbench.validation(options.folder, data)
+    meshes = _meshes(workbench, options.folder, options.budget)
     if options.json:
         verdict = {k: v for k, v in data.items() if k != "problems"}
+        verdict["discretisation"] = [asdict(d) for d in meshes]
         print(json.dumps(verdict, allow_nan=False))
     else:
         print(as_text(data))
+        if known := [d for d in meshes if d.error is not None]:
+            lines = [f"{d.case}: {_mesh(d)}" for d in known]
+            title = (
+                "Discretisation errors, relative; `report` shows what they are worth"
+            )
+            print(f"\n{_list(title, lines)}")
         for page in pages:
             print(page)
     return 0 if found.agreed else 1
+
+
+def _meshes(workbench: Workbench, folder: Path, budget: float) -> list[Discretisation]:
+    """Solve the folder's cases on finer meshes, where families say what these are."""
+    refinable = {k: f for k, f in workbench.families.items() if hasattr(f, "refined")}
+    records = {r.case: r for r in read_journal(folder) if r.family in refinable}
+    names = []
+    for r in records.values():
+        with suppress(InputError):  # of another version: listed as not validated
+            names.append(assemble(refinable[r.family], r.params, r.form))
+    return discretisation_errors(
+        names, refinable, workbench.reference, folder, budget, say
+    )
+
+
+def _mesh(d: Discretisation) -> str:
+    before = "less than " if d.kind == "rounding" else ""
+    return f"{before}{_e(d.error)}{' to the next mesh' * (d.kind == 'change')}"
 
 
 def as_text(data: Mapping[str, Any]) -> str:

@@ -27,7 +27,7 @@ from problems.emit import FORMS, contact_case
 from problems.inverse import GeneralisedInverse
 from problems.linearise import METHODS, linearisation
 from problems.mesh import dofs_of, half_ring, join, rectangle
-from problems.ranges import at_least, one_of
+from problems.ranges import at_least, doubled, one_of
 from problems.results import quantities
 from problems.stepping import LoadPath
 
@@ -51,6 +51,8 @@ class BeamRing:
         hash=False,
     )  # fmt: skip
     forms: tuple[str, ...] = FORMS
+    #: the energy under the point load grows like log 1/h
+    singular: str = "the work of a point load grows without bound as its cell shrinks"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in the keys left out; radial defaults to 2·Nh, step to steps."""
@@ -74,6 +76,13 @@ class BeamRing:
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
         one_of(self.name, p, METHODS | {"plane": ("strain", "stress")})
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved; its load steps are linearised anew.
+
+        The arcs of the ring are other polygons.
+        """
+        return {**params, **doubled(params, "Nr", "Nh", "radial")}
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Case, Mechanics, Solution, Vector
+from harness import QP, Case, Grid, Mechanics, Solution, Vector
 from problems.bodies import Bodies
 from problems.dual import Transformed, dual_bounds, dualise
 from problems.inverse import GeneralisedInverse
@@ -68,7 +68,11 @@ def contact_case(
         dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=primal, back=new.recover, factorise=supported,
-            mesh_size=bodies.mesh_size, rigid=bodies.rigid,
+            mesh_size=bodies.mesh_size, rigid=bodies.rigid, scale=energy,
+            grid=Grid(
+                bodies.mesh.points, bodies.mesh.cells, bodies.body,
+                np.zeros(bodies.mesh.dofs),
+            ),
         ),
     )  # fmt: skip
 

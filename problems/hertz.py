@@ -9,6 +9,9 @@ Bodies are half discs, pressed by a uniform pressure on the flat side; the appro
 not determined by the theory, so that the force is given. Only contact holds the upper
 body up: ``dual-bounds`` does not exist.
 
+More cells per a (`n`, `m`) refine the contact alone: away from it, cells grow by GROWTH
+whatever their number. Every one of `halvings` halves all cells.
+
 R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark of the literature; it gives no units,
 here they are mm, GPa and MN/m. It has a = 0.68078 mm and p₀ = 9.3514 GPa.
 
@@ -77,7 +80,7 @@ class HertzPlane:
     name: str = "hertz-plane"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
-            "n": 10, "load": 10.0, "plane": "strain",
+            "n": 10, "load": 10.0, "plane": "strain", "halvings": 0,
         }),
         hash=False,
     )  # fmt: skip
@@ -86,8 +89,13 @@ class HertzPlane:
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         at_least(1, self.name, params, ("n",))
+        at_least(0, self.name, params, ("halvings",))
         positive(self.name, params, ("load",))
         one_of(self.name, params, {"plane": ("strain", "stress")})
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved; the arcs are other polygons."""
+        return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -99,7 +107,7 @@ class HertzPlane:
         exact = LineContact(
             p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
         )
-        mesh = lower_half(exact.a / p["n"], exact.a)
+        mesh = lower_half(exact.a / p["n"], exact.a, p["halvings"])
         bodies = assemble(
             mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("cylinder",),
             materials=(MATERIAL,), plane=p["plane"], units=(RADIUS, exact.P),
@@ -119,6 +127,7 @@ class HertzCylinder:
         default_factory=lambda: MappingProxyType({
             "n": 10, "m": 8, "load": 1.0, "radius": 1.0, "ratio": 1.0,
             "slave": "upper", "contact": "mortar", "basis": "dual", "plane": "strain",
+            "halvings": 0,
         }),
         hash=False,
     )  # fmt: skip
@@ -127,10 +136,15 @@ class HertzCylinder:
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         at_least(1, self.name, params, ("n", "m"))
+        at_least(0, self.name, params, ("halvings",))
         positive(self.name, params, ("load", "radius", "ratio"))
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),
         })  # fmt: skip
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved; the arcs are other polygons."""
+        return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -158,8 +172,8 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
         p["load"] * UNIT_LOAD, 1 / (1 / RADIUS + 1 / radius), 1 / compliance
     )
     halves = (
-        lower_half(exact.a / p["n"], exact.a),
-        upper_half(exact.a / p["m"], exact.a, radius),
+        lower_half(exact.a / p["n"], exact.a, p["halvings"]),
+        upper_half(exact.a / p["m"], exact.a, radius, p["halvings"]),
     )
     mesh, body = join((prefixed(halves[0], "upper_"), prefixed(halves[1], "lower_")))
     sides = mesh.boundaries
@@ -178,21 +192,23 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     return bodies, exact
 
 
-def lower_half(h: float, a: float) -> Mesh:
+def lower_half(h: float, a: float, halvings: int) -> Mesh:
     """Mesh the lower half of the cylinder above (0, 0), with cells of size h there."""
-    return half_disc((0.0, RADIUS), *_polar(h, a, RADIUS, -np.pi / 2))
+    return half_disc((0.0, RADIUS), *_polar(h, a, RADIUS, -np.pi / 2, halvings))
 
 
-def upper_half(h: float, a: float, radius: float) -> Mesh:
+def upper_half(h: float, a: float, radius: float, halvings: int) -> Mesh:
     """Mesh the upper half of a cylinder below (0, 0), with cells of size h there."""
-    return half_disc((0.0, -radius), *_polar(h, a, radius, np.pi / 2))
+    return half_disc((0.0, -radius), *_polar(h, a, radius, np.pi / 2, halvings))
 
 
-def _polar(h: float, a: float, radius: float, towards: float) -> tuple[Vector, Vector]:
-    """Grade angles about `towards` and radii from the arc, geometrically."""
-    arc = graded(h, UNIFORM * a, radius * np.pi / 2) / radius
+def _polar(
+    h: float, a: float, radius: float, towards: float, halvings: int
+) -> tuple[Vector, Vector]:
+    """Grade angles about `towards` and radii from the arc, geometrically; halve all."""
+    arc = halved(graded(h, UNIFORM * a, radius * np.pi / 2), halvings) / radius
     angles = towards + np.concatenate([-arc[:0:-1], arc])
-    return angles, radius - graded(h, 0.0, radius)[:-1]
+    return angles, radius - halved(graded(h, 0.0, radius), halvings)[:-1]
 
 
 def graded(h: float, uniform: float, total: float) -> Vector:
@@ -202,6 +218,12 @@ def graded(h: float, uniform: float, total: float) -> Vector:
     count = np.ceil(np.log1p(rest * (GROWTH - 1) / (GROWTH * h)) / np.log(GROWTH))
     sizes = GROWTH ** np.arange(1, count + 1)
     return np.append(even, even[-1] + rest * np.cumsum(sizes) / sizes.sum())
+
+
+def halved(x: Vector, times: int) -> Vector:
+    """Insert the midpoints of an increasing sequence, so many times."""
+    places = np.arange(x.size)
+    return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
 def above_plane(mesh: Mesh) -> ContactRows:

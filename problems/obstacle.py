@@ -24,13 +24,24 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
-from harness import QP, Case, Mechanics, Reference, Solution, Value, Vector, no_rows
+from harness import (
+    QP,
+    Case,
+    Grid,
+    Mechanics,
+    Reference,
+    Solution,
+    Value,
+    Vector,
+    no_rows,
+)
 from problems.dual import Transformed, dual_bounds
 from problems.inverse import GeneralisedInverse, regular_inverse
-from problems.ranges import at_least, one_of
+from problems.ranges import at_least, doubled, one_of
 from problems.results import ACTIVE
 
 HALF = 1.5  #: half the width of Ω, m
@@ -52,6 +63,10 @@ class Obstacle:
         one_of(self.name, params, {"dim": (1, 2)})
         at_least(2, self.name, params, ("n",))
 
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved."""
+        return {**params, **doubled(params, "n")}
+
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
@@ -66,16 +81,21 @@ class Obstacle:
         else:
             new = dual_bounds(rows, problem.factorise())
         seconds = None if form == "primal" else perf_counter() - start
+        datum = problem.energy(np.zeros(rows.q.size))
         return Case(
             qp=new.qp,
             recover=lambda s: problem.lift + new.recover(s).x,
             quantities=lambda s: obstacle_quantities(problem, new.recover(s)),
             scale=new.sign,
-            constant=new.constant + problem.energy(np.zeros(rows.q.size)),
+            constant=new.constant + datum,
             dualise_seconds=seconds,
             mechanics=Mechanics(
                 primal=rows, back=new.recover, factorise=problem.factorise,
                 mesh_size=2 * HALF / p["n"], rigid=np.zeros((rows.q.size, 0)),
+                constant=datum, grid=Grid(
+                    problem.x, cells(p["dim"], p["n"]),
+                    np.zeros(problem.cells, dtype=np.int64), problem.lift,
+                ),
             ),
         )  # fmt: skip
 
@@ -155,6 +175,15 @@ def nodes(dim: int, n: int) -> Vector:
     x = np.linspace(-HALF, HALF, n + 1)
     grid = np.meshgrid(*[x] * dim, indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=-1)
+
+
+def cells(dim: int, n: int) -> NDArray[np.int64]:
+    """Return the corners of each cell in turn, (n, 2) or (n², 4)."""
+    i = np.arange(n)
+    if dim == 1:
+        return np.stack([i, i + 1], axis=-1)
+    first = (i[:, None] * (n + 1) + i).ravel()
+    return np.asarray(first[:, None] + np.array([0, n + 1, n + 2, 1]))
 
 
 def exact_height(x: Vector) -> Vector:

@@ -27,7 +27,7 @@ from problems.elasticity import Material
 from problems.emit import contact_case
 from problems.linearise import METHODS, linearisation
 from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.ranges import at_least, one_of, positive
+from problems.ranges import at_least, doubled, one_of, positive
 from problems.results import quantities
 from problems.stepping import primal_qp
 from problems.stress import gauss_stress
@@ -58,6 +58,10 @@ class ContactPatch:
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),
         })  # fmt: skip
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved; the odd row of cells is not."""
+        return {**params, **doubled(params, "lower", "upper")}
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -33,3 +33,8 @@ def one_of(
                 f"{family}: {key}={params[key]!r} is unknown, expected "
                 + " or ".join(map(repr, values))
             )
+
+
+def doubled(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
+    """Return the integer `keys`, numbers of cells, twice as large."""
+    return {key: 2 * int(params[key]) for key in keys}

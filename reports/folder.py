@@ -37,6 +37,7 @@ from reports.sweeps import accuracy
 from reports.tally import tally
 from reports.times import times
 from reports.wording import TIMED, clean, tolerance
+from reports.worth import worth
 from reports.writing import RENDERED, write_page, write_text
 
 MOST_LADDERS = 6  #: that are drawn; all are tabulated
@@ -93,6 +94,7 @@ def compose(evidence: Evidence) -> Page:
         ranking(standings),
         profiles(standings, evidence.solvers),
         accuracy(evidence),
+        worth(evidence),
         iterations(evidence),
         convergence(evidence),
         errors(evidence),

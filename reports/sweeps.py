@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness import Verdict
+from harness.discretisation import read_discretisation
+from reports.certified import certified_picture, certified_sweeps, matched_table
 from reports.data import Evidence, Outcome
 from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_log, look
 from reports.layout import Cell, Picture, Section, Table, name_cell, source
@@ -24,32 +26,51 @@ Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
 
 
 def accuracy(evidence: Evidence) -> Section | None:
-    """Tabulate and draw every sweep; None where there is none."""
-    swept = _sweeps(evidence)
-    if not swept:
+    """Tabulate and draw every sweep; None where there is none.
+
+    Certified errors where there are any; the largest residual elsewhere.
+    """
+    swept, certified = _sweeps(evidence), certified_sweeps(evidence)
+    if not swept and not certified:
         return None
-    drawn = [*swept][:_PANELS]
-    rest = f" The first {len(drawn)} of {len(swept)} cases." * (len(swept) > len(drawn))
-    return Section(
-        name="accuracy",
-        title="Time to accuracy",
-        prose=(
+    tables, pictures, prose = [], [], []
+    if certified:
+        meshes = read_discretisation(evidence.directory)
+        prose.append(
             "Solvers test their tolerance in norms of their own, so that equal "
             "tolerances are unequal demands. Here the tolerance asked for is swept, "
-            "every answer is judged at the same accuracy, and what counts is the "
-            "cheapest answer that is verified at it.",
-        ),
-        tables=(_table(swept, evidence.solvers),),
-        pictures=(
-            Picture(
-                name="sweep",
-                caption="Certified accuracy (the largest of the four residuals) "
-                "against the median total time, a line per solver through the "
-                "tolerances asked for. Below the horizontal line an answer is "
-                f"verified (filled).{rest}",
-                figure=_figure({key: swept[key] for key in drawn}, evidence.solvers),
-            ),
-        ),
+            "the error of every answer is certified, and solvers are compared by the "
+            "time at equal error. No claim is believed: it only tells that a solver's "
+            "own test ended the solve."
+        )
+        tables.append(matched_table(certified, evidence.solvers))
+        pictures.append(certified_picture(certified, evidence.solvers, meshes))
+    if swept:
+        prose.append(
+            "Every answer of the sweep is judged at the same accuracy, too, whatever "
+            "tolerance was asked for; what counts there is the cheapest answer that is "
+            "verified at it."
+        )
+        tables.append(_table(swept, evidence.solvers))
+    if rest := {key: row for key, row in swept.items() if key[0] not in certified}:
+        pictures.append(_picture(rest, evidence.solvers))
+    return Section(
+        name="accuracy", title="Time to accuracy", prose=tuple(prose),
+        tables=tuple(tables), pictures=tuple(pictures),
+    )  # fmt: skip
+
+
+def _picture(
+    swept: Mapping[Key, Mapping[str, list[Outcome]]], solvers: Sequence[str]
+) -> Picture:
+    drawn = dict([*swept.items()][:_PANELS])
+    rest = f" The first {len(drawn)} of {len(swept)} cases." * (len(swept) > len(drawn))
+    return Picture(
+        name="sweep",
+        caption="Certified accuracy (the largest of the four residuals) against the "
+        "median total time, a line per solver through the tolerances asked for. Below "
+        f"the horizontal line an answer is verified (filled).{rest}",
+        figure=_figure(drawn, solvers),
     )
 
 

@@ -13,6 +13,7 @@ from harness.assessment import assess, distances, energy_allowed
 from harness.build import build
 from harness.cli import main
 from harness.crossval import compared
+from harness.discretisation import read_discretisation
 from harness.journal import Journal, read_journal
 from harness.judge import blank, judged
 from harness.measure import Measurement
@@ -632,3 +633,33 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
 
     assert [a.assessment is None for a in found.answers] == [False, True]
     assert "no way back" in found.answers[1].remarks[0]
+
+
+def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path):
+    """u″ = 2 over a length of 1 makes ‖u − u_h‖² = h²/3, but for the norm of û."""
+    text = "obstacle/dim=1/n=12/primal"
+    case = built(text)
+    folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])
+    _, verdict = verdict_on(cli, folder)
+    (found,) = read_discretisation(folder).values()
+    (level, *_) = found.levels
+
+    assert verdict["discretisation"][0]["error"] == found.error
+    assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
+    assert "obstacle/dim=1/n=12: " in cli(folder)[1]
+    for budget in ("0", "nan"):
+        (none,) = verdict_on(cli, folder, "--budget", budget)[1]["discretisation"]
+        assert none["error"] is None
+
+
+def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
+    text = "obstacle/dim=1/n=12/primal"
+    exact = reference_solution(built(text).qp)
+    folder = write(tmp_path / "out", [("exact", text, exact)])
+    with Journal(folder, "there") as journal:
+        old = record_of(text, "old").but(params={"size": 3}, case="obstacle/size=3/x")
+        journal.append(old.but(status=Verdict.FAILED))
+
+    assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
+        "obstacle/dim=1/n=12"
+    ]

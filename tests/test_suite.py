@@ -425,7 +425,7 @@ def test_the_suite_of_accuracies_judges_at_one():
     sweep = shipped("accuracy")
 
     assert sweep.accuracy == 1e-6
-    assert len(sweep.tolerances) == 6
+    assert len(sweep.tolerances) == 8
 
 
 def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():

@@ -1,0 +1,299 @@
+"""What finer meshes say of the error of a mesh, against errors known without them.
+
+The obstacle problems have exact solutions: the true error of u_h is a quadrature over
+its elements. The patch test's solution is in every finite element space.
+"""
+
+import json
+from time import sleep
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from harness import InputError
+from harness.discretisation import (
+    FILE,
+    MOST_UNKNOWNS,
+    Level,
+    discretisation_errors,
+    estimated,
+    read_discretisation,
+)
+from harness.halving import prolongation
+from harness.names import completed, parse
+from harness.references import reference_point
+from problems import PROBLEMS
+from problems.hertz import halved
+from problems.obstacle import exact_energy, exact_height, obstacle_problem
+from solvers.reference import reference_solution
+
+
+def levels(*distances, bound=1e-9):
+    """Levels of norm 2 so far from each other."""
+    return [
+        Level(case="box", unknowns=9, energy=-7.0, norm=2.0, bound=bound, distance=d)
+        for d in (None, *distances)
+    ]
+
+
+def converging(error, rate, count):
+    """Levels of orthogonal errors ε², ε²/2^q, …: between them are their differences."""
+    squares = error**2 * 2.0 ** (-rate * np.arange(count))
+    return levels(*np.sqrt(-np.diff(squares)))
+
+
+def meshes(folder, *names, budget=1e9):
+    return discretisation_errors(
+        [parse(name, PROBLEMS) for name in names], PROBLEMS, reference_solution,
+        folder, budget,
+    )  # fmt: skip
+
+
+def true_error(dim, n, folder):
+    """‖u − u_h‖ by Gauss's rule on every cell, and ‖û‖ that certificates divide by."""
+    problem = obstacle_problem(dim, n)
+    case = PROBLEMS["obstacle"].build("primal", {"dim": dim, "n": n}, None)
+    point = reference_point(case.mechanics, reference_solution, folder)
+    u = (problem.lift + point.u).astype(float).reshape((n + 1,) * dim)
+    h, (s, w) = 3 / n, np.polynomial.legendre.leggauss(6)
+    s, w = (s + 1) / 2, w / 2
+    corner = -1.5 + h * np.arange(n)
+    x = (corner[:, None] + h * s).ravel()
+    i, t, weight = np.repeat(np.arange(n), 6), np.tile(s, n), np.tile(w * h, n)
+    if dim == 1:
+        slopes = [(u[i + 1] - u[i]) / h]
+        points = x[:, None]
+    else:
+        a, b = t[:, None], t
+        I, J = i[:, None], i
+        slopes = [
+            ((u[I + 1, J] - u[I, J]) * (1 - b) + (u[I + 1, J + 1] - u[I, J + 1]) * b)
+            / h,
+            ((u[I, J + 1] - u[I, J]) * (1 - a) + (u[I + 1, J + 1] - u[I + 1, J]) * a)
+            / h,
+        ]
+        points = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
+        weight = np.outer(weight, weight).ravel()
+    e = 1e-6 * np.eye(dim)
+    exact = [(exact_height(points + d) - exact_height(points - d)) / 2e-6 for d in e]
+    square = sum(
+        (a - np.asarray(b).ravel()) ** 2 for a, b in zip(exact, slopes, strict=True)
+    )
+    return np.sqrt(weight @ square), point.norm
+
+
+@pytest.mark.parametrize(("dim", "n"), [(1, 15), (1, 24), (2, 10), (2, 15)])
+def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n):
+    (found,) = meshes(tmp_path, f"obstacle/dim={dim}/n={n}/primal")
+    error, norm = true_error(dim, n, tmp_path / "references")
+
+    assert found.kind == "limit"
+    assert found.rate == pytest.approx(2, abs=0.1)
+    assert found.error == pytest.approx(error / norm, rel=0.03)
+    assert found.change < found.error  # the next mesh has an error, too
+
+
+@pytest.mark.parametrize(("dim", "least", "most"), [(1, 0.9, 1.0), (2, 0.6, 0.7)])
+def test_energies_say_more_than_the_error_where_boundary_values_move(
+    tmp_path, dim, least, most
+):
+    """The string has points for a boundary; there, ‖u_h − u‖² ≤ 2(J_h − J)."""
+    errors = [true_error(dim, n, tmp_path)[0] for n in (12, 24, 48)]
+
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(1, abs=0.1)
+    for n, error in zip((12, 24, 48), errors, strict=True):
+        case = PROBLEMS["obstacle"].build("primal", {"dim": dim, "n": n}, None)
+        point = reference_point(case.mechanics, reference_solution, tmp_path)
+        excess = case.mechanics.energy(point.u) - exact_energy(dim)
+        assert least <= error / np.sqrt(2 * excess) <= most + 1e-6
+
+
+def test_energies_of_mechanics_are_those_of_the_case():
+    """½ of the work of the pressure on the patch; what a dual form finds for others."""
+    for name in ("contact-patch", "obstacle", "hertz-plane", "hertz-cylinder"):
+        family = PROBLEMS[name]
+        for form in family.forms:
+            case = family.build(form, completed(family, {}), reference_solution)
+            point = reference_point(case.mechanics, reference_solution)
+            s = reference_solution(case.qp)
+            energy = case.scale * case.qp.objective(s.x) + case.constant
+            assert case.mechanics.energy(point.u) == pytest.approx(energy, rel=1e-11)
+
+
+def test_a_solution_in_the_space_has_no_error_that_could_be_seen(tmp_path):
+    (found,) = meshes(tmp_path, "contact-patch/primal")
+
+    assert found.kind == "rounding"
+    assert found.change < 1e-13 < found.error < 1e-7
+    assert found.rate is None
+    assert found.levels[0].energy == pytest.approx(-45500, rel=1e-12)
+
+
+def test_halving_removes_the_error_of_a_whole_cylinder_with_the_rate_of_its_elements(
+    tmp_path,
+):
+    (found,) = meshes(tmp_path, "hertz-plane/n=4/dual")
+
+    assert found.kind == "limit"
+    assert found.rate == pytest.approx(2, abs=0.1)
+    assert found.levels[1].case == "hertz-plane/n=4/halvings=1/primal"
+
+
+def test_halved_cells_keep_every_node():
+    x = np.array([0.0, 1, 3, 7])
+    assert halved(x, 0).tolist() == x.tolist()
+    assert halved(x, 2)[::4].tolist() == x.tolist()
+    assert halved(x, 1)[1::2].tolist() == [0.5, 2, 5]
+
+
+def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):
+    (found,) = meshes(tmp_path, "beam-ring/Nr=4/Nh=2/step=1/dual")
+
+    assert found.kind == "change"
+    assert found.error == found.change
+    assert "point load" in found.note
+    assert [x.unknowns for x in found.levels] == [580, 2052, 7684]
+    assert found.levels[1].case == "beam-ring/Nr=8/Nh=4/step=1/primal"
+
+
+@pytest.mark.parametrize("rate", [1.0, 1.5, 2.0])
+def test_the_rate_and_the_error_of_a_sequence_that_has_them_are_found(rate):
+    found = estimated("box", converging(0.6, rate, 3))
+
+    assert found.rate == pytest.approx(rate)
+    assert found.error == pytest.approx(0.6 / 2)
+
+
+def test_two_meshes_tell_their_difference_only():
+    found = estimated("box", levels(0.3), note="the next one would be too large")
+
+    assert (found.kind, found.rate) == ("change", None)
+    assert found.note == "the next one would be too large"
+    assert found.error == found.change == pytest.approx(0.15)
+
+
+def test_what_hardly_falls_is_not_extrapolated():
+    found = estimated("box", levels(0.3, 0.29))
+
+    assert found.kind == "change"
+    assert "slowly" in found.note
+
+
+def test_what_the_reference_does_not_know_is_no_discretisation_error():
+    found = estimated("box", levels(1e-3, bound=1e-2))
+
+    assert found.kind == "rounding"
+    assert found.error >= 1e-2
+
+
+def test_halved_cells_have_the_bilinear_function_that_the_cells_had(tmp_path):
+    """On every family's own meshes, curved ones and those with triangles, too."""
+    for name in ("obstacle", "contact-patch", "beam-ring", "hertz-cylinder"):
+        family = PROBLEMS[name]
+        params = completed(family, {})
+        grids = [
+            family.build("primal", p, reference_solution).mechanics.grid
+            for p in (params, family.refined(params))
+        ]
+        P = prolongation(*grids)
+        straight = (abs(P @ grids[0].points - grids[1].points) < 1e-9).all(axis=1)
+
+        assert P.shape == (len(grids[1].points), len(grids[0].points))
+        assert P.sum(axis=1) == pytest.approx(1, rel=1e-15)
+        assert straight.all() or name in ("beam-ring", "hertz-cylinder")
+        assert straight.sum() >= len(grids[0].points)
+
+
+def test_meshes_that_are_not_halved_are_refused():
+    family = PROBLEMS["obstacle"]
+    grids = [
+        family.build("primal", {"dim": 2, "n": n}, None).mechanics.grid
+        for n in (4, 6, 8, 16)
+    ]
+    for other in (grids[1], grids[3], grids[0]):
+        with pytest.raises(ValueError, match="every cell halved"):
+            prolongation(grids[0], other)
+    assert prolongation(grids[0], grids[2]).shape == (81, 25)
+
+
+def test_forms_of_one_physical_case_are_one_line_of_the_file(tmp_path):
+    names = ("obstacle/n=4/primal", "obstacle/n=4/dual-bounds", "obstacle/n=6/primal")
+    found = meshes(tmp_path, *names)
+
+    assert [d.case for d in found] == ["obstacle/n=4", "obstacle/n=6"]
+    assert list(read_discretisation(tmp_path).values()) == found
+    assert len(list((tmp_path / "references").iterdir())) == 6
+
+
+def test_what_cannot_be_told_has_its_reason(tmp_path):
+    broken = replace_build(PROBLEMS["obstacle"], ArithmeticError("it is Monday"))
+    bare = SimpleNamespace(
+        name="bare", defaults={}, forms=("primal",), build=PROBLEMS["obstacle"].build
+    )
+    families = {"obstacle": broken, "bare": bare}
+    names = [parse("obstacle/primal", families), parse("bare/primal", families)]
+    found = discretisation_errors(names, families, reference_solution, tmp_path, 1e9)
+    large = meshes(tmp_path, "obstacle/n=300/primal")
+    late = meshes(tmp_path, "obstacle/primal", budget=-1.0)
+
+    assert {d.kind for d in (*found, *large, *late)} == {"unknown"}
+    assert "it is Monday" in found[0].note
+    assert "does not say" in found[1].note
+    assert f"{MOST_UNKNOWNS:,}" in large[0].note
+    assert "time" in late[0].note
+    assert late[0].levels == large[0].levels == ()
+
+
+def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
+    """The first one takes a twentieth of a second, the next eight times that."""
+    obstacle = PROBLEMS["obstacle"]
+
+    def build(*given):
+        sleep(0.05)
+        return obstacle.build(*given)
+
+    slow = SimpleNamespace(
+        name="obstacle", defaults=obstacle.defaults, forms=obstacle.forms,
+        refined=obstacle.refined, build=build,
+    )  # fmt: skip
+    (found,) = discretisation_errors(
+        [parse("obstacle/n=4/primal", PROBLEMS)], {"obstacle": slow},
+        reference_solution, tmp_path, 0.4,
+    )  # fmt: skip
+
+    assert found.kind == "unknown"
+    assert "more time than was left" in found.note
+    assert len(found.levels) <= 1
+
+
+def replace_build(family, error):
+    def build(*_):
+        raise error
+
+    return SimpleNamespace(
+        name=family.name, defaults=family.defaults, forms=family.forms, build=build,
+        refined=family.refined,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"schema": 2, "cases": []}', '{"schema": 1, "cases": [{}]}']
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / FILE).write_text(text)
+    with pytest.raises(InputError, match=FILE) as e:
+        read_discretisation(tmp_path)
+    assert "\n" not in str(e.value)
+
+
+def test_a_folder_without_the_file_says_nothing(tmp_path):
+    assert read_discretisation(tmp_path) == {}
+
+
+def test_the_file_is_plain_data(tmp_path):
+    (found,) = meshes(tmp_path, "obstacle/n=4/primal")
+    (row,) = json.loads((tmp_path / FILE).read_text())["cases"]
+
+    assert row["case"] == "obstacle/n=4"
+    assert row["error"] == found.error

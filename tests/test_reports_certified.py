@@ -1,0 +1,326 @@
+"""Times at matched certified errors, and what accuracy beyond the mesh's costs.
+
+The sweeps below follow laws that are known: times and errors are planted.
+"""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness import InputError, Record, Verdict
+from harness.discretisation import FILE, Discretisation, Level
+from reports.certified import certified_picture, certified_sweeps
+from reports.data import Evidence, arrange
+from reports.folder import compose
+from reports.markdown import markdown
+from reports.matched import matched, time_at
+
+TOLS = (1e-2, 1e-4, 1e-6, 1e-8)
+
+
+def record(solver="a", tol=1e-6, repeat=0, **changes):
+    defaults = dict(
+        run_id=f"{solver}-{tol}-{repeat}-{changes.get('case', 'box/dual')}",
+        case="box/dual", family="box", params={}, form="dual", sizes={},
+        solver=solver, options={}, tol=tol, repeat=repeat, block=repeat,
+        status=Verdict.VERIFIED, claimed="solved", total_seconds=0.01, primal=1e-9,
+        dual=1e-9, complementarity=1e-9, gap=1e-9, energy_bound=tol,
+        started="2026-11-21T06:00:00.000+00:00",
+    )  # fmt: skip
+    return Record(**(defaults | changes))
+
+
+def sweep(solver="a", seconds=lambda tol: 1e-3 * tol**-0.25, repeats=3, **changes):
+    """One solver whose certified error is its tolerance."""
+    return [
+        record(solver, tol, i, total_seconds=seconds(tol) * (1 + 0.01 * i), **changes)
+        for tol in TOLS
+        for i in range(repeats)
+    ]
+
+
+def outcomes(records):
+    evidence = Evidence(directory=Path(), records=arrange(records))
+    return [o for o in evidence.flat if o.solver == records[0].solver]
+
+
+@pytest.fixture
+def page(tmp_path):
+    def make(records, meshes=()):
+        if meshes:
+            rows = [vars(m) | {"levels": [vars(x) for x in m.levels]} for m in meshes]
+            (tmp_path / FILE).write_text(json.dumps({"schema": 1, "cases": rows}))
+        return compose(Evidence(directory=tmp_path, records=arrange(records)))
+
+    return make
+
+
+def tables(page, name):
+    (section,) = (s for s in page.sections if s.name == name)
+    return [
+        [dict(zip(t.columns, row, strict=True)) for row in t.rows]
+        for t in section.tables
+    ]
+
+
+@pytest.mark.parametrize("error", [1e-2, 3e-3, 1e-5, 1e-8])
+def test_a_power_law_is_interpolated_exactly(error):
+    found = matched(outcomes(sweep(repeats=1)), error)
+
+    assert found.kind == "between"
+    assert found.time.value == pytest.approx(1e-3 * error**-0.25)
+    assert found.time.samples == 1
+
+
+def test_beyond_the_sweep_nothing_is_invented():
+    points = outcomes(sweep(repeats=1))
+
+    assert matched(points, 0.9e-8) == ("not reached", None)
+    looser = matched(points, 0.5)
+    assert looser.kind == "looser"
+    assert looser.time.value == pytest.approx(1e-3 * 1e-2**-0.25)
+
+
+def test_a_better_answer_never_takes_less_time():
+    """The noise of two tolerances is pooled, not followed."""
+    errors = np.array([1e-2, 1e-4, 1e-6, 1e-8])
+    times = np.array([1.0, 4.0, 1.0, 8.0])
+    at = [time_at(e, errors, times) for e in np.geomspace(1e-2, 1e-8, 40)]
+
+    assert (np.diff(at) >= -1e-12).all()
+    assert time_at(1e-4, errors, times) == pytest.approx(2)  # √(4·1)
+    assert time_at(1e-8, errors, times) == pytest.approx(8)
+
+
+def test_two_tolerances_with_one_answer_are_one_point():
+    errors, times = np.array([1e-2, 1e-4, 1e-4]), np.array([1.0, 2.0, 8.0])
+
+    assert time_at(1e-4, errors, times) == pytest.approx(4)
+    assert time_at(1e-3, errors, times) == pytest.approx(2)
+
+
+@pytest.mark.parametrize(
+    "ending",
+    [
+        dict(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        dict(status=Verdict.TIME_LIMIT, claimed="time_limit"),
+        dict(status=Verdict.FAILED, claimed="failed"),
+        dict(status=Verdict.CRASHED, claimed=None, energy_bound=None),
+        dict(status=Verdict.MEMORY_LIMIT),
+        dict(energy_bound=None),
+    ],
+)
+def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
+    records = [r.but(**ending) if r.tol == 1e-8 else r for r in sweep()]
+
+    assert matched(outcomes(records), 1e-7).kind == "not reached"
+    assert matched(outcomes(records), 1e-5).kind == "between"
+
+
+def test_one_repeat_that_failed_takes_the_point_away():
+    records = sweep()
+    records[-1] = records[-1].but(status=Verdict.FAILED, claimed="failed")
+
+    assert matched(outcomes(records), 1e-7).kind == "not reached"
+
+
+def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
+    """The loose end of a sweep that is judged at a strict accuracy."""
+    refuted = [r.but(status=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
+
+    assert matched(outcomes(refuted), 1e-5).kind == "between"
+
+
+def test_the_largest_error_of_the_repeats_is_the_error():
+    records = [
+        r.but(energy_bound=0.5) if (r.tol, r.repeat) == (1e-8, 2) else r
+        for r in sweep()
+    ]
+
+    assert matched(outcomes(records), 1e-7).kind == "not reached"
+
+
+def test_the_interval_comes_from_the_repeats_and_is_the_same_every_time():
+    scattered = [
+        r.but(total_seconds=r.total_seconds * (1 + 0.5 * (r.repeat % 2)))
+        for r in sweep(repeats=6)
+    ]
+    found, again = (matched(outcomes(scattered), 1e-5) for _ in range(2))
+    time = found.time
+
+    assert found == again
+    assert time.low < time.value < time.high
+    assert (time.low, time.high) == (
+        pytest.approx(1e-3 * 1e-5**-0.25, rel=0.06),
+        pytest.approx(1.5 * 1e-3 * 1e-5**-0.25, rel=0.06),
+    )
+    assert time.samples == 6
+
+
+def test_intervals_of_medians_hold_the_true_time_nearly_as_often_as_they_say():
+    """Lognormal times of 10 %, nine repeats; such a bootstrap is somewhat short."""
+    rng, held, n = np.random.default_rng(161803), 0, 120
+    for trial in range(n):
+        records = [
+            r.but(
+                total_seconds=1e-3 * r.tol**-0.25 * np.exp(0.1 * rng.standard_normal()),
+                run_id=f"{trial}-{i}",
+            )
+            for i, r in enumerate(sweep(repeats=9))
+        ]
+        time = matched(outcomes(records), 1e-5).time
+        held += time.low <= 1e-3 * 1e-5**-0.25 <= time.high
+    assert 0.85 <= held / n <= 1
+
+
+def test_the_table_names_the_fastest_at_each_error(page):
+    records = [*sweep(), *sweep("b", lambda tol: 5e-3 * tol**-0.05)]
+    found, *_ = tables(page(records), "accuracy")
+
+    assert [row["error"].value for row in found] == [1e-2, 1e-4, 1e-6]
+    assert [row["a"].kind for row in found] == ["best", "", ""]
+    assert [row["b"].kind for row in found] == ["", "best", "best"]
+
+
+def test_the_table_says_why_there_is_no_time(page):
+    direct = sweep("direct", repeats=2, energy_bound=1e-12)
+    weak = [r for r in sweep("weak") if r.tol > 1e-5]
+    none = dict(claimed="declined", energy_bound=None, total_seconds=None)
+    refusing = [record("c", tol, status=Verdict.DECLINED, **none) for tol in TOLS]
+    found, *_ = tables(page([*sweep(), *direct, *weak, *refusing]), "accuracy")
+    last = found[-1]
+
+    assert last["direct"].text.startswith("≤ ")
+    assert last["direct"].after == "below the loosest tolerance"
+    assert (last["weak"].text, last["weak"].after) == ("not reached", "at best 1.0e-4")
+    assert last["c"].text == "declined"
+
+
+def test_no_matched_time_is_printed_without_its_uncertainty(page):
+    text = markdown(page(sweep()))
+    start = text.index("## Time to accuracy")
+    section = text[start : text.index("\n## ", start + 4)]
+    times = re.findall(r"\d (?:s|ms|µs)\b(.{3})", section)
+
+    assert len(times) == 3
+    assert all(re.match(r" \\\[", after) for after in times)
+
+
+def test_cases_without_certificates_keep_their_residuals(page):
+    bare = sweep(case="file/dual", family="file", energy_bound=None, accuracy=1e-6)
+    both = page([*sweep(accuracy=1e-6), *bare])
+    (section,) = (s for s in both.sections if s.name == "accuracy")
+
+    assert [p.name for p in section.pictures] == ["certified", "sweep"]
+    assert len(section.pictures[1].figure.axes) == 1
+    assert len(section.tables) == 2
+
+
+def test_two_tolerances_are_no_sweep(page):
+    few = [r for r in sweep() if r.tol > 1e-5]
+    assert not any(s.name == "accuracy" for s in page(few).sections)
+
+
+def test_the_curve_joins_what_counts_and_the_rest_is_hollow():
+    records = [
+        r.but(claimed="iteration_limit", status=Verdict.ITERATION_LIMIT)
+        if r.tol == 1e-8 else r
+        for r in sweep()
+    ]  # fmt: skip
+    evidence = Evidence(directory=Path(), records=arrange(records))
+    picture = certified_picture(certified_sweeps(evidence), ("a",), {"box": MESH})
+    (axes,) = picture.figure.axes
+    joined, hollow = (line for line in axes.lines if line.get_marker() == "o")
+    mesh = [line.get_ydata()[0] for line in axes.lines if len(line.get_xdata()) == 2
+            and line.get_marker() == "None"]  # fmt: skip
+
+    assert joined.get_ydata().tolist() == [1e-2, 1e-4, 1e-6]
+    assert hollow.get_ydata().tolist() == [1e-8]
+    assert hollow.get_markerfacecolor() == "none"
+    assert MESH.error in mesh
+    assert MESH.error / 10 == pytest.approx(min(mesh))
+
+
+MESH = Discretisation(
+    case="box", kind="limit", error=5e-2, change=4e-2, rate=2.0,
+    levels=tuple(
+        Level(case="box", unknowns=4**k, energy=-1.0, norm=1.0, bound=1e-9)
+        for k in (3, 4, 5)
+    ),
+)  # fmt: skip
+
+
+def test_a_solver_is_compared_with_the_error_of_the_mesh(page):
+    """Enough is 5e-3: of 1e-2, 1e-4, … the second; then times grow tenfold."""
+    meshes, shares, prices = tables(page(sweep(), [MESH]), "worth")
+
+    assert meshes[0]["error"].value == 5e-2
+    assert meshes[0]["rate"].text == "1.00"
+    assert [row["a"].value for row in shares] == pytest.approx([0.2, 2e-3, 2e-5, 2e-7])
+    assert [row["a"].kind for row in shares] == ["over", "", "", ""]
+    assert prices[0]["a"].value == pytest.approx(1.01 * 1e-2)
+    assert prices[0]["a"].after.startswith("tol 1e-4; 1e-8: ×10.0")
+
+
+def test_the_headline_is_the_median_price_of_digits_that_nobody_needed(page):
+    records = [*sweep(), *sweep("b", lambda _: 1e-3)]
+    (section,) = (s for s in page(records, [MESH]).sections if s.name == "worth")
+
+    assert "2 pairs" in section.prose[1]
+    assert "(from 1.0 to 10 times)" in section.prose[1]
+
+
+def test_answers_that_never_are_good_enough_have_no_price(page):
+    bad = sweep(energy_bound=0.02)
+    *_, prices = tables(page(bad, [MESH]), "worth")
+
+    assert prices[0]["a"].text == "never enough"
+
+
+def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
+    records = [
+        r.but(claimed="iteration_limit", status=Verdict.ITERATION_LIMIT)
+        if r.tol == 1e-4 else r
+        for r in sweep()
+    ]  # fmt: skip
+    _, shares, prices = tables(page(records, [MESH]), "worth")
+
+    assert shares[1]["a"].text == "(2.0e-3)"
+    assert prices[0]["a"].after.startswith("tol 1e-6")
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "note", "told"),
+    [
+        ("change", 0.1, "a point load", "to the next mesh only: a point load"),
+        ("rounding", 1e-8, "", "the mesh holds the solution"),
+        ("unknown", None, "too large", "too large"),
+    ],
+)
+def test_what_is_not_known_of_a_mesh_is_said(page, kind, error, note, told):
+    mesh = Discretisation(case="box", kind=kind, error=error, note=note)
+    found = tables(page(sweep(), [mesh]), "worth")
+
+    assert told in found[0][0]["note"].text
+    assert len(found) == (3 if kind == "change" else 1)
+
+
+def test_without_the_file_there_is_no_such_section(page):
+    assert not any(s.name == "worth" for s in page(sweep()).sections)
+
+
+def test_a_damaged_file_is_one_line(tmp_path):
+    (tmp_path / FILE).write_text("{")
+    with pytest.raises(InputError, match=FILE):
+        compose(Evidence(directory=tmp_path, records=tuple(sweep())))
+
+
+def test_an_outcome_without_a_certificate_has_no_share(page):
+    mixed = [*sweep(), *sweep("b", energy_bound=None)]
+    _, shares, prices = tables(page(mixed, [MESH]), "worth")
+
+    assert "b" not in shares[0]
+    assert "b" not in prices[0]
