@@ -92,7 +92,7 @@ def _answer(name: str) -> Reference:
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
         "cases": ("*/Nr=4/*", "*/Nr=8/*", "*/Nr=15/*", "*/Nr=30/*dual*"),
-        "solvers": ("smalbe", "osqp", "clarabel", "piqp"),
+        "solvers": ("smalbe", "osqp", "piqp"),
         "repeats": 3,
     },
     "paper-accuracy": {

@@ -86,7 +86,7 @@ def _methods(experiment: Experiment) -> Section:
         if (r["problem"], r["contact"], r["n"]) == ("patch", "nts", finest)
     )  # fmt: skip
     caption = (
-        "Contact rows against exact solutions. (a): largest error of σ_y at any Gauss "
+        "Contact rows against exact solutions. (a): largest error of σy at any Gauss "
         "point of the patch test, 3 elements meeting 2 (errors below 1e-12 are "
         f"rounding and drawn there): node-to-segment keeps {100 * left:.2g} % on the "
         f"finest mesh, mortar has {worst['mortar']:.0e} at most. (b): pressure between "

@@ -10,7 +10,7 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import BoundaryNorm
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -90,8 +90,9 @@ def _through_the_steps(
     figure: Figure, axes: Axes, rows: Sequence[Row], span: tuple[float, float]
 ) -> None:
     last = max(int(r["step"]) for r in rows)
-    colours = colormaps["viridis"].resampled(last + 1)
-    norm = BoundaryNorm(np.arange(0.5, last + 1), colours.N - 1)
+    # neither end of the map: one is lost on a dark page, the other on a white one
+    colours = ListedColormap(colormaps["viridis"](np.linspace(0.25, 0.9, last)))
+    norm = BoundaryNorm(np.arange(0.5, last + 1), last)
     for step in range(1, last + 1):
         x, p = _profile(rows, "nts", step)
         near = (x >= span[0]) & (x <= span[1])
@@ -215,8 +216,6 @@ def _scale_bar(
     axes.annotate(
         f"pressure {unit / 1e9:g} GPa", (start[0], start[1] + scale * unit / 2),
         xytext=(6, 0), textcoords="offset points", va="center", zorder=7,
-        bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5},
-        color="#20242b",
     )  # fmt: skip
 
 
