@@ -151,7 +151,7 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, experiment, tmp_path)
     save_experiment(load_experiment(folder / "data"), tmp_path / "data")
     again = write_paper(tmp_path)
 
-    assert len(again) == 1 + 14 * 3 + 5 + 6
+    assert len(again) == 1 + 14 * 3 + 5 + 8
     for path in [*again, *(tmp_path / "data").glob("*.csv")]:
         assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
 

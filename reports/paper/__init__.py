@@ -11,6 +11,7 @@ from reports.latex import latex
 from reports.page import html
 from reports.paper.page import BEYOND, compose
 from reports.paper.sheets import sheets
+from reports.sheets import sheets as report_sheets
 
 
 def write_paper(folder: Path) -> list[Path]:
@@ -44,9 +45,11 @@ def write_paper(folder: Path) -> list[Path]:
         if section.tables:
             path = tables / f"{section.name}.tex"
             written.append(_write(path, latex(section.tables)))
+    frames = sheets(experiment)
+    frames |= {name: report_sheets(e)["outcomes"] for name, e in suites.items()}
     written += [
         _write(tables / f"{name}.csv", frame.to_csv(index=False))
-        for name, frame in sheets(experiment).items()
+        for name, frame in frames.items()
     ]
     return written
 
