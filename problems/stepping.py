@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from harness import QP, Reference, Vector, kkt_residuals
+from harness import QP, Reference, Solution, Vector, kkt_residuals
 from problems.bodies import Bodies
 from problems.contact import ContactRows
 from problems.dual import Transformed, dual_bounds
@@ -45,27 +45,31 @@ class LoadPath:
     steps: int
     relin: int = 1
     transform: Transform = dual_bounds
-    _solutions: list[Vector] = field(default_factory=list)  #: of steps 1, 2, …
+    _answers: list[Solution] = field(default_factory=list)  #: of steps 1, 2, …
 
     def primal(self, k: int) -> QP:
         """Emit the QP of step k (1 … steps), as last linearised."""
         u = self.solution(k - 1)
         for _ in range(self.relin - 1):
-            u = self._solve(self._linearised(u, k), k / self.steps)
+            u = self._solve(self._linearised(u, k), k / self.steps).x
         return self._linearised(u, k)
+
+    def answer(self, k: int) -> Solution:
+        """Return the solution of the primal QP of step k (1 … steps)."""
+        while len(self._answers) < k:
+            j = len(self._answers) + 1
+            self._answers.append(self._solve(self.primal(j), j / self.steps))
+        return self._answers[k - 1]
 
     def solution(self, k: int) -> Vector:
         """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
-        while len(self._solutions) < k:
-            j = len(self._solutions) + 1
-            self._solutions.append(self._solve(self.primal(j), j / self.steps))
-        return self._solutions[k - 1] if k else np.zeros(self.bodies.mesh.dofs)
+        return self.answer(k).x if k else np.zeros(self.bodies.mesh.dofs)
 
     def _linearised(self, u: Vector, k: int) -> QP:
         rows = self.linearise(u * self.bodies.length)
         return primal_qp(self.bodies, rows, k / self.steps)
 
-    def _solve(self, primal: QP, load_factor: float) -> Vector:
+    def _solve(self, primal: QP, load_factor: float) -> Solution:
         dual = self.transform(primal, self.inverse, self._free * load_factor)
         s = self.reference(dual.qp)
         if not (worst := kkt_residuals(dual.qp, s).worst) <= REFERENCE:
@@ -73,7 +77,7 @@ class LoadPath:
                 f"the reference solve at load factor {load_factor:g} left a residual "
                 f"of {worst:.1e}, more than {REFERENCE:g}"
             )
-        return dual.recover(s).x
+        return dual.recover(s)
 
     @cached_property
     def _free(self) -> Vector:

@@ -1,34 +1,51 @@
 """The paper's figures and tables, measured in little and drawn by the real code."""
 
 import csv
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from matplotlib import image
 
-from harness import InputError
+from harness import InputError, Record, Verdict
 from harness.experiment import Experiment, load_experiment, save_experiment
+from harness.journal import Journal
 from problems.beam_ring import BEAM
 from problems.elasticity import elasticity_matrix, stiffness
 from problems.experiments import QUICK, paper_experiment
 from problems.experiments.analysis import WAYS, analyse
 from problems.experiments.clock import Rounds, Stopwatch, race, whole
+from problems.experiments.physics import stepping
 from problems.inverse import Factorised
 from problems.mesh import half_ring
 from problems.triplets import stiffness_by_triplets
+from reports.data import Evidence, arrange
 from reports.paper import write_paper
+from reports.paper.contact import active
+from reports.paper.fleet import (
+    certified_table,
+    fleet_figure,
+    fleet_table,
+    totals_table,
+)
 from reports.paper.geometry import dimensions
 from reports.paper.page import compose
 from reports.paper.samples import curve, fit, medians
+from reports.paper.stepping import errors, order
 from reports.paper.stress import extent
 from reports.paper.tables import PARTS
-from solvers.smalbe import SMALBE
+from solvers.reference import reference_solution
+from solvers.smalbe import PAPER, SMALBE
 
-FIGURES = [f"figure{i}" for i in range(1, 8)]
+FIGURES = [
+    *(f"figure{i}" for i in range(1, 8)),
+    "zoom", "pressure", "verification", "stepping", "fleet", "totals", "certified",
+]  # fmt: skip
 TWICE = Rounds(most=2, least=2)
 LITTLE = replace(
     QUICK,
@@ -36,6 +53,7 @@ LITTLE = replace(
     contact=((1, 2), (1, 2)), contact_rounds=TWICE,
     inverse=(1, 2, 3, 4), inverse_rounds=TWICE, dense=200,
     scaling=(1, 2), scaling_rounds=TWICE, Nh=2, steps=2,
+    stepped=(2, 2), stepping=(1, 2, 4), relin=(1, 2), patch=(2, 4), hertz=(1, 2),
 )  # fmt: skip
 
 
@@ -47,8 +65,11 @@ def solve(qp):
 def experiment():
     environment = {"machine": {"cpu": "Abacus & Sons <9>"}, "now": {"time": "noon"}}
     said = []
-    done = paper_experiment(LITTLE, solve, environment, said.append)
-    assert len(said) == 5
+    done = paper_experiment(
+        LITTLE, solve, environment, said.append,
+        baseline=lambda qp: PAPER.prepare(qp, 1e-8)(), reference=reference_solution,
+    )  # fmt: skip
+    assert len(said) == 8
     return done
 
 
@@ -56,8 +77,46 @@ def experiment():
 def folder(experiment, tmp_path_factory):
     path = tmp_path_factory.mktemp("paper")
     save_experiment(experiment, path / "data")
+    for name, records in planted().items():
+        with Journal(path / "data" / name, "here") as journal:
+            for record in records:
+                journal.append(record)
     write_paper(path)
     return path
+
+
+#: m and n of the planted cases
+SIZES = {50: 500, 100: 2000, 200: 8000}
+
+
+def record(solver, form, m, seconds, repeat, **changes):
+    given = dict(
+        run_id=f"{solver} {form} {m} {repeat} {changes.get('tol')}",
+        case=f"beam-ring/m={m}/{form}", family="beam-ring", params={"m": m}, form=form,
+        sizes={"variables": SIZES[m] if form == "primal" else m}, solver=solver,
+        options={}, tol=1e-6, repeat=repeat, block=repeat, status=Verdict.VERIFIED,
+        claimed="solved", total_seconds=seconds, primal=1e-9, dual=1e-9,
+        complementarity=1e-9, gap=1e-9, quantities={"dofs": SIZES[m]},
+        dualise_seconds=None if form == "primal" else 0.5,
+    )  # fmt: skip
+    return Record(**(given | changes))
+
+
+def planted():
+    """Times of 1e-6·m² s; `lazy` is wrong at the largest size, in no time at all."""
+    fleet = [
+        record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
+               **(wrong if solver == "lazy" and m == 200 else {}))
+        for wrong in [dict(status=Verdict.WRONG, total_seconds=1e-9, quantities={})]
+        for solver in ("smalbe", "lazy") for form in ("primal", "dual", "dual-bounds")
+        for m in SIZES for repeat in range(3)
+    ]  # fmt: skip
+    sweep = [
+        record("smalbe", "dual", 200, 1e-3 / tol**0.1, repeat, tol=tol,
+               energy_bound=10 * tol)
+        for tol in (1e-2, 1e-4, 1e-6) for repeat in range(3)
+    ]  # fmt: skip
+    return {"paper-fleet": fleet, "paper-accuracy": sweep}
 
 
 def rows_of(path):
@@ -79,8 +138,8 @@ def test_every_figure_is_there_in_three_formats_and_not_blank(folder, name):
 def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
     page = (folder / "index.html").read_text()
 
-    assert page.count("<svg") == page.count("<b>Figure ") == 7
-    assert page.count("<b>Table ") == 2
+    assert page.count("<svg") == page.count("<b>Figure ") == 14
+    assert page.count("<b>Table ") == 7
     assert "Abacus &amp; Sons &lt;9&gt;" in page
     assert "AMD Ryzen 5 3600, MATLAB R2020a" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
@@ -88,10 +147,11 @@ def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
 
 def test_the_same_data_are_drawn_to_the_same_bytes(folder, experiment, tmp_path):
     """From the files in data/ alone: nothing is measured again."""
+    shutil.copytree(folder / "data", tmp_path / "data")
     save_experiment(load_experiment(folder / "data"), tmp_path / "data")
     again = write_paper(tmp_path)
 
-    assert len(again) == 1 + 7 * 3 + 1 + 6
+    assert len(again) == 1 + 14 * 3 + 5 + 8
     for path in [*again, *(tmp_path / "data").glob("*.csv")]:
         assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
 
@@ -249,6 +309,114 @@ def test_published_times_are_compared_at_the_published_size_only(experiment):
     assert float(compared[-1].split()[0]) == pytest.approx(29.99 / total, rel=0.01)
     assert float(compared[4].split()[0]) == pytest.approx(26.764 / set_up, rel=0.01)
     assert compared[6] == "–"  # the paper says nothing of recovery
+
+
+def with_orders(p):
+    """Plant tips and forces that are off by 0.1·steps⁻ᵖ."""
+
+    def row(steps, relin, error):
+        return {"steps": steps, "relin": relin, "tip_x": 3 * (1 + error), "tip_y": 4,
+                "force_x": 0.0, "force_y": 1e8 * (1 - error)}  # fmt: skip
+
+    return [*(row(n, 1, 0.1 * n**-p) for n in (1, 2, 5, 10, 20, 40)), row(2, 8, 0.0)]
+
+
+@pytest.mark.parametrize("p", [1.0, 2.0])
+@pytest.mark.parametrize(("quantity", "part"), [("tip displacement", 0.6),
+                                                ("contact force", 1.0)])  # fmt: skip
+def test_the_order_of_the_stepping_is_recovered(p, quantity, part):
+    rows = with_orders(p)
+
+    assert dict(errors(rows, 1, quantity))[10] == pytest.approx(0.1 * 10**-p * part)
+    law = order(rows, 1, quantity)
+    assert (law.exponent, law.low, law.high) == pytest.approx((p, p, p))
+
+
+def test_the_papers_stepping_is_of_first_order():
+    """Erratum of the notes: 10 steps leave 7 % of the horizontal contact force."""
+    plan = replace(LITTLE, stepped=(6, 3), stepping=(5, 10, 20, 40), relin=(1,))
+    rows = list(stepping(plan, reference_solution))
+
+    for quantity in ("tip displacement", "contact force"):
+        assert order(rows, 1, quantity).exponent == pytest.approx(1, abs=0.2)
+
+
+def test_mortar_passes_the_patch_test_and_node_to_segment_does_not(experiment):
+    found = {"nts": [], "mortar": [], "mortar-standard": []}
+    for r in experiment.tables["verification"]:
+        if r["problem"] == "patch":
+            found[r["contact"]].append(r["error"])
+
+    assert max(found["mortar"] + found["mortar-standard"]) < 1e-10
+    assert min(found["nts"]) > 0.05
+
+
+def test_the_pressures_of_a_step_carry_the_force_of_its_nodes(experiment):
+    rows = experiment.tables["pressures"]
+
+    assert {(r["contact"], r["step"]) for r in rows} == {
+        (contact, step) for contact in ("nts", "mortar") for step in (1, 2)
+    }
+    for r in rows:
+        assert r["pressure"] * r["length"] == pytest.approx(r["force"])
+    arc = sum(r["length"] for r in rows if (r["contact"], r["step"]) == ("nts", 1))
+    assert arc == pytest.approx(np.pi * 0.49, rel=0.01)
+    assert len(active(rows, "nts")[2]) >= 1
+
+
+def evidence(name):
+    return Evidence(directory=Path(), records=arrange(planted()[name]))
+
+
+def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
+    """`lazy` took 1 ns to be wrong: below every axis, and a cross instead."""
+    figure = fleet_figure(evidence("paper-fleet"))
+    times, strips = figure.axes[:2], figure.axes[2:]
+
+    for axes in times:
+        drawn = np.concatenate([line.get_ydata() for line in axes.lines])
+        assert drawn.min() >= 2.5e-3
+    assert all(line.get_xdata() == [200] for axes in strips for line in axes.lines)
+    assert len(strips) == 2
+
+
+def test_a_planted_growth_is_tabulated_and_failures_as_such():
+    table = fleet_table(evidence("paper-fleet"), "dual")
+    smalbe, lazy = (
+        dict(zip(table.columns, row, strict=True)) for row in sorted(
+            table.rows, key=lambda row: row[0].text, reverse=True
+        )
+    )  # fmt: skip
+
+    assert smalbe["p [95 %]"].value == pytest.approx(2)
+    assert smalbe["m = 200"].value == pytest.approx(0.0404)
+    assert lazy["m = 200"].text.startswith("wrong")
+    assert lazy["p [95 %]"].value is None  # of two sizes
+
+
+def test_dual_totals_include_the_dualisation():
+    table = totals_table(evidence("paper-fleet"))
+    values = {row[0].text: [cell.value for cell in row[1:]] for row in table.rows}
+
+    assert values["smalbe"] == pytest.approx([0.0404, 0.0404, 0.5, 0.5404])
+
+
+def test_the_time_to_an_error_is_that_of_the_cheapest_certified_answer():
+    """tol 1e-2 is certified to 0.1 only, 1e-4 to 1e-3, 1e-6 to 1e-5."""
+    (row,) = certified_table(evidence("paper-accuracy")).rows
+
+    assert row[2].value == pytest.approx(1e-3 * 1e-4**-0.1)
+    assert row[3].value == pytest.approx(1e-3 * 1e-6**-0.1)
+    assert row[4].text == "not reached"
+
+
+def test_no_panel_is_empty(experiment):
+    suites = {name: evidence(name) for name in planted()}
+    for section in compose(experiment, suites).sections:
+        for picture in section.pictures:
+            for axes in picture.figure.axes:
+                drawn = axes.lines, axes.collections, axes.patches, axes.images
+                assert any(drawn), picture.name
 
 
 def test_colours_end_at_the_quantile_of_the_size(experiment):

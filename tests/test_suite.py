@@ -10,6 +10,7 @@ import pytest
 import problems
 import solvers
 from harness import InputError
+from harness.__main__ import BEYOND
 from harness.names import canonical
 from harness.overrides import with_overrides
 from harness.registry import SolverSpec
@@ -419,6 +420,19 @@ def test_the_suite_of_the_load_path_is_one_sequence_per_form():
         list(range(1, 11))
     ] * 2
     assert [{c.form for c in s} for s in path.sequences] == [{"dual"}, {"dual-bounds"}]
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
+    """Six repeats are the fewest whose median has a 95 % interval."""
+    suite = shipped(name)
+    narrowed = with_overrides(
+        suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
+    )  # fmt: skip
+
+    assert (suite.name, suite.repeats) == (name, 6)
+    assert 0 < len(narrowed.cases) < len(suite.cases)
+    assert {"smalbe", "osqp", "piqp"} == {s.label for s in narrowed.solvers}
 
 
 def test_the_suite_of_accuracies_judges_at_one():

@@ -11,6 +11,7 @@ from harness.experiment import Experiment
 from problems.beam_ring import BEAM, LOAD, RING
 from problems.experiments.analysis import scaling, states
 from problems.experiments.parts import Rows, assembly, contact, counts, inverse
+from problems.experiments.physics import pressures, stepping, verification
 from problems.experiments.plan import PAPER, QUICK, Plan
 
 __all__ = ["PAPER", "QUICK", "Plan", "paper_experiment"]
@@ -21,12 +22,17 @@ def paper_experiment(
     solve: Reference,
     environment: Mapping[str, Any],
     say: Callable[[str], None],
+    *,
+    baseline: Reference,
+    reference: Reference,
 ) -> Experiment:
     """Measure all of it, single-threaded if the caller has seen to that.
 
     Parameters
     ----------
-    solve : of the dual QPs; part of what is timed
+    solve, baseline : ours of the dual QPs, and what the paper would take; part of what
+        is timed
+    reference : solves where not the time but the accuracy of the model is studied
     environment : recorded with the measurements
     say : called with one line before each experiment
 
@@ -36,8 +42,13 @@ def paper_experiment(
         ("figure3", "Figure 3: assembly", lambda: assembly(plan)),
         ("figure4", "Figure 4: contact rows", lambda: contact(plan)),
         ("figure5", "Figure 5: generalised inverse", lambda: inverse(plan)),
-        ("figure6", "Figure 6: the whole analysis", lambda: scaling(plan, solve)),
-    )
+        ("figure6", "Figure 6: the whole analysis",
+         lambda: scaling(plan, solve, baseline)),
+        ("stepping", "Accuracy of the stepping", lambda: stepping(plan, reference)),
+        ("pressures", "Contact pressures", lambda: pressures(plan, reference)),
+        ("verification", "Contact rows against exact solutions",
+         lambda: verification(plan, reference)),
+    )  # fmt: skip
     for name, title, rows in experiments:
         say(title)
         tables[name] = list(rows())

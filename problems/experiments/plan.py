@@ -23,6 +23,11 @@ class Plan:
     Nh: int = 15  #: of Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
     steps: int = 10  #: load steps
+    stepped: tuple[int, int]  #: Nr, Nh of the study of the stepping
+    stepping: tuple[int, ...]  #: numbers of steps in it
+    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations of each step in it
+    patch: tuple[int, ...]  #: elements along the upper block of the patch test
+    hertz: tuple[int, ...]  #: elements per half width of Hertz's contact
 
 
 PAPER = Plan(
@@ -35,16 +40,20 @@ PAPER = Plan(
     dense=2000,
     scaling=(2, 5, 10, 15, 20, 25, 30),
     scaling_rounds=Rounds(most=10, least=6, seconds=60),
-)
+    stepped=(20, 10), stepping=(1, 2, 5, 10, 20, 40, 80),
+    patch=(2, 4, 8, 16, 32), hertz=(3, 6, 12, 24, 48),
+)  # fmt: skip
 
 QUICK = Plan(
     assembly=(3, 6, 10, 15, 20, 30, 40),
     assembly_rounds=Rounds(most=30, least=6, seconds=1),
     contact=((10, 20, 30, 60), (5, 10, 15, 30)),
-    contact_rounds=Rounds(most=15, least=6, seconds=0.5),
+    contact_rounds=Rounds(most=15, least=6, seconds=0.3),
     inverse=(2, 3, 4, 5, 6, 8, 10, 15, 20, 30),
     inverse_rounds=Rounds(most=6, least=6, seconds=1),
     dense=800,
     scaling=(5, 15, 30),
-    scaling_rounds=Rounds(most=6, least=3, seconds=9),
-)
+    scaling_rounds=Rounds(most=6, least=3, seconds=2),
+    stepped=(10, 5), stepping=(1, 2, 5, 10, 20, 40),
+    patch=(2, 4, 8, 16), hertz=(3, 6, 12, 24),
+)  # fmt: skip

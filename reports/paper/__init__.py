@@ -5,17 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from harness.experiment import load_experiment
+from reports.data import read_evidence
 from reports.figures import save
 from reports.latex import latex
 from reports.page import html
-from reports.paper.page import compose
+from reports.paper.page import BEYOND, compose
 from reports.paper.sheets import sheets
+from reports.sheets import sheets as report_sheets
 
 
 def write_paper(folder: Path) -> list[Path]:
     """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex) from data/.
 
-    The same data give the same bytes.
+    data/ is an experiment and, where measured, the result folders of the suites of
+    `BEYOND`. The same data give the same bytes.
 
     Raises
     ------
@@ -24,7 +27,12 @@ def write_paper(folder: Path) -> list[Path]:
 
     """
     experiment = load_experiment(folder / "data")
-    page = compose(experiment)
+    suites = {
+        name: read_evidence(folder / "data" / name)
+        for name in BEYOND
+        if (folder / "data" / name).is_dir()
+    }
+    page = compose(experiment, suites)
     written = [_write(folder / "index.html", html(page))]
     figures, tables = folder / "figures", folder / "tables"
     figures.mkdir(exist_ok=True)
@@ -37,9 +45,11 @@ def write_paper(folder: Path) -> list[Path]:
         if section.tables:
             path = tables / f"{section.name}.tex"
             written.append(_write(path, latex(section.tables)))
+    frames = sheets(experiment)
+    frames |= {name: report_sheets(e)["outcomes"] for name, e in suites.items()}
     written += [
         _write(tables / f"{name}.csv", frame.to_csv(index=False))
-        for name, frame in sheets(experiment).items()
+        for name, frame in frames.items()
     ]
     return written
 

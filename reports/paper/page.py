@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from harness.experiment import Experiment, Row
+from reports.data import Evidence
 from reports.layout import Page, Picture, Section
 from reports.mechanics import PERCENTILE, SCALE
-from reports.paper import published
+from reports.paper import beyond, published
 from reports.paper.geometry import geometry_figure, mesh_figure
 from reports.paper.samples import curve
 from reports.paper.stress import STRESSES, extent, stress_figure
@@ -23,8 +25,13 @@ from reports.paper.timings import (
 from reports.wording import clean, seconds, significant
 
 
-def compose(experiment: Experiment) -> Page:
-    """Put the page together, in the order of the paper."""
+def compose(
+    experiment: Experiment, suites: Mapping[str, Evidence] = MappingProxyType({})
+) -> Page:
+    """Put the page together: the paper in its order, then what it does not have.
+
+    suites : measured ones by name; those of `BEYOND` make sections
+    """
     machine = experiment.setting["environment"].get("machine", {})
     now = experiment.setting["environment"].get("now", {}).get("time", "")
     sections = (
@@ -36,6 +43,8 @@ def compose(experiment: Experiment) -> Page:
         _inverse(experiment),
         _scaling(experiment),
         _final(experiment),
+        *beyond.physics(experiment),
+        *(s for name, of in BEYOND.items() if name in suites for s in of(suites[name])),
         Section(name="errata", title="Errata of the paper", points=published.ERRATA),
     )
     return Page(
@@ -51,6 +60,10 @@ def compose(experiment: Experiment) -> Page:
     )
 
 
+#: suite → sections on it
+BEYOND = {"paper-fleet": beyond.fleet, "paper-accuracy": beyond.certified}
+
+
 def _summary(experiment: Experiment) -> Section:
     rows = largest(experiment)
     Nr, Nh, n = (rows[0][k] for k in ("Nr", "Nh", "n"))
@@ -59,8 +72,9 @@ def _summary(experiment: Experiment) -> Section:
     )
     prose = (
         f"The whole analysis at Nr = {Nr}, Nh = {Nh} (n = {n}) takes {seconds(ours)} "
-        f"here with the dual condensed onto the interface, {seconds(theirs)} with one "
-        "solve per constraint row and load step as in the paper."
+        "here with the dual condensed onto the interface and our SMALBE, "
+        f"{seconds(theirs)} the paper's way: one solve per constraint row and load "
+        "step, the textbook's SMALBE; both in one interleaved run."
     )
     if of_table_1(rows):
         ratio = significant(published.TOTAL / ours.value)

@@ -44,7 +44,8 @@ ERRATA = (
     "The text calls Figure 6 “Figure 7”, and Figure 5 “Figure ??”.",
     "Tolerances, penalty, contact rows and active rows are not stated, nor whether "
     "the 0.078 s of the Cholesky factor are for both bodies. Here each dual QP is "
-    "solved by SMALBE to 1e-8.",
+    "solved by SMALBE to 1e-8, in the paper's way with the parameters of its reference "
+    "[3].",
     "89 % of the published 29.99 s are dualisation and 3.6 % are the QPs: what the "
     "paper concludes on QP algorithms rests on the latter.",
     "Rotations reach 20°, bending stresses several GPa: far outside linear elasticity. "

@@ -169,7 +169,8 @@ def _dual(axes: Axes, rows: Sequence[Row]) -> None:
     for i, (method, parts, label) in enumerate((
         ("per-row", ("dualisation",), "dualisation, one solve per row"),
         ("condensed", ("factor", "dualisation"), "the same, condensed, with factor"),
-        ("condensed", ("qp",), "dual QPs (SMALBE)"),
+        ("per-row", ("qp",), "dual QPs, the textbook's SMALBE"),
+        ("condensed", ("qp",), "dual QPs, our SMALBE"),
     )):  # fmt: skip
         _times(axes, curve(rows, "m", method=method, part=parts), label, look(i))
     stars = (("dualisation", "*", 9, "dualisation"), ("qp", "P", 7, "QPs"))
@@ -178,7 +179,7 @@ def _dual(axes: Axes, rows: Sequence[Row]) -> None:
         seconds = published.SECONDS[part]
         axes.plot(published.ROWS, seconds, label=f"published: {name}", **style)
     axes.set(yscale="log", xlabel="size of the dual $m$", ylabel="time in s")
-    _head_room(axes, 3.2)
+    _head_room(axes, 3.8)
     axes.legend(loc="upper left", fontsize=8)
 
 

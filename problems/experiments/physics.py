@@ -1,0 +1,116 @@
+"""What the paper does not show: how accurate its stepping is, and its contact rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from harness import Reference, Value
+from problems.beam_ring import LENGTH, model
+from problems.bodies import Bodies, clamped
+from problems.experiments.parts import Rows
+from problems.experiments.plan import Plan
+from problems.hertz import HertzCylinder
+from problems.linearise import linearisation
+from problems.mesh import dofs_of, nodal_lengths
+from problems.patch import ContactPatch
+from problems.results import quantities
+from problems.stepping import LoadPath
+
+SETTLED = (2, 8)  #: steps, linearisations of each: further ones change nothing
+
+#: of the figures → keys of a case
+ROWS: Mapping[str, Mapping[str, Value]] = {
+    "nts": {"contact": "nts"},
+    "mortar": {"contact": "mortar", "basis": "dual"},
+    "mortar-standard": {"contact": "mortar", "basis": "standard"},
+}
+
+
+def stepping(plan: Plan, solve: Reference) -> Rows:
+    """Measure what is left of the stepping's error, for 1/steps → 0, and by `relin`.
+
+    A row (steps, relin, tip_x, tip_y in m, energy in J/m, force_x, force_y in N/m) for
+    each way to the full load. The last one is settled: contact holds as linearised at
+    the solution itself, which is what all the others approach.
+    """
+    bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
+    inverse, linearise = clamped(bodies), linearisation(bodies, "nts", "dual")
+    ways = [(s, r) for r in plan.relin for s in plan.stepping]
+    for steps, relin in (*ways, SETTLED):
+        path = LoadPath(bodies, linearise, inverse, solve, steps, relin)
+        yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
+
+
+def _results(bodies: Bodies, path: LoadPath, step: int) -> dict[str, Value]:
+    primal, s = path.primal(step), path.answer(step)
+    found = quantities(bodies, primal, s)
+    sides = bodies.mesh.boundaries
+    tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]))] * LENGTH
+    force = found["contact_force"]
+    return {
+        "tip_x": float(tip[0]), "tip_y": float(tip[1]), "energy": found["energy"],
+        "force_x": force[0], "force_y": force[1],
+    }  # fmt: skip
+
+
+def pressures(plan: Plan, solve: Reference) -> Rows:
+    """Follow the contact along the arc through the load steps, by either method.
+
+    A row (contact, step, node, angle in degrees, length in m, force in N/m, pressure
+    in Pa) for each slave node. angle: of the undeformed node around the ring's centre,
+    from the right foot on. length: that of the arc which belongs to the node, ∫N_j.
+    force: what presses on it, ‖(Bᵀλ)_j‖, there being no friction; pressure: force per
+    length.
+    """
+    bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
+    inverse = clamped(bodies)
+    slave = bodies.pairs[0].slave
+    points = bodies.mesh.points[slave]
+    angles = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 1.0))
+    lengths = nodal_lengths(points)
+    for contact in ("nts", "mortar"):
+        linearise = linearisation(bodies, contact, "dual")
+        path = LoadPath(bodies, linearise, inverse, solve, plan.steps)
+        for step in range(1, plan.steps + 1):
+            s = path.answer(step)
+            on_nodes = (path.primal(step).G.T @ s.z).reshape(-1, 2)[slave]
+            forces = np.hypot(*on_nodes.T) * bodies.force
+            columns = zip(angles, lengths, forces, strict=True)
+            for node, (angle, length, force) in enumerate(columns):
+                yield {
+                    "contact": contact, "step": step, "node": node,
+                    "angle": float(angle), "length": float(length),
+                    "force": float(force), "pressure": float(force / length),
+                }  # fmt: skip
+
+
+def verification(plan: Plan, solve: Reference) -> Rows:
+    """Compare contact rows with exact solutions: the patch test and Hertz's pressure.
+
+    A row (problem, contact, n, error) for each mesh; n: elements along the upper block,
+    or per half width of the contact. error: max|σ_y + p|/p, or that of the pressure
+    in L2, both relative.
+    """
+    for contact, keys in ROWS.items():
+        for upper in plan.patch:
+            given = {"upper": upper, "lower": upper + upper // 2, **keys}
+            error = _error(ContactPatch(), given, "stress_error", solve)
+            yield {"problem": "patch", "contact": contact, "n": upper, "error": error}
+        for n in plan.hertz:
+            given = {"n": n, "m": max(3 * n // 4, 1), **keys}
+            error = _error(HertzCylinder(), given, "pressure_l2_error", solve)
+            yield {"problem": "hertz", "contact": contact, "n": n, "error": error}
+
+
+def _error(
+    family: ContactPatch | HertzCylinder,
+    given: Mapping[str, Value],
+    name: str,
+    solve: Reference,
+) -> float:
+    params: dict[str, Any] = {**family.defaults, **given}
+    case = family.build("dual", params, solve)
+    return float(case.quantities(solve(case.qp))[name])
