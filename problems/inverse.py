@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Protocol
 
 import numpy as np
@@ -34,6 +35,10 @@ from problems.mesh import Nodes, dofs_of
 
 class GeneralisedInverse(Protocol):
     """A symmetric K⁺ (n, n) with K K⁺ K = K on the components it acts on."""
+
+    @property
+    def seconds(self) -> float:
+        """What factorising took, whichever load step it was for."""
 
     @property
     def kernel(self) -> NDArray[np.float64]:
@@ -53,6 +58,7 @@ class Factorised:
     factor: Factor
     order: Nodes  #: components in the order of the factor; K⁺ is zero on the others
     kernel: NDArray[np.float64]
+    seconds: float  #: to factorise, and to condense where that was asked for
 
     def __call__(self, b: Vector) -> Vector:
         """Solve."""
@@ -78,6 +84,11 @@ class Condensed:
     def kernel(self) -> NDArray[np.float64]:
         """Orthonormal basis R (n, r) of ker K."""
         return self.whole.kernel
+
+    @property
+    def seconds(self) -> float:
+        """What factorising and condensing took."""
+        return self.whole.seconds
 
     def __call__(self, b: Vector) -> Vector:
         """Solve with the whole factor."""
@@ -164,6 +175,7 @@ def supported_inverse(
 def _inverse(
     K: csc_array, free: Nodes, kernel: NDArray[np.float64], interface: Nodes | None
 ) -> GeneralisedInverse:
+    start = perf_counter()
     touched = np.zeros(0, np.int64) if interface is None else np.unique(interface)
     held = ~np.isin(touched, free)
     last = touched[~held]
@@ -174,11 +186,11 @@ def _inverse(
     ordered = csc_matrix(K[order][:, order])
     factor = analyze(ordered, mode="supernodal", ordering_method="natural")
     factor.cholesky_inplace(ordered)
-    whole = Factorised(factor, order, kernel)
     if interface is None:
-        return whole
+        return Factorised(factor, order, kernel, perf_counter() - start)
     L = factor.L()[len(first) :, len(first) :].toarray()
     lower, _ = lapack.dpotri(L, lower=1, overwrite_c=1)
     compliance = np.zeros((touched.size, touched.size))
     compliance[np.ix_(~held, ~held)] = np.tril(lower) + np.tril(lower, -1).T
+    whole = Factorised(factor, order, kernel, perf_counter() - start)
     return Condensed(whole, touched, compliance)

@@ -7,6 +7,8 @@ import pytest
 from scipy.sparse import csc_array, csr_array
 
 from harness import QP, Solution, Status, kkt_residuals, no_rows
+from problems import PROBLEMS
+from problems.beam_ring import _clamped, _floating
 from problems.dual import dual_bounds, dualise
 from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fixing import fixing_nodes, spectral_fixing_nodes
@@ -227,3 +229,14 @@ def test_recovery_keeps_the_claim():
     back = dual.recover(claim)
 
     assert (back.status, back.message) == (Status.TIME_LIMIT, "too slow")
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_a_dual_is_charged_for_a_factor_that_was_there_already(form):
+    family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
+    factor = {"dual": _floating, "dual-bounds": _clamped}[form](*geometry)
+    assert factor.seconds > 0
+    for step in (1, 2):
+        params = family.complete(dict(Nr=3, Nh=2, step=step))
+        case = family.build(form, params, reference_solution)
+        assert case.dualise_seconds > factor.seconds
