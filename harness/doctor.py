@@ -204,7 +204,7 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
     step = noise.clock_seconds
     coarse = "" if step <= FINE_CLOCK_SECONDS else "Measure on a machine with a clock"
     yield _check(
-        "clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
+        "Clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
     )
     biased = abs(noise.ratio - 1) > EQUAL and not noise.low <= 1 <= noise.high
     yield _check(

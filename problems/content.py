@@ -22,7 +22,9 @@ def digest(*paths: Path) -> str:
         try:
             content.update(path.read_bytes())
         except OSError as e:
-            raise InputError(f"{path}: {e.strerror}") from None
+            raise InputError(
+                f"{path}: {e.strerror}; expected a file that can be read"
+            ) from None
     return content.hexdigest()[:12]
 
 
