@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
 from typing import Any, Self
@@ -102,7 +102,7 @@ class Record:
 
     def to_json(self) -> str:
         """Serialise to one line of strict JSON: NaN and inf become null."""
-        return json.dumps(finite(asdict(self)), allow_nan=False)
+        return json.dumps(finite(vars(self)), allow_nan=False)
 
     @classmethod
     def from_json(cls, line: str) -> Self:

@@ -164,6 +164,7 @@ class Evidence:
 
     directory: Path
     records: tuple[Record, ...]  #: in the order of the report
+    journal: tuple[Record, ...] = ()  #: as read, each line
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
     factor: float = VERIFIED_FACTOR  #: at which the records are judged
@@ -223,6 +224,7 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
     try:
         return Evidence(
             directory=directory,
+            journal=tuple(records),
             records=arrange(_apart(_judged(r, factor)) for r in records),
             environment=json.loads(environment.read_text("utf-8"))
             if environment.exists()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from harness import Fields, InputError
 from harness.errors import unknown
-from harness.journal import read_journal
 from harness.kkt import VERIFIED_FACTOR
 from harness.store import load_fields
 from reports.cases import cases
@@ -73,8 +72,7 @@ def write_report(
             for name, frame in sheets(evidence).items()
         ]
     if "parquet" in formats:
-        records = read_journal(directory)
-        written.append(write_records(target / "records.parquet", records))
+        written.append(write_records(target / "records.parquet", evidence.journal))
     return written
 
 

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness import Record
+from harness.record import finite
 
 _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 
@@ -25,14 +26,21 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     is JSON text.
     """
     columns = {f.name: _kind(str(f.type)) for f in fields(Record)}
-    rows = [json.loads(record.to_json()) for record in records]
-    for row in rows:
-        nested = {k: v for k, v in row.items() if isinstance(v, Mapping)}
-        row |= {k: json.dumps(v, ensure_ascii=False) for k, v in nested.items()}
-    table = pa.Table.from_pylist(rows, schema=pa.schema(columns))
+    table = pa.table({
+        name: pa.array([_entry(getattr(r, name)) for r in records], kind)
+        for name, kind in columns.items()
+    })  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path, compression="zstd")
     return path
+
+
+def _entry(value: Any) -> Any:
+    """Store as in the journal: what is not finite is null, what is nested is text."""
+    value = finite(value)
+    if isinstance(value, Mapping):
+        return json.dumps(value, ensure_ascii=False)
+    return str(value) if isinstance(value, str) else value  # a verdict, plainly
 
 
 def _kind(annotation: str) -> Any:
