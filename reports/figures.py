@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import rc_context, rcParams
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import PlaceHolderLayoutEngine
 from matplotlib.lines import Line2D
@@ -69,15 +70,25 @@ _METADATA: dict[str, dict[str, Any]] = {
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure in the format of the file's ending, the same bytes every time."""
+    return save_all(figure, [path])[0]
+
+
+def save_all(figure: Figure, paths: Sequence[Path]) -> list[Path]:
+    """Write a figure in several formats, cut to what is drawn, which is found once."""
     with rc_context(STYLE):
         _lay_out(figure)
-        figure.savefig(
-            path,
-            bbox_inches="tight",
-            facecolor=PAPER,
-            metadata=_METADATA.get(path.suffix, {}),
+        renderer = FigureCanvasAgg(figure).get_renderer()
+        box = figure.get_tightbbox(renderer).padded(
+            float(rcParams["savefig.pad_inches"])
         )
-    return path
+        for path in paths:
+            figure.savefig(
+                path,
+                bbox_inches=box,
+                facecolor=PAPER,
+                metadata=_METADATA.get(path.suffix, {}),
+            )
+    return list(paths)
 
 
 def _lay_out(figure: Figure) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from reports.figures import save
+from reports.figures import save_all
 from reports.latex import latex
 from reports.layout import Page
 from reports.markdown import markdown
 from reports.page import html
 
+ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
 RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
 
 
@@ -46,7 +47,7 @@ def write_figures(page: Page, target: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     pictures = [p for section in page.sections for p in section.pictures]
     return [
-        save(p.figure, folder / f"{p.name}.{ending}")
+        path
         for p in pictures
-        for ending in ("pdf", "svg", "png")
+        for path in save_all(p.figure, [folder / f"{p.name}{e}" for e in ENDINGS])
     ]

@@ -53,7 +53,7 @@ QUICK = Plan(
     inverse_rounds=Rounds(most=6, least=6, seconds=1),
     dense=800,
     scaling=(5, 15, 30),
-    scaling_rounds=Rounds(most=6, least=3, seconds=2),
+    scaling_rounds=Rounds(most=6, least=2, seconds=2),
     stepped=(10, 5), stepping=(1, 2, 5, 10, 20, 40),
     patch=(2, 4, 8, 16), hertz=(3, 6, 12, 24),
 )  # fmt: skip

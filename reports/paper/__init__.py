@@ -6,12 +6,13 @@ from pathlib import Path
 
 from harness.experiment import load_experiment
 from reports.data import read_evidence
-from reports.figures import save
+from reports.figures import save_all
 from reports.latex import latex
 from reports.page import html
 from reports.paper.page import BEYOND, compose
 from reports.paper.sheets import sheets
 from reports.sheets import sheets as report_sheets
+from reports.writing import ENDINGS
 
 
 def write_paper(folder: Path) -> list[Path]:
@@ -38,10 +39,8 @@ def write_paper(folder: Path) -> list[Path]:
     figures.mkdir(exist_ok=True)
     for section in page.sections:
         for picture in section.pictures:
-            written += [
-                save(picture.figure, figures / f"{picture.name}.{ending}")
-                for ending in ("pdf", "svg", "png")
-            ]
+            files = [figures / f"{picture.name}{e}" for e in ENDINGS]
+            written += save_all(picture.figure, files)
         if section.tables:
             path = tables / f"{section.name}.tex"
             written.append(_write(path, latex(section.tables)))
