@@ -26,6 +26,10 @@ _MOST = 12  #: entries of a list on the terminal; the page has them all
 
 def validate(workbench: Workbench, options: Namespace) -> int:
     """Cross-validate a result folder; 1 if a claim is refuted or answers disagree."""
+    if not options.budget >= 0:  # a NaN, too
+        raise InputError(
+            f"--budget {options.budget:g}; expected a number of seconds ≥ 0"
+        )
     workbench = workbench.with_files(options.plugin)
     found = validated(options.folder, workbench.families, workbench.reference, say)
     data = as_data(found, options.folder.resolve().name)

@@ -647,9 +647,18 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
     assert verdict["discretisation"][0]["error"] == found.error
     assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
     assert "obstacle/dim=1/n=12: " in cli(folder)[1]
-    for budget in ("0", "nan"):
-        (none,) = verdict_on(cli, folder, "--budget", budget)[1]["discretisation"]
-        assert none["error"] is None
+    again = verdict_on(cli, folder, "--budget", "0")[1]["discretisation"]
+    assert again[0]["error"] == found.error
+
+
+@pytest.mark.parametrize("budget", ["-1", "nan"])
+def test_no_time_for_finer_meshes_is_less_than_none(cli, tmp_path, budget):
+    code, _, complaint = cli(tmp_path, "--budget", budget)
+
+    assert code == 2
+    assert "--budget" in complaint
+    assert "expected a number of seconds" in complaint
+    assert budget in complaint
 
 
 def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
