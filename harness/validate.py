@@ -162,7 +162,10 @@ def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
     for d in listed:
         key = (d["case"], d["text"])
         counted[key] = counted.get(key, 0) + 1
-    return [f"{case} ({n} answers): {text}" for (case, text), n in counted.items()]
+    return [
+        f"{case} ({n} answer{'s' * (n != 1)}): {text}"
+        for (case, text), n in counted.items()
+    ]
 
 
 def _list(title: str, lines: Sequence[str]) -> str:

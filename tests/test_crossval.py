@@ -1,6 +1,7 @@
 """Cross-validation: planted errors are measured, their solver named, nobody else."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -585,17 +586,34 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, cli):
     (tmp_path / "empty").mkdir()
     bare = write(tmp_path / "bare", [("dies", f"{BEAM}/primal", Verdict.CRASHED)])
     foreign = write(tmp_path / "foreign", [("a", "half/qp", pulled())])
+    gone = write(tmp_path / "gone", [("a", "half/qp", pulled())])
+    shutil.rmtree(gone / "vectors")
+    (foreign / "suite.toml").touch()
 
     for folder, text in (
         (tmp_path / "nowhere", "no such folder"),
         (tmp_path / "empty", "no journal"),
-        (bare, "none of its 1 measurements has a stored point"),
+        (bare, "no solver returned a point (1 crashed)"),
+        (foreign / "suite.toml", "suite.toml: a file; expected a result folder"),
+        (gone, "its stored points are gone"),
         (foreign, "no stored answer can be judged: unknown family 'half'"),
     ):
         code, out, err = cli(folder)
         assert (code, out) == (2, "")
         assert text in err.splitlines()[-1]
         assert "Traceback" not in err
+
+
+def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path, cli):
+    folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
+    (folder / "report").touch()
+    code, _, err = cli(folder, validation=write_validation)
+
+    assert code == 2
+    assert err.splitlines()[-1] == (
+        f"mortarbench: {folder / 'report'}: a file is where a folder is needed; "
+        "move the file away"
+    )
 
 
 def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
