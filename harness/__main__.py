@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from harness import Reference, cli
 from harness.beyond import measured
+from harness.discretisation import Discretisation
 from harness.environment import capture
 from harness.experiment import save_experiment
 from harness.kkt import VERIFIED_FACTOR
@@ -61,10 +62,12 @@ def _compare(
     return write_comparison(before, after, formats, factor)
 
 
-def _validation(folder: Path, data: Mapping[str, Any]) -> list[Path]:
+def _validation(
+    folder: Path, data: Mapping[str, Any], meshes: Sequence[Discretisation]
+) -> list[Path]:
     from reports.validation import write_validation
 
-    return write_validation(folder, data)
+    return write_validation(folder, data, meshes)
 
 
 def _plot(fields: Fields, path: Path) -> None:

@@ -126,9 +126,8 @@ def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
         )
     near = get_close_matches(run_id, by_id, n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
-    raise InputError(
-        f"unknown run_id {run_id!r}: {folder} holds {len(by_id)} measurements{hint}"
-    )
+    count = f"{len(by_id)} measurement{'s' * (len(by_id) != 1)}"
+    raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
 
 
 def _family(record: Record, families: Mapping[str, Family]) -> Family:

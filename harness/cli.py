@@ -53,7 +53,7 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
         return 0
     except Exception as e:
         if isinstance(e, OSError) and e.filename is not None:
-            return _complain(f"{os.fsdecode(e.filename)}: {e.strerror}")
+            return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
         traceback.print_exc()
         return 3
 
@@ -70,6 +70,14 @@ def _run(workbench: Workbench, argv: Sequence[str]) -> int:
     code: int = options.run(workbench, options)
     print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
+
+
+def _remedied(e: OSError, path: Path) -> str:
+    """Say what is wrong with a file, and what would be right where that is plain."""
+    if isinstance(e, FileExistsError | NotADirectoryError):
+        path = next((p for p in (path, *path.parents) if p.is_file()), path)
+        return f"{path}: a file is where a folder is needed; move the file away"
+    return f"{path}: {e.strerror}"
 
 
 def _complain(message: str) -> int:

@@ -245,6 +245,6 @@ def _farther(a: Assessment) -> float:
 
 
 def brief(value: float) -> str:
-    """Print an order of magnitude with two digits: 3.2e-9."""
+    """Print an order of magnitude with two digits: 3.2e-9, 1.0e0."""
     mantissa, _, exponent = f"{value:.1e}".partition("e")
-    return f"{mantissa.removesuffix('.0')}e{int(exponent)}" if exponent else mantissa
+    return f"{mantissa}e{int(exponent)}" if exponent else mantissa

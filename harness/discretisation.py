@@ -27,7 +27,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from math import log2, sqrt
 from pathlib import Path
 from time import perf_counter
@@ -78,6 +79,7 @@ class Discretisation:
     rate: float | None = None  #: q of the squared error, observed
     note: str = ""  #: why there is no more than that
     levels: tuple[Level, ...] = ()  #: coarsest first, that is the case itself
+    params: Mapping[str, object] = field(default_factory=dict)  #: of the case, all
 
 
 def estimated(
@@ -118,12 +120,17 @@ def discretisation_errors(
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
+    What the file says already stays where there was less time than there was then.
+
     names : forms of one physical case count once
     folder : the result folder; its ``references`` keep what was solved
     budget : seconds; a mesh that would take longer than what is left is not begun
     tell : is told of each case that begins
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
+    earlier: dict[str, Discretisation] = {}
+    with suppress(InputError):  # a damaged file is replaced
+        earlier = read_discretisation(folder)
     for name in names:
         family = families[name.family]
         physical = canonical(name, family).removesuffix(f"/{name.form}")
@@ -132,7 +139,10 @@ def discretisation_errors(
             left = _Halving(family, reference, folder / "references", end)
             levels = tuple(left.levels(name))
             singular = getattr(family, "singular", "")
-            found[physical] = estimated(physical, levels, singular, left.why)
+            new = estimated(physical, levels, singular, left.why)
+            new = replace(new, params=name.params)
+            old = earlier.get(physical, new)
+            found[physical] = old if left.late and _continues(old, new) else new
     _write(folder / FILE, found.values())
     return list(found.values())
 
@@ -163,6 +173,17 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
     return {row.case: row for row in rows}
 
 
+def _continues(old: Discretisation, new: Discretisation) -> bool:
+    """Whether `old` has the meshes of `new` and finer ones."""
+    common = [
+        (a.case, a.unknowns) == (b.case, b.unknowns)
+        for a, b in zip(old.levels, new.levels, strict=False)
+    ]
+    return (
+        old.params == new.params and len(old.levels) > len(new.levels) and all(common)
+    )
+
+
 def _write(path: Path, found: Iterable[Discretisation]) -> None:
     """Replace the file as a whole."""
     data = {"schema": SCHEMA, "cases": [asdict(d) for d in found]}
@@ -184,6 +205,7 @@ class _Halving:
         self._end = end
         self._coarse: tuple[Grid, Extended] | None = None
         self.why = ""
+        self.late = False  #: stopped for lack of time
 
     def levels(self, name: CaseName) -> Iterator[Level]:
         """Yield the levels that can be afforded, coarsest first."""
@@ -201,6 +223,7 @@ class _Halving:
                 return
             left = self._end - perf_counter()
             if not left > seconds * growth**POWER:
+                self.late = True
                 self.why = "the next mesh would take more time than was left"
                 return
             start = perf_counter()

@@ -13,16 +13,23 @@ class InputError(Exception):
     """
 
 
-def unknown(what: str, got: str, known: Iterable[str], where: str = "") -> InputError:
-    """Build the error for a name that is not among `known`, with the nearest one."""
+PLUGINS = "; others come with --plugin FILE.py"  #: after the names that are known
+
+
+def unknown(
+    what: str, got: str, known: Iterable[str], where: str = "", more: str = ""
+) -> InputError:
+    """Build the error for a name that is not among `known`, with the nearest one.
+
+    more : what follows the known names
+    """
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
-    return InputError(
-        f"{prefix}unknown {what} {got!r}; {hint}known: {', '.join(names) or 'none'}"
-    )
+    listed = ", ".join(names) or "none"
+    return InputError(f"{prefix}unknown {what} {got!r}; {hint}known: {listed}{more}")
 
 
 def some(names: Iterable[str], most: int = 3) -> str:

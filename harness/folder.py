@@ -198,7 +198,10 @@ def _environment(path: Path) -> dict[str, Any]:
     except ValueError:
         environment = None
     if not isinstance(environment, dict) or "digest" not in environment:
-        raise InputError(f"{path}: no JSON object with a digest") from None
+        raise InputError(
+            f"{path}: no JSON object with a digest; expected the file that the run "
+            "wrote; restore it, or run with --fresh"
+        ) from None
     return environment
 
 

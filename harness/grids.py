@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from harness import checked
-from harness.errors import InputError, some, unknown
+from harness.errors import PLUGINS, InputError, some, unknown
 from harness.names import CaseName, assemble, canonical
 from harness.plugin import Family
 
@@ -69,7 +69,7 @@ def _blocks(
                 raise InputError("family is missing")
             name = checked.text("family", table["family"])
             if name not in families:
-                raise unknown("family", name, families)
+                raise unknown("family", name, families, more=PLUGINS)
             family = families[name]
             params = table.get("params", {})
             along = _along(table.get("sequence"), params)

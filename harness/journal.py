@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from json import JSONDecodeError
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -56,9 +57,13 @@ def read_journal(folder: Path) -> list[Record]:
     Raises
     ------
     InputError
-        When there is no journal, or a line other than a partial last one is bad.
+        When there is no folder, no journal, or a line other than a partial last one is
+        bad.
 
     """
+    if not folder.is_dir():
+        wrong = "a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {wrong}; expected a result folder")
     paths = sorted((folder / "journal").glob("*.jsonl"))
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
@@ -69,6 +74,11 @@ def _records(path: Path) -> Iterator[Record]:
     for number, line in enumerate(_whole_lines(path.read_bytes()).splitlines(), 1):
         try:
             yield Record.from_json(line.decode())
+        except (JSONDecodeError, UnicodeDecodeError):
+            raise InputError(
+                f"{path}, line {number}: damaged; expected a JSON object, as a run "
+                "appends it; restore the file, or delete the line and run again"
+            ) from None
         except ValueError as e:
             raise InputError(f"{path}, line {number}: {e}") from None
 

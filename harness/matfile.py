@@ -66,7 +66,9 @@ def read_mat(path: Path) -> dict[str, Any]:
             f"{path}: a .mat file of version 7.3; save it with -v7"
         ) from None
     except (ValueError, TypeError, EOFError, MatReadError, OverflowError):
-        raise InputError(f"{path}: not a .mat file") from None
+        raise InputError(
+            f"{path}: not a .mat file; expected one saved with -v7 or older"
+        ) from None
 
 
 def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:

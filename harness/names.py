@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from harness.errors import InputError, unknown
+from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
@@ -52,7 +52,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
     """
     head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
-        raise unknown("family", head, families)
+        raise unknown("family", head, families, more=PLUGINS)
     family = families[head]
     if (suffix := getattr(family, "path_suffix", None)) is None:
         parts, given = text.split("/")[1:], {}

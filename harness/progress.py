@@ -78,7 +78,7 @@ class _Lines:
 
     def start(self, total: int) -> None:
         self._total = total
-        self.warn(f"{total} measurements")
+        self.warn(f"{total} measurement{'s' * (total != 1)}")
 
     def say(self, text: str) -> None:
         """Be silent: the line that follows says what was done."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
-from harness.errors import InputError, unknown
+from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver
 
 T = TypeVar("T")
@@ -64,7 +64,7 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
         solver = _with_options(spec, solvers[wildcard], reserved={"backend"})
         return _with_backend(prefix, backend, solver)
     if spec.name not in solvers:
-        raise unknown("solver", spec.name, solvers)
+        raise unknown("solver", spec.name, solvers, more=PLUGINS)
     return _with_options(spec, solvers[spec.name])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -37,6 +37,7 @@ class Comparison:
     ratios: Mapping[str, tuple[float, float, float] | None]
     """Of times: now over the median of the stored repeats; and those repeats' least
     and greatest over that median. None where one was not measured."""
+    stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, s
     environment: list[tuple[str, Any, Any]]  #: dotted key, then, now
 
     @property
@@ -62,6 +63,10 @@ def compared(
 ) -> Comparison:
     """Compare a new measurement and its point with what `folder` holds."""
     then, now = capsule.record, result.record
+    stored = {
+        name: tuple(s for r in capsule.repeats if (s := getattr(r, name)) is not None)
+        for name in _SECONDS
+    }
     return Comparison(
         then=then,
         now=now,
@@ -69,7 +74,8 @@ def compared(
         same_options=then.options == now.options,
         same_counts=(then.iterations, then.counts) == (now.iterations, now.counts),
         distance=_distance(folder, then, result.point),
-        ratios={name: _ratio(name, capsule.repeats, now) for name in _SECONDS},
+        ratios={name: _ratio(stored[name], getattr(now, name)) for name in _SECONDS},
+        stored=stored,
         environment=list(differences(_keyed(capsule.environment), _keyed(environment))),
     )
 
@@ -133,16 +139,21 @@ def _times(c: Comparison) -> Iterable[list[str]]:
         a, b = getattr(c.then, name), getattr(c.now, name)
         if ratio is None:
             continue
-        now, least, greatest = ratio
-        among = (
-            f"stored repeats {least:.2f} … {greatest:.2f}"
-            if least < greatest
-            else "one stored run"
-        )
-        row = f"ratio {now:.2f} ({among})"
+        row = _ratio_text(ratio, c.stored[name])
         yield [
             name.removesuffix("_seconds") + ", s", _text(a, ".3g"), _text(b, ".3g"), row
         ]  # fmt: skip
+
+
+def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> str:
+    """Say what a new time is divided by: `then` is but one of several repeats."""
+    now, least, greatest = ratio
+    if len(stored) == 1:
+        return f"{now:.2f} of the only stored repeat"
+    return (
+        f"{now:.2f} of {median(stored):.3g}, the median of {len(stored)} stored "
+        f"repeats ({least:.2f} … {greatest:.2f} of it)"
+    )
 
 
 def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
@@ -159,10 +170,8 @@ def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
 
 
 def _ratio(
-    name: str, repeats: Iterable[Record], now: Record
+    stored: Sequence[float], new: float | None
 ) -> tuple[float, float, float] | None:
-    stored = [s for r in repeats if (s := getattr(r, name)) is not None]
-    new = getattr(now, name)
     if new is None or not stored or not (middle := median(stored)):
         return None
     return new / middle, min(stored) / middle, max(stored) / middle

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -43,7 +44,8 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
         When it is missing or damaged.
 
     """
-    return read_point(_path(folder, digest), status)
+    with _restorable():
+        return read_point(_path(folder, digest), status)
 
 
 def load_history(folder: Path, digest: str) -> History:
@@ -56,7 +58,8 @@ def load_history(folder: Path, digest: str) -> History:
 
     """
     path = _path(folder, digest)
-    return _history(path, read_arrays(path, (), only=_HISTORY))
+    with _restorable():
+        return _history(path, read_arrays(path, (), only=_HISTORY))
 
 
 def save_fields(folder: Path, fields: Fields) -> str:
@@ -80,7 +83,8 @@ def load_fields(folder: Path, digest: str) -> Fields:
         When it is missing or damaged.
 
     """
-    arrays = read_arrays(_path(folder, digest), _ALWAYS)
+    with _restorable():
+        arrays = read_arrays(_path(folder, digest), _ALWAYS)
     nodal = _with_prefix(_NODAL, arrays)
     known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
     return Fields(nodal=nodal, **known)
@@ -157,7 +161,9 @@ def _expected(
         raise InputError(f"{path}: {e.strerror or e}; expected an npz file") from None
     except (ValueError, TypeError, AttributeError, EOFError, BadZipFile):
         # what numpy raises for a text, a pickle, one bare array, a truncated archive
-        raise InputError(f"{path}: not an npz file of plain arrays") from None
+        raise InputError(
+            f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
+        ) from None
     if missing := [name for name in expected if name not in arrays]:
         raise InputError(f"{path}: {', '.join(missing)} missing")
     return arrays
@@ -184,6 +190,15 @@ def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
         for name, values in arrays.items()
         if name.startswith(prefix)
     }
+
+
+@contextmanager
+def _restorable() -> Iterator[None]:
+    """Say of a file of a result folder what can be done."""
+    try:
+        yield
+    except InputError as e:
+        raise InputError(f"{e}; restore the file, or run with --fresh") from None
 
 
 def _path(folder: Path, digest: str) -> Path:

@@ -26,6 +26,10 @@ _MOST = 12  #: entries of a list on the terminal; the page has them all
 
 def validate(workbench: Workbench, options: Namespace) -> int:
     """Cross-validate a result folder; 1 if a claim is refuted or answers disagree."""
+    if not options.budget >= 0:  # a NaN, too
+        raise InputError(
+            f"--budget {options.budget:g}; expected a number of seconds ≥ 0"
+        )
     workbench = workbench.with_files(options.plugin)
     found = validated(options.folder, workbench.families, workbench.reference, say)
     data = as_data(found, options.folder.resolve().name)
@@ -36,8 +40,10 @@ def validate(workbench: Workbench, options: Namespace) -> int:
     temporary = target.with_suffix(".tmp")
     temporary.write_text(json.dumps(data, allow_nan=False) + "\n", "utf-8")
     os.replace(temporary, target)
-    pages = workbench.validation(options.folder, data)
-    meshes = _meshes(workbench, options.folder, options.budget)
+    pages = workbench.validation(options.folder, data, ())
+    if meshes := _meshes(workbench, options.folder, options.budget):
+        # the page was there while meshes were solved; now it tells of them, too
+        pages = workbench.validation(options.folder, data, meshes)
     if options.json:
         verdict = {k: v for k, v in data.items() if k != "problems"}
         verdict["discretisation"] = [asdict(d) for d in meshes]
@@ -47,7 +53,8 @@ def validate(workbench: Workbench, options: Namespace) -> int:
         if known := [d for d in meshes if d.error is not None]:
             lines = [f"{d.case}: {_mesh(d)}" for d in known]
             title = (
-                "Discretisation errors, relative; `report` shows what they are worth"
+                "Discretisation errors, relative, in the energy norm; `report` shows "
+                "what they are worth"
             )
             print(f"\n{_list(title, lines)}")
         for page in pages:
@@ -104,25 +111,26 @@ def as_text(data: Mapping[str, Any]) -> str:
 
 
 def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay out a row per solver; certified errors, relative, in the energy norm."""
-    head = [
-        "solver", "tol", "answers", "refuted", "unanswered", "error: median", "worst",
-        "penetration/h", "balance", "primal-dual", "from smalbe",
-    ]  # fmt: skip
-    keys = (
-        "error_median", "error_worst", "penetration", "balance", "primal_dual",
-        "from_ours",
-    )  # fmt: skip
+    """Lay out a row per solver."""
+    columns = {
+        "error_median": "error: median", "error_worst": "worst",
+        "penetration": "penetration/h", "balance": "balance",
+        "primal_dual": "primal-dual", "from_ours": "from smalbe",
+    }  # fmt: skip
+    if all(row["from_ours"] is None for row in rows):
+        del columns["from_ours"]  # there is no smalbe to compare with
+    head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
     lines = [
         [
             legible(row["solver"]),
             f"{row['tol']:g}",
             *(str(row[key]) for key in ("answers", "refuted", "unanswered")),
-            *(_e(row[key]) for key in keys),
+            *(_e(row[key]) for key in columns),
         ]
         for row in rows
     ]
-    return aligned([head, *lines], right=range(1, len(head)))
+    table = aligned([head, *lines], right=range(1, len(head)))
+    return f"Certified errors: relative, in the energy norm.\n{table}"
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -158,7 +166,10 @@ def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
     for d in listed:
         key = (d["case"], d["text"])
         counted[key] = counted.get(key, 0) + 1
-    return [f"{case} ({n} answers): {text}" for (case, text), n in counted.items()]
+    return [
+        f"{case} ({n} answer{'s' * (n != 1)}): {text}"
+        for (case, text), n in counted.items()
+    ]
 
 
 def _list(title: str, lines: Sequence[str]) -> str:

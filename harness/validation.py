@@ -6,6 +6,7 @@ residuals, errors and distances computed from them; what cannot be is listed.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,14 +102,9 @@ def validated(
         When there is no folder, no journal or no stored point.
 
     """
-    if not path.is_dir():
-        raise InputError(f"{path}: no such folder; expected a result folder")
     records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
     if not any(r.vectors and _file(path, r).exists() for r in records):
-        raise InputError(
-            f"{path}: none of its {len(records)} measurements has a stored point; "
-            "expected vectors/*.npz, which a run writes"
-        )
+        raise InputError(f"{path}: {_pointless(records)}")
     twins: dict[tuple[str, str], set[str]] = {}
     for r in records:
         if r.vectors:
@@ -173,6 +169,15 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         if (text := _falsehood(r, solvable.get(r.case, elastic)))
     ]
     return _Part(problems, lost, false, forces, truths)
+
+
+def _pointless(records: Sequence[Record]) -> str:
+    """Say why a folder has nothing to judge."""
+    if any(r.vectors for r in records):
+        return "its stored points are gone; expected vectors/*.npz, which a run writes"
+    statuses = Counter(r.status.value.replace("_", " ") for r in records)
+    ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
+    return f"no solver returned a point ({ends}); expected one that solves a case"
 
 
 def _built(

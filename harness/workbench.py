@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from harness.block import Commands
+from harness.discretisation import Discretisation
 from harness.errors import InputError, unknown
 from harness.plugin import Family, Fields, Reference, Solver
 from harness.registry import Plugin, SolverSpec, load_plugin, merged
@@ -51,7 +52,10 @@ class Workbench:
     """Measure and write the paper's figures: folder, quick?, progress."""
     compare: Comparer = lambda *_, **__: ([], [])
     #: writes the page of a cross-validation: result folder, `harness.agreement.as_data`
-    validation: Callable[[Path, Mapping[str, Any]], list[Path]] = lambda *_: []
+    #: and what finer meshes told
+    validation: Callable[
+        [Path, Mapping[str, Any], Sequence[Discretisation]], list[Path]
+    ] = lambda *_: []
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,6 +16,8 @@ from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
 from reports.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
+
+_AS_WRITTEN = "expected the file that the run wrote; restore it"
 
 #: Worst first: the verdict on several repeats is the worst of theirs.
 SEVERITY = (
@@ -215,26 +217,30 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         When the folder or its measurements are missing, or a file is malformed.
 
     """
-    if not directory.is_dir():
-        raise InputError(f"{directory}: no such folder; expected a result folder")
     records = read_journal(directory)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
-    environment, suite = directory / "environment.json", directory / "suite.toml"
+    return Evidence(
+        directory=directory,
+        journal=tuple(records),
+        records=arrange(_apart(_judged(r, factor)) for r in records),
+        environment=_read(directory / "environment.json", json.loads),
+        suite=_read(directory / "suite.toml", tomllib.loads),
+        factor=factor,
+    )
+
+
+def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    """Read a table that a run wrote beside its journal; empty without a file."""
+    if not path.exists():
+        return {}
     try:
-        return Evidence(
-            directory=directory,
-            journal=tuple(records),
-            records=arrange(_apart(_judged(r, factor)) for r in records),
-            environment=json.loads(environment.read_text("utf-8"))
-            if environment.exists()
-            else {},
-            suite=tomllib.loads(suite.read_text("utf-8")) if suite.exists() else {},
-            factor=factor,
-        )
-    except (json.JSONDecodeError, tomllib.TOMLDecodeError) as e:
-        what = environment if isinstance(e, json.JSONDecodeError) else suite
-        raise InputError(f"{what}: malformed: {e}") from None
+        table = parse(path.read_text("utf-8"))
+    except ValueError as e:  # no UTF-8, too
+        raise InputError(f"{path}: malformed: {e}; {_AS_WRITTEN}") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: no JSON object; {_AS_WRITTEN}")
+    return table
 
 
 def _judged(record: Record, factor: float) -> Record:

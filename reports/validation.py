@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from harness import Verdict
+from harness.discretisation import Discretisation
 from reports.compared import (
     Data,
     count_cell,
@@ -19,6 +21,7 @@ from reports.compared import (
 from reports.error_figure import error_figure
 from reports.layout import Cell, Page, Picture, Section, Table, name_cell
 from reports.markdown import markdown
+from reports.meshes import mesh_table
 from reports.page import html
 from reports.wording import ABSENT, VERDICTS, clean, plural, tolerance
 from reports.writing import write_figures, write_text
@@ -39,9 +42,9 @@ _RULES = (
     "the bound of the reference. The second is the distance ‖Bᵀ(λ − λ*)‖ of the "
     "contact forces in the dual norm; λ itself need not be unique.",
     "A claim of success at tolerance t is refuted if a KKT residual exceeds 10t; or if "
-    "one of the two distances, less the bound of the reference, exceeds √(20t), which "
-    "is what a gap of 10t allows; or if a multiplier pulls. A claim that there is no "
-    "solution is refuted by the certified one.",
+    "one of the two distances, less the bound of the reference, exceeds √(20t)‖u*‖, "
+    "which is what a gap of 10t allows; or if a multiplier pulls. A claim that there "
+    "is no solution is refuted by the certified one.",
     "Two answers at one tolerance disagree without a culprit if they are farther apart "
     "than both claims allow, and neither is refuted.",
     "Rows: contact rows where truth and answer contradict each other. A row is closed "
@@ -55,9 +58,14 @@ _RULES = (
 )
 
 
-def write_validation(directory: Path, data: Data) -> list[Path]:
-    """Write DIR/report/validation.html and .md from the data of `validate`."""
-    page, target = compose(data), directory / "report"
+def write_validation(
+    directory: Path, data: Data, meshes: Sequence[Discretisation] = ()
+) -> list[Path]:
+    """Write DIR/report/validation.html and .md from the data of `validate`.
+
+    meshes : what finer meshes told, where they were solved
+    """
+    page, target = compose(data, meshes), directory / "report"
     write_figures(page, target)
     return [
         write_text(target / "validation.html", html(page)),
@@ -65,13 +73,14 @@ def write_validation(directory: Path, data: Data) -> list[Path]:
     ]
 
 
-def compose(data: Data) -> Page:
+def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
     """Put the page together, verdict first."""
     sections = (
         _verdict(data),
         _disagreements(data),
         problems(data),
         remarks(data),
+        _discretisation(meshes),
         left_out(data),
         Section(name="rules", title="How it is decided", points=_RULES),
     )
@@ -90,19 +99,20 @@ def compose(data: Data) -> Page:
 def _verdict(data: Data) -> Section:
     rows = data["solvers"]
     tols = {row["tol"] for row in rows}
+    ours = any(row["from_ours"] is not None for row in rows)
     columns = (
         "solver", *(("tol",) if len(tols) > 1 else ()), "answers", "refuted",
         "unanswered", "error, median", "worst", "worst on", "penetration / h",
-        "balance", "rows", "primal against dual", "against smalbe",
+        "balance", "rows", "primal against dual", *(("against smalbe",) * ours),
     )  # fmt: skip
     at = f", tol {tolerance(next(iter(tols)))}" if len(tols) == 1 else ""
     table = Table(
         caption=f"Every solver{at}: certified errors, relative, in the energy norm.",
         columns=columns,
-        rows=tuple(_solver(row, several=len(tols) > 1) for row in rows),
+        rows=tuple(_solver(row, several=len(tols) > 1, ours=ours) for row in rows),
         notes=(
-            "The last two: largest distance between its answers to primal and dual "
-            "forms, and from those of smalbe.",
+            f"{'The last two' if ours else 'The last'}: largest distance between its "
+            f"answers to primal and dual forms{', and from those of smalbe' * ours}.",
         ),
     )
     return Section(
@@ -122,13 +132,14 @@ def _errors(data: Data) -> tuple[Picture, ...]:
     if figure is None:
         return ()
     caption = (
-        f"Certified error of every answer at tol {tolerance(tol)}. It is never below "
-        "what is known of the reference. Beyond √(20t) no verified answer may lie."
+        f"Certified error of every answer, over ‖u*‖, at tol {tolerance(tol)}. It is "
+        "never below what is known of the reference. Beyond √(20t) no verified answer "
+        "may lie."
     )
     return (Picture(name="validation-errors", caption=caption, figure=figure),)
 
 
-def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:
+def _solver(row: Data, *, several: bool, ours: bool) -> tuple[Cell, ...]:
     tol = (Cell(text=tolerance(row["tol"]), value=row["tol"]),) if several else ()
     refuted = row["refuted"]
     return (
@@ -148,7 +159,22 @@ def _solver(row: Data, *, several: bool) -> tuple[Cell, ...]:
         number_cell(row["balance"]),
         count_cell(row["contradicted_rows"]),
         number_cell(row["primal_dual"]),
-        number_cell(row["from_ours"]),
+        *((number_cell(row["from_ours"]),) * ours),
+    )
+
+
+def _discretisation(meshes: Sequence[Discretisation]) -> Section | None:
+    """List the errors of the meshes themselves, which certified errors add to."""
+    if not meshes:
+        return None
+    return Section(
+        name="discretisation",
+        title="Errors of the meshes",
+        prose=(
+            "u* is the solution on a mesh; this is how far it is from that of the "
+            "continuum. The report says what accuracy beyond it costs.",
+        ),
+        tables=(mesh_table(meshes),),
     )
 
 

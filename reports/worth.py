@@ -11,6 +11,7 @@ from reports.certified import SHARE
 from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell, source
 from reports.matched import counts
+from reports.meshes import mesh_table
 from reports.wording import (
     ABSENT,
     TIMED,
@@ -36,7 +37,7 @@ def worth(evidence: Evidence) -> Section | None:
         return None
     priced = _priced(evidence, mine)
     present = [s for s in evidence.solvers if any(s in row for row in priced.values())]
-    tables = [_meshes(list(mine.values()))]
+    tables = [mesh_table(list(mine.values()))]
     if priced:
         tables += [_shares(priced, present, mine), _prices(priced, present, mine)]
     return Section(
@@ -84,41 +85,6 @@ def _headline(priced: Priced, meshes: Mapping[str, Discretisation]) -> tuple[str
         f"accurate enough (from {significant(min(factors), 2)} to "
         f"{significant(max(factors), 2)} times).",
     )
-
-
-def _meshes(found: Sequence[Discretisation]) -> Table:
-    return Table(
-        caption="Discretisation errors: relative, in the energy norm.",
-        notes=(
-            "From the solutions on meshes with every cell halved once and twice; the "
-            "reference solve found them, no solver under test. Rate: of the error, "
-            "like h to that power.",
-        ),
-        columns=("physical case", "unknowns", "error", "rate", "finest mesh", "note"),
-        rows=tuple(_mesh(d) for d in found),
-    )
-
-
-def _mesh(d: Discretisation) -> tuple[Cell, ...]:
-    sizes = [level.unknowns for level in d.levels]
-    note = {
-        "limit": "against the limit of fine meshes",
-        "change": f"to the next mesh only: {d.note}",
-        "rounding": "the mesh holds the solution; what rounding hides",
-    }.get(d.kind, d.note)
-    less = "< " if d.kind == "rounding" else ""
-    return (
-        name_cell(d.case),
-        _count(sizes[0] if sizes else None),
-        Cell(text=less + power(d.error) if d.error else ABSENT, value=d.error),
-        Cell(text=ABSENT if d.rate is None else f"{d.rate / 2:.2f}", value=d.rate),
-        _count(sizes[-1] if len(sizes) > 1 else None),
-        Cell(text=clean(note, 200), kind="words"),
-    )
-
-
-def _count(n: int | None) -> Cell:
-    return Cell() if n is None else Cell(text=str(n), value=n)
 
 
 def _shares(

@@ -1,6 +1,7 @@
 """Cross-validation: planted errors are measured, their solver named, nobody else."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from harness import QP, Case, Mechanics, Solution, Status, no_rows
 from harness.assessment import assess, distances, energy_allowed
 from harness.build import build
 from harness.cli import main
-from harness.crossval import compared
+from harness.crossval import brief, compared
 from harness.discretisation import read_discretisation
 from harness.journal import Journal, read_journal
 from harness.judge import blank, judged
@@ -585,17 +586,34 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, cli):
     (tmp_path / "empty").mkdir()
     bare = write(tmp_path / "bare", [("dies", f"{BEAM}/primal", Verdict.CRASHED)])
     foreign = write(tmp_path / "foreign", [("a", "half/qp", pulled())])
+    gone = write(tmp_path / "gone", [("a", "half/qp", pulled())])
+    shutil.rmtree(gone / "vectors")
+    (foreign / "suite.toml").touch()
 
     for folder, text in (
         (tmp_path / "nowhere", "no such folder"),
         (tmp_path / "empty", "no journal"),
-        (bare, "none of its 1 measurements has a stored point"),
+        (bare, "no solver returned a point (1 crashed)"),
+        (foreign / "suite.toml", "suite.toml: a file; expected a result folder"),
+        (gone, "its stored points are gone"),
         (foreign, "no stored answer can be judged: unknown family 'half'"),
     ):
         code, out, err = cli(folder)
         assert (code, out) == (2, "")
         assert text in err.splitlines()[-1]
         assert "Traceback" not in err
+
+
+def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path, cli):
+    folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
+    (folder / "report").touch()
+    code, _, err = cli(folder, validation=write_validation)
+
+    assert code == 2
+    assert err.splitlines()[-1] == (
+        f"mortarbench: {folder / 'report'}: a file is where a folder is needed; "
+        "move the file away"
+    )
 
 
 def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
@@ -647,9 +665,40 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
     assert verdict["discretisation"][0]["error"] == found.error
     assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
     assert "obstacle/dim=1/n=12: " in cli(folder)[1]
-    for budget in ("0", "nan"):
-        (none,) = verdict_on(cli, folder, "--budget", budget)[1]["discretisation"]
-        assert none["error"] is None
+    cli(folder, validation=write_validation)
+    page = (folder / "report" / "validation.md").read_text()
+    assert "Errors of the meshes" in page
+    assert "obstacle/dim=1/n=12" in page.partition("Errors of the meshes")[2]
+    again = verdict_on(cli, folder, "--budget", "0")[1]["discretisation"]
+    assert again[0]["error"] == found.error
+
+
+@pytest.mark.parametrize("budget", ["-1", "nan"])
+def test_no_time_for_finer_meshes_is_less_than_none(cli, tmp_path, budget):
+    code, _, complaint = cli(tmp_path, "--budget", budget)
+
+    assert code == 2
+    assert "--budget" in complaint
+    assert "expected a number of seconds" in complaint
+    assert budget in complaint
+
+
+def test_errors_say_their_norm_and_nothing_is_said_of_a_smalbe_that_took_no_part(
+    truths, tmp_path, cli
+):
+    for label, told in (("a", False), ("smalbe", True)):
+        answers = [(k, f"{BEAM}/primal", truths[2, "primal"][1]) for k in (label, "b")]
+        folder = write(tmp_path / label, answers)
+        _, out, _ = cli(folder, "--budget", "0", validation=write_validation)
+        page = (folder / "report" / "validation.md").read_text()
+
+        assert "Certified errors: relative, in the energy norm." in out
+        assert "√(20t)‖u\\*‖" in page or "√(20t)‖u*‖" in page
+        assert [("smalbe" in text) for text in (out, page)] == [told, told]
+
+
+def test_small_numbers_have_two_digits_each():
+    assert [brief(x) for x in (1.0, 4e-4, 3.17e-9)] == ["1.0e0", "4.0e-4", "3.2e-9"]
 
 
 def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):

@@ -267,6 +267,37 @@ def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
     assert len(found.levels) <= 1
 
 
+def test_less_time_takes_nothing_away_that_more_time_has_told(tmp_path):
+    name = "obstacle/dim=1/n=4/primal"
+    known = meshes(tmp_path, name)
+
+    assert known[0].error is not None
+    assert meshes(tmp_path, name, "obstacle/n=6/primal", budget=0.0)[0] == known[0]
+    assert read_discretisation(tmp_path)["obstacle/dim=1/n=4"] == known[0]
+
+
+def test_what_was_told_of_other_parameters_or_meshes_does_not_stay(tmp_path):
+    """As after a default, which a case's name leaves out, has changed."""
+    name = "obstacle/dim=1/n=4/primal"
+    meshes(tmp_path, name)
+    data = json.loads((tmp_path / FILE).read_text())
+    data["cases"][0]["params"]["n"] = 5
+    (tmp_path / FILE).write_text(json.dumps(data))
+
+    assert meshes(tmp_path, name, budget=0.0)[0].error is None
+
+
+def test_a_reason_other_than_time_replaces_what_was_told(tmp_path):
+    name = "obstacle/dim=1/n=4/primal"
+    meshes(tmp_path, name)
+    broken = {"obstacle": replace_build(PROBLEMS["obstacle"], OSError("no longer"))}
+    (found,) = discretisation_errors(
+        [parse(name, PROBLEMS)], broken, reference_solution, tmp_path, 1e9
+    )
+
+    assert (found.error, "no longer" in found.note) == (None, True)
+
+
 def replace_build(family, error):
     def build(*_):
         raise error

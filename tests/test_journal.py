@@ -84,6 +84,16 @@ def test_a_journal_cut_at_any_byte_loses_only_the_line_that_was_cut(tmp_path):
         assert ids(tmp_path) == ["a"]
 
 
+@pytest.mark.parametrize("bad", [b'{"schema', b"", b"\xff"])
+def test_of_a_damaged_line_it_is_said_what_would_be_right(tmp_path, bad):
+    file = tmp_path / "journal" / "here.jsonl"
+    file.parent.mkdir()
+    file.write_bytes(bad + b"\n")
+
+    with pytest.raises(InputError, match="line 1: damaged; expected a JSON object"):
+        read_journal(tmp_path)
+
+
 @pytest.mark.parametrize("bad", ["nonsense", '{"schema": 99}', '{"schema": 1}', ""])
 def test_a_bad_line_that_is_whole_is_named(tmp_path, bad):
     with Journal(tmp_path, "here") as journal:
@@ -123,4 +133,12 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
 
 def test_a_folder_without_journal_is_named(tmp_path):
     with pytest.raises(InputError, match="no journal in "):
-        read_journal(tmp_path / "nowhere")
+        read_journal(tmp_path)
+
+
+def test_what_is_no_folder_is_said_to_be_missing_or_a_file(tmp_path):
+    (tmp_path / "file").touch()
+    for name, wrong in (("nowhere", "no such folder"), ("file", "a file")):
+        with pytest.raises(InputError) as e:
+            read_journal(tmp_path / name)
+        assert str(e.value) == f"{tmp_path / name}: {wrong}; expected a result folder"

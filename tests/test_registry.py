@@ -136,6 +136,11 @@ def test_what_is_wrong_with_a_solver_is_said_in_one_line(asked, message):
     assert "\n" not in str(e.value)
 
 
+def test_where_a_solver_is_unknown_plugins_are_mentioned():
+    with pytest.raises(InputError, match=r"known: .*; others come with --plugin FILE"):
+        resolve(spec("mine"), SOLVERS)
+
+
 def test_options_are_all_fields_with_their_values():
     assert options_of(Method(max_iter=9)) == {
         "max_iter": 9, "alpha": 1.5, "scaling": True, "mode": "fast", "seed": None

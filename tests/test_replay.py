@@ -1,12 +1,14 @@
 """A stored measurement, made again: what must be the same, what must be told."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from harness.cli import main
@@ -101,6 +103,19 @@ def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
     assert told["distance"] == 0
     assert ratio == pytest.approx(told["now"]["solve_seconds"] / middle)
     assert least + greatest == pytest.approx(2)  # two repeats about their median
+
+
+def test_the_ratio_of_times_says_what_it_is_of(cli, stored):
+    """Not of the time beside it, which is that of one of the stored repeats."""
+    then = stored["half", 1, 0]
+    out = cli("replay", "done", then.run_id)[1]
+    (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]
+    ratio, middle = re.search(r"([\d.]+) of ([\d.e-]+), the median of 2", row).groups()
+    times = [stored["half", 1, repeat].solve_seconds for repeat in (0, 1)]
+    now = float(row.split()[3])
+
+    assert float(middle) == pytest.approx(np.mean(times), rel=5e-3)
+    assert float(ratio) == pytest.approx(now / np.mean(times), rel=1e-2, abs=6e-3)
 
 
 def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):

@@ -478,5 +478,10 @@ def test_bad_input_is_one_line_that_says_what_would_be_right(tmp_path, measured)
     (folder / "suite.toml").write_text("name = ")
     with pytest.raises(InputError, match=r"suite\.toml") as malformed:
         write_report(folder, ["html"])
+    (folder / "suite.toml").unlink()
+    for damaged in (b"{", b"[]", b"\xff"):
+        (folder / "environment.json").write_bytes(damaged)
+        with pytest.raises(InputError, match=r"environment\.json: .*; expected"):
+            write_report(folder, ["html"])
     for error in (unknown, missing, empty, malformed):
         assert "\n" not in str(error.value)
