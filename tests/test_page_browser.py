@@ -12,6 +12,8 @@ import pytest
 
 from harness import Record, Verdict
 from harness.journal import Journal
+from reports.changes import compare
+from reports.comparison import compose as comparison
 from reports.data import read_evidence
 from reports.folder import compose
 from reports.page import html
@@ -376,6 +378,47 @@ def test_a_plot_zooms_changes_its_axes_and_names_the_point_under_the_pointer(
     assert run.case in tip
     page.keyboard.press("Enter")
     assert f"Run {run.run_id}" in opened(page).inner_text()
+
+
+@pytest.fixture(scope="session")
+def compared(tmp_path_factory):
+    """The page of two runs, with a name that is long and one that is far too long."""
+    paths = [tmp_path_factory.mktemp(name) for name in ("before", "after")]
+    for path in paths:
+        with Journal(path, "test") as journal:
+            for i, solver in enumerate(("osqp-polish", "x" * 30, "short")):
+                for repeat in range(3):
+                    journal.append(Record(
+                        run_id=f"{i}-{repeat}", case="box/n=1/dual", family="box",
+                        params={"n": 1}, form="dual", sizes={"variables": 10},
+                        solver=solver, options={}, tol=1e-6, repeat=repeat,
+                        block=repeat, status=Verdict.VERIFIED, claimed="solved",
+                        iterations=7, total_seconds=1e-3 * (1 + 0.01 * repeat * i),
+                        primal=1e-9, dual=1e-9, complementarity=1e-9, gap=1e-9,
+                        started="2026-11-21T10:00:00+00:00",
+                    ))  # fmt: skip
+    (paths[1] / "report").mkdir()
+    page = html(comparison(compare(*map(read_evidence, paths))))
+    (paths[1] / "report" / "index.html").write_text(page, "utf-8", newline="\n")
+    return paths[1]
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_names_beside_a_plot_are_whole_or_shortened_but_never_cut(
+    visit, compared, width
+):
+    drawing = visit(compared, width=width).locator("#times .panel > svg").first
+    drawing.scroll_into_view_if_needed()
+    edge = drawing.bounding_box()["x"]
+    names = drawing.locator("> text[text-anchor=end]")
+    shown = [name.evaluate("e => e.firstChild.data") for name in names.all()]
+
+    assert len(shown) == 3
+    assert {"osqp-polish", "short"} <= set(shown)
+    assert all(name.bounding_box()["x"] >= edge for name in names.all())
+    assert names.locator("title").all_text_contents() == (
+        ["x" * 30] if width == 390 else []
+    )
 
 
 def test_dragging_over_a_plot_enlarges_what_is_within(visit, folder):

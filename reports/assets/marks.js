@@ -45,6 +45,25 @@ function swatch(look) {
   return svg("svg", { width: 28, height: 14, "aria-hidden": "true" }, ...line, ...dot);
 }
 
+const pen = document.createElement("canvas").getContext("2d");
+
+/** How wide a text is, in px, in the font of a node. */
+function breadth(text, node) {
+  pen.font = getComputedStyle(node).font;
+  return pen.measureText(text).width;
+}
+
+/** A text without its middle, if it has not the room: names differ at their ends. */
+function shortened(text, room, node) {
+  let shown = text, letters = [...text];
+  while (letters.length > 3 && breadth(shown, node) > room) {
+    letters.splice(Math.floor((2 * letters.length) / 3), 1);
+    const front = Math.ceil((2 * letters.length) / 3);
+    shown = letters.slice(0, front).join("") + "…" + letters.slice(front).join("");
+  }
+  return shown;
+}
+
 const raised = (k) => (k < 0 ? "⁻" : "") + [...String(Math.abs(k))].map((d) => RAISED[d]).join("");
 
 function number(v) {
@@ -71,4 +90,10 @@ function ticks([low, high], log, most) {
   const found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high * (1 + 1e-12) + 1e-9 * step; k++) found.push(Number((k * step).toPrecision(12)));
   return found;
+}
+
+/** Ticks within the view of an axis, with their texts: those that are set, or `most`. */
+function labelled({ view, log, ticks: set }, most) {
+  const all = set ?? ticks(view, log, most).map((v) => [v, number(v)]);
+  return all.filter(([v]) => v >= view[0] && v <= view[1]);
 }
