@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from harness import Record, Verdict
 from harness.journal import Journal
@@ -16,6 +17,7 @@ from reports.changes import compare
 from reports.comparison import compose as comparison
 from reports.data import read_evidence
 from reports.folder import compose
+from reports.layout import Page, Picture, Section
 from reports.page import html
 
 try:
@@ -446,6 +448,26 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(visit, folder):
     )
     assert outside == []
     assert page.evaluate("document.documentElement.scrollWidth") == 390
+
+
+@pytest.mark.parametrize(("width", "wider"), [(1400, False), (390, True)])
+def test_a_printed_figure_says_when_there_is_more_of_it_beside_the_screen(
+    visit, tmp_path, width, wider
+):
+    figure = Figure(figsize=(6.9, 2))
+    figure.subplots().imshow([[0.0, 1.0]])
+    picture = Picture(name="still", caption="Two cells.", figure=figure)
+    section = Section(name="still", title="A still", pictures=(picture,))
+    (tmp_path / "report").mkdir()
+    text = html(Page(title="One figure", dateline="", sections=(section,)))
+    (tmp_path / "report" / "index.html").write_text(text, "utf-8", newline="\n")
+    page = visit(tmp_path, width=width)
+    box = page.locator("#still .scroll")
+    page.wait_for_function("document.querySelector('#still .scroll').clientWidth > 0")
+
+    assert box.evaluate("e => e.scrollWidth > e.clientWidth + 1") == wider
+    assert page.locator("#still .hint").is_visible() == wider
+    assert page.evaluate("document.documentElement.scrollWidth") == width
 
 
 def test_without_scripts_the_page_still_shows_figures_and_first_rows(visit, folder):
