@@ -423,6 +423,19 @@ def test_names_beside_a_plot_are_whole_or_shortened_but_never_cut(
     )
 
 
+@pytest.mark.parametrize(
+    ("view", "texts"),
+    [([4e-4, 3e-3], ["5·10⁻⁴", "10⁻³", "2·10⁻³"]),
+     ([5e-5, 2], ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹", "10⁰"]),
+     ([0.05, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])],
+)  # fmt: skip
+def test_the_ticks_of_an_axis_are_numbers_of_one_kind(visit, folder, view, texts):
+    axis = {"view": view, "log": True}
+    found = visit(folder).evaluate("axis => labelled(axis, 8)", axis)
+
+    assert [text for _, text in found] == texts
+
+
 def test_dragging_over_a_plot_enlarges_what_is_within(visit, folder):
     page = visit(folder)
     drawing = page.locator("#times .panel svg").first

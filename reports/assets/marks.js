@@ -66,10 +66,14 @@ function shortened(text, room, node) {
 
 const raised = (k) => (k < 0 ? "⁻" : "") + [...String(Math.abs(k))].map((d) => RAISED[d]).join("");
 
-function number(v) {
+const decade = (v) => Math.floor(Math.log10(Math.abs(v)) + 1e-9);
+const plain = (v) => v === 0 || (decade(v) >= -3 && decade(v) <= 4);
+
+/** A number as people write it; with its power of ten if it asks for one. */
+function number(v, powered = !plain(v)) {
   if (v === 0) return "0";
-  const size = Math.floor(Math.log10(Math.abs(v)) + 1e-9);
-  if (size >= -3 && size <= 4) return String(Number(v.toPrecision(5)));
+  const size = decade(v);
+  if (!powered) return String(Number(v.toPrecision(5)));
   const front = Number((v / 10 ** size).toPrecision(4));
   return (front === 1 ? "" : `${front}·`) + "10" + raised(size);
 }
@@ -92,8 +96,10 @@ function ticks([low, high], log, most) {
   return found;
 }
 
-/** Ticks within the view of an axis, with their texts: those that are set, or `most`. */
+/** Ticks within the view of an axis, those that are set or `most`, with texts of one kind. */
 function labelled({ view, log, ticks: set }, most) {
-  const all = set ?? ticks(view, log, most).map((v) => [v, number(v)]);
-  return all.filter(([v]) => v >= view[0] && v <= view[1]);
+  const within = (v) => v >= view[0] && v <= view[1];
+  if (set) return set.filter(([v]) => within(v));
+  const found = ticks(view, log, most).filter(within);
+  return found.map((v) => [v, number(v, !found.every(plain))]);
 }
