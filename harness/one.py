@@ -152,6 +152,8 @@ def _show(record: Record, history: History, as_json: bool) -> None:
         print(show.outcome(record))
         if table := show.convergence(history):
             print(f"\n{table}")
+            if legend := show.legend(history):
+                print(f"\n{legend}")
     if record.status is Verdict.DECLINED:
         say(f"{record.solver} declines {record.case}: {record.message}")
 

@@ -29,7 +29,15 @@ UNITS = {
 
 _HEADS = {
     "free_gradient": "‖φ‖", "chopped_gradient": "‖β‖", "infeasibility": "‖Ax−b‖",
+    "active": "at bound", "cost": "own cost",
 }  # fmt: skip
+_LEGEND = {
+    "step": "steps: c cg, e expansion, f fallback, p proportioning",
+    "free_gradient": "‖φ‖: free gradient",
+    "chopped_gradient": "‖β‖: chopped gradient",
+    "active": "at bound: variables that meet one",
+    "cost": "own cost: what it minimises inside",
+}
 _UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
 _ROWS = 15  #: of a table of convergence
 
@@ -152,6 +160,12 @@ def convergence(history: History) -> str:
         )
         cells.append([_HEADS.get(name, name.replace("_", " ")), *texts])
     return aligned(zip(*cells, strict=True), right=range(len(cells)))
+
+
+def legend(history: History) -> str:
+    """Explain in a line what `convergence` shows; empty where that needs no words."""
+    told = (text for k, text in _LEGEND.items() if k in history and history[k].size)
+    return "; ".join(told)
 
 
 def _milestones(history: History) -> list[int]:

@@ -54,9 +54,10 @@ def matched_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     for case, row in swept.items():
         for error in ERRORS:
             found = {s: matched(outcomes, error) for s, outcomes in row.items()}
-            times = [m.time.value for m in found.values() if m.time]
-            best = min(times, default=None)
-            cells = [_cell(found.get(s), row.get(s, ()), best) for s in present]
+            kinds = _kinds({s: m for s, m in found.items() if not row[s][0].first.arm})
+            cells = [
+                _cell(found.get(s), row.get(s, ()), kinds.get(s, "")) for s in present
+            ]
             rows.append(
                 (name_cell(case), Cell(text=tolerance(error), value=error), *cells)
             )
@@ -66,7 +67,10 @@ def matched_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
             "Interpolated between the tolerances of the sweep, monotone and linear in "
             f"logarithms, never beyond them; in brackets the {COVERAGE:.0%} interval "
             "of a bootstrap over the repeats. ≤: the answer at the loosest tolerance "
-            "is better than that already, and took so long.",
+            "is better than that already, and took so long; at this error it may take "
+            "less than any other. Bold: the fastest of its row, where no other has a "
+            "≤; ≈: the interval overlaps that of the fastest time without a ≤, so that "
+            "this run does not tell them apart.",
             TIMED,
         ),
         columns=("case", "error", *(clean(s, 40) for s in present)),
@@ -74,7 +78,22 @@ def matched_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     )
 
 
-def _cell(found: Matched | None, tried: Sequence[Outcome], best: float | None) -> Cell:
+def _kinds(found: Mapping[str, Matched]) -> dict[str, str]:
+    """Rank the times of a row; what is only bounded from above has no place in it."""
+    known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
+    if not known:
+        return {}
+    fastest = min(known.values(), key=lambda t: t.value)
+    best = "" if any(m.kind == "looser" for m in found.values()) else "best"
+    return {
+        s: best if t.value == fastest.value
+        else "tied" if t.low <= fastest.high and t.samples > 1
+        else ""
+        for s, t in known.items()
+    }  # fmt: skip
+
+
+def _cell(found: Matched | None, tried: Sequence[Outcome], kind: str) -> Cell:
     if found is None:
         return Cell(text=ABSENT)
     reached = [o for o in tried if counts(o)]
@@ -89,7 +108,8 @@ def _cell(found: Matched | None, tried: Sequence[Outcome], best: float | None) -
     return Cell(
         text=("≤ " if looser else "") + seconds(found.time),
         after="below the loosest tolerance" if looser else "",
-        kind="best" if found.time.value == best else "",
+        symbol="≈" if kind == "tied" else "",
+        kind=kind,
         value=found.time.value,
         title=clean(f"from runs {runs}", 400),
     )

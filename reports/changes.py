@@ -21,6 +21,7 @@ from reports.data import SEVERITY, Evidence, Outcome
 from reports.intervals import COVERAGE
 
 DRAWS = 2000
+ALIKE = 1.5  #: an interval that excludes such a factor either way can tell "no change"
 FEWEST = 3  #: cells that an interval over cells needs
 _NEGLIGIBLE = 1e-12  #: energies below, of QPs with data of order one, are rounding
 
@@ -73,7 +74,7 @@ class Pair:
     @property
     def change(self) -> int:
         """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
-        return _side(self.ratio)
+        return side(self.ratio)
 
     @property
     def turn(self) -> int:
@@ -244,15 +245,16 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     return Mean(float(value), float(low), float(high), n)
 
 
-def side(mean: Mean | None) -> int:
+def side(interval: Ratio | Mean | None) -> int:
     """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
-    return _side(mean)
-
-
-def _side(interval: Ratio | Mean | None) -> int:
     if interval is None:
         return 0
     return int(interval.low > 1) - int(interval.high < 1)
+
+
+def resolved(interval: Ratio | Mean) -> bool:
+    """Whether a change by a factor `ALIKE`, either way, would have been seen."""
+    return side(interval) != 0 or 1 / ALIKE < interval.low <= interval.high < ALIKE
 
 
 def _cells(evidence: Evidence) -> dict[Key, Outcome]:

@@ -16,7 +16,7 @@ from reports.changes import (
 from reports.comparison_conditions import conditions_that_differ
 from reports.comparison_figure import ratios_figure
 from reports.comparison_words import (
-    CHANGES,
+    change_word,
     dates,
     named,
     ratio_text,
@@ -112,7 +112,7 @@ def _mean_cells(mean: Mean | None, kind: str = "") -> tuple[Cell, ...]:
     return (
         Cell(text=str(mean.cells), value=mean.cells, kind=kind),
         Cell(text=ratio_text(mean), value=mean.value, kind=kind),
-        Cell(text=CHANGES[way], value=way, kind="over" if way > 0 else kind),
+        Cell(text=change_word(mean), value=way, kind="over" if way > 0 else kind),
     )
 
 
@@ -164,7 +164,7 @@ def _time_row(p: Pair) -> tuple[Cell, ...]:
         *times,
         Cell(text=ratio_text(p.ratio), value=p.ratio.value, title=source(p.after)),
         Cell(
-            text=CHANGES[p.change],
+            text=change_word(p.ratio),
             value=p.change,
             kind={1: "over", 0: "quiet", -1: ""}[p.change],
         ),

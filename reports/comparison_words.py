@@ -4,23 +4,34 @@ from __future__ import annotations
 
 from harness.kkt import VERIFIED_FACTOR
 from harness.pairs import Ratio
-from reports.changes import Comparison, Mean, Pair, mean_ratio, relative_ratio, side
+from reports.changes import (
+    ALIKE,
+    Comparison,
+    Mean,
+    Pair,
+    mean_ratio,
+    relative_ratio,
+    resolved,
+    side,
+)
 from reports.conditions import environments, machines_differ
 from reports.intervals import COVERAGE
 from reports.summary import busy_with, dateline
 from reports.wording import VERDICTS, clean, plural, power, tolerance
 
 NAMED = 8  #: changes that are named; tables have all
-CHANGES = {1: "slower", 0: "no change", -1: "faster"}
+WORDS = ("slower", "faster", "no change seen", "not resolved")
 
 
 def verdict_lines(c: Comparison) -> list[str]:
     """Say in a few lines of plain text how the comparison ended."""
-    lines = [*filter(None, (_environments(c), _busy(c))), _counted_times(c)]
+    if not c.pairs:
+        return [_nothing(c)]
+    lines = [*filter(None, (_same(c), _environments(c), _busy(c))), _counted_times(c)]
     means = [(s, mean_ratio(c.of(s))) for s in c.solvers]
     lines += [
         f"  {s}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
-        f"{CHANGES[side(mean)]}"
+        f"{change_word(mean)}"
         for s, mean in means
         if mean is not None
     ]
@@ -40,9 +51,41 @@ def dates(c: Comparison) -> str:
 
 def sentences(c: Comparison) -> tuple[str, ...]:
     """Say how the conditions compare, and count what changed."""
+    if not c.pairs:
+        return (_nothing(c),)
     counted = f"{_counted_verdicts(c)} {_counted_others(c)}"
-    said = (_environments(c), _busy(c), _counted_times(c), _shared(c), counted)
+    said = (
+        _same(c),
+        _environments(c),
+        _busy(c),
+        _counted_times(c),
+        _shared(c),
+        counted,
+    )
     return tuple(filter(None, said))
+
+
+def _same(c: Comparison) -> str:
+    """Tell who compares a folder with itself that this says nothing."""
+    if c.before.directory.resolve() != c.after.directory.resolve():
+        return ""
+    return "Before and after are the same folder: nothing in it can have changed."
+
+
+def _nothing(c: Comparison) -> str:
+    """Say that there is nothing to compare."""
+    return (
+        "No cell is in both folders (a solver on a case at a tolerance), so there is "
+        f"nothing to compare: {plural(len(c.only_before), 'cell')} before, "
+        f"{len(c.only_after)} after."
+    )
+
+
+def change_word(interval: Ratio | Mean) -> str:
+    """Say what an interval tells; "no change" only if it could have told one."""
+    if way := side(interval):
+        return "slower" if way > 0 else "faster"
+    return "no change seen" if resolved(interval) else "not resolved"
 
 
 def _environments(c: Comparison) -> str:
@@ -69,12 +112,14 @@ def _counted_times(c: Comparison) -> str:
     timed = c.timed
     if not timed:
         return "Times: no cell has two verified repeats in both folders to compare."
-    slower, faster = (sum(p.change == way for p in timed) for way in (1, -1))
+    words = [change_word(p.ratio) for p in timed if p.ratio is not None]
+    counted = ", ".join(f"{words.count(word)} {word}" for word in WORDS)
     chance = (1 - COVERAGE) * len(timed)
     return (
-        f"Times: {slower} slower, {faster} faster, {len(timed) - slower - faster} "
-        f"without a change, of {plural(len(timed), 'cell')}; of intervals that hold "
-        f"{COVERAGE:.0%}, {chance:.1f} would show a change by chance."
+        f"Times: {counted}, of {plural(len(timed), 'cell')}; not resolved: the "
+        f"interval holds 1, and a factor of {ALIKE:g} or its inverse as well. Of "
+        f"intervals that hold {COVERAGE:.0%}, {chance:.1f} would show a change by "
+        "chance."
     )
 
 

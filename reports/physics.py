@@ -147,6 +147,7 @@ def physics(evidence: Evidence) -> Section | None:
             _quantities(mine, family, sizes=False),
         ]
     si = " Units are SI." if any(elastic(o) for o, _ in chosen) else ""
+    si += " A number without a unit is dimensionless, or in that of its file."
     return Section(
         name="physics",
         title="Physical results",

@@ -123,12 +123,13 @@ def _canary_row(name: str, mine: Sequence[Record], kind: str = "") -> tuple[Cell
     times = [r.canary_seconds for r in mine if r.canary_seconds]
     middle = median(times)
     low, high = np.quantile(times, (0.05, 0.95)) / middle - 1
+    span = f"{low:+.1%} to {high:+.1%}" if len(times) > 1 else ABSENT
     third = len(times) // _PARTS
     drift = median(times[-third:]) / median(times[:third]) - 1 if third else None
     return (
         Cell(**{**vars(name_cell(name)), "kind": kind}),
         Cell(text=str(len(times)), value=len(times), kind=kind),
         Cell(text=seconds(median_interval(times)), value=middle, kind=kind),
-        Cell(text=f"{low:+.1%} to {high:+.1%}", value=high - low, kind=kind),
+        Cell(text=span, value=None if span == ABSENT else high - low, kind=kind),
         Cell(text=ABSENT if drift is None else f"{drift:+.1%}", value=drift, kind=kind),
     )

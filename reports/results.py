@@ -161,12 +161,14 @@ def errors(evidence: Evidence) -> Section:
     )
     measures = (*RESIDUALS, "energy_bound") if bounded else RESIDUALS
     heads = tuple(name.replace("_", " ") for name in measures)
+    answers = [o for o in evidence.flat if o.worst is not None]
+    if not answers:
+        none = "No solver handed over a point, so there are no residuals."
+        return Section(name="errors", title="Errors", prose=(none,))
     table = Table(
         caption="Residuals of every answer.",
         columns=("case", "solver", "tol", "verdict", *heads),
-        rows=tuple(
-            _residuals(o, measures) for o in evidence.flat if o.worst is not None
-        ),
+        rows=tuple(_residuals(o, measures) for o in answers),
         text_columns=2,
     )
     return Section(

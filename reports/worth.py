@@ -179,11 +179,11 @@ def _further(enough: Outcome, tightest: Outcome) -> str:
     if enough is tightest:
         return ", the tightest"
     ratio = paired_ratio(_by_repeat(tightest), _by_repeat(enough))
-    to = f"; {tolerance(tightest.tol)}: "
+    at = f"times as long at {tolerance(tightest.tol)}"
     if ratio is not None:
-        return f"{to}×{ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"
+        return f"; {ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}] {at}"
     a, b = tightest.seconds("total"), enough.seconds("total")
-    return f"{to}×{a.value / b.value:.2f} [1 run]" if a and b else ""
+    return f"; {a.value / b.value:.2f} [1 run] {at}" if a and b else ""
 
 
 def _by_repeat(outcome: Outcome) -> dict[int, float]:

@@ -11,9 +11,9 @@ import pytest
 from harness import InputError, Record, Verdict
 from harness.journal import Journal
 from reports import write_comparison
-from reports.changes import compare, mean_of, mean_ratio, relative_ratio, side
+from reports.changes import Mean, compare, mean_of, mean_ratio, relative_ratio, side
 from reports.comparison import compose
-from reports.comparison_words import verdict_lines
+from reports.comparison_words import change_word, verdict_lines
 from reports.data import Evidence, arrange
 from reports.markdown import markdown
 
@@ -120,6 +120,49 @@ def test_the_interval_over_cells_covers_as_it_says(cells):
         for i in range(400)
     )
     assert 7 <= missed <= 40
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "word"),
+    [(1.1, 9.0, "slower"), (0.1, 0.9, "faster"), (0.9, 1.2, "no change seen"),
+     (0.68, 1.49, "no change seen"), (0.9, 1.6, "not resolved"),
+     (0.6, 1.1, "not resolved"), (0.145, 4.437, "not resolved"),
+     (0.0, np.inf, "not resolved")],
+)  # fmt: skip
+def test_what_a_change_by_half_may_hide_in_is_not_called_unchanged(low, high, word):
+    assert change_word(Mean(1.0, low, high, 3)) == word
+
+
+def test_cells_that_resolve_nothing_are_counted_apart(changed):
+    """Of two cells without a change, one scatters by a factor of ten."""
+    times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
+    before = [record(case=k, repeat=i) for k in times for i in range(2)]
+    after = [
+        r.but(total_seconds=r.total_seconds * times[r.params["n"]][r.repeat])
+        for r in before
+    ]
+    said = "\n".join(verdict_lines(changed(before, after)))
+
+    assert "0 slower, 0 faster, 1 no change seen, 1 not resolved" in said
+
+
+def test_a_folder_has_nothing_to_say_about_itself(tmp_path):
+    with Journal(tmp_path / "a", "j") as journal:
+        for r in suite(1, cases=2, repeats=2):
+            journal.append(r)
+    said, written = write_comparison(tmp_path / "a", tmp_path / "a", ["md"])
+
+    (page,) = (path for path in written if path.name == "report.md")
+    assert "the same folder" in said[0]
+    assert said[0] in page.read_text()
+
+
+def test_folders_that_share_no_cell_are_told_so_in_one_sentence(changed):
+    c = changed([record("one")], [record("two", case=k) for k in range(2)])
+
+    (line,) = verdict_lines(c)
+    assert line.startswith("No cell is in both folders")
+    assert "1 cell before, 2 after" in line
 
 
 def test_one_repeat_in_each_folder_names_no_change_of_a_cell(changed):

@@ -196,14 +196,17 @@ def test_solvers_without_a_history_have_an_empty_one_in_json_and_no_table(cli):
 def test_solve_shows_people_counters_and_a_table_of_convergence(cli):
     _, out, _ = cli("solve", "well/dual", "--solver", "descent")
 
-    facts, _, table = out.partition("\n\n")
+    facts, table, legend = out.split("\n\n")
     assert "counts P_products 2 prepare" in " ".join(facts.split())
     head, *rows = (line.split() for line in table.splitlines())
-    assert head == ["iteration", "step", "products", "‖φ‖", "‖β‖", "active", "cost"]
+    assert " ".join(head) == "iteration step products ‖φ‖ ‖β‖ at bound own cost"
     assert rows == [
         ["1", "e1", "1", "0", "1.73e+00", "3", "0"],
         ["2", "e1", "2", "0", "0", "0", "-1.5"],
     ]
+    (line,) = legend.splitlines()
+    for word in ("e expansion", "‖φ‖: free", "‖β‖: chopped", "at bound:", "own cost:"):
+        assert word in line
 
 
 def test_a_row_of_the_table_ends_each_outer_iteration():

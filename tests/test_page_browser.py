@@ -9,11 +9,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from harness import Record, Verdict
 from harness.journal import Journal
+from reports.changes import compare
+from reports.comparison import compose as comparison
 from reports.data import read_evidence
 from reports.folder import compose
+from reports.layout import Page, Picture, Section
 from reports.page import html
 
 try:
@@ -378,6 +382,60 @@ def test_a_plot_zooms_changes_its_axes_and_names_the_point_under_the_pointer(
     assert f"Run {run.run_id}" in opened(page).inner_text()
 
 
+@pytest.fixture(scope="session")
+def compared(tmp_path_factory):
+    """The page of two runs, with a name that is long and one that is far too long."""
+    paths = [tmp_path_factory.mktemp(name) for name in ("before", "after")]
+    for path in paths:
+        with Journal(path, "test") as journal:
+            for i, solver in enumerate(("osqp-polish", "x" * 30, "short")):
+                for repeat in range(3):
+                    journal.append(Record(
+                        run_id=f"{i}-{repeat}", case="box/n=1/dual", family="box",
+                        params={"n": 1}, form="dual", sizes={"variables": 10},
+                        solver=solver, options={}, tol=1e-6, repeat=repeat,
+                        block=repeat, status=Verdict.VERIFIED, claimed="solved",
+                        iterations=7, total_seconds=1e-3 * (1 + 0.01 * repeat * i),
+                        primal=1e-9, dual=1e-9, complementarity=1e-9, gap=1e-9,
+                        started="2026-11-21T10:00:00+00:00",
+                    ))  # fmt: skip
+    (paths[1] / "report").mkdir()
+    page = html(comparison(compare(*map(read_evidence, paths))))
+    (paths[1] / "report" / "index.html").write_text(page, "utf-8", newline="\n")
+    return paths[1]
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_names_beside_a_plot_are_whole_or_shortened_but_never_cut(
+    visit, compared, width
+):
+    drawing = visit(compared, width=width).locator("#times .panel > svg").first
+    drawing.scroll_into_view_if_needed()
+    edge = drawing.bounding_box()["x"]
+    names = drawing.locator("> text[text-anchor=end]")
+    shown = [name.evaluate("e => e.firstChild.data") for name in names.all()]
+
+    assert len(shown) == 3
+    assert {"osqp-polish", "short"} <= set(shown)
+    assert all(name.bounding_box()["x"] >= edge for name in names.all())
+    assert names.locator("title").all_text_contents() == (
+        ["x" * 30] if width == 390 else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("view", "texts"),
+    [([4e-4, 3e-3], ["5·10⁻⁴", "10⁻³", "2·10⁻³"]),
+     ([5e-5, 2], ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹", "10⁰"]),
+     ([0.05, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])],
+)  # fmt: skip
+def test_the_ticks_of_an_axis_are_numbers_of_one_kind(visit, folder, view, texts):
+    axis = {"view": view, "log": True}
+    found = visit(folder).evaluate("axis => labelled(axis, 8)", axis)
+
+    assert [text for _, text in found] == texts
+
+
 def test_dragging_over_a_plot_enlarges_what_is_within(visit, folder):
     page = visit(folder)
     drawing = page.locator("#times .panel svg").first
@@ -403,6 +461,26 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(visit, folder):
     )
     assert outside == []
     assert page.evaluate("document.documentElement.scrollWidth") == 390
+
+
+@pytest.mark.parametrize(("width", "wider"), [(1400, False), (390, True)])
+def test_a_printed_figure_says_when_there_is_more_of_it_beside_the_screen(
+    visit, tmp_path, width, wider
+):
+    figure = Figure(figsize=(6.9, 2))
+    figure.subplots().imshow([[0.0, 1.0]])
+    picture = Picture(name="still", caption="Two cells.", figure=figure)
+    section = Section(name="still", title="A still", pictures=(picture,))
+    (tmp_path / "report").mkdir()
+    text = html(Page(title="One figure", dateline="", sections=(section,)))
+    (tmp_path / "report" / "index.html").write_text(text, "utf-8", newline="\n")
+    page = visit(tmp_path, width=width)
+    box = page.locator("#still .scroll")
+    page.wait_for_function("document.querySelector('#still .scroll').clientWidth > 0")
+
+    assert box.evaluate("e => e.scrollWidth > e.clientWidth + 1") == wider
+    assert page.locator("#still .hint").is_visible() == wider
+    assert page.evaluate("document.documentElement.scrollWidth") == width
 
 
 def test_without_scripts_the_page_still_shows_figures_and_first_rows(visit, folder):

@@ -250,6 +250,15 @@ def test_the_energy_bound_is_explained_only_where_there_is_one(measured, page):
     assert "Energy bound" in bounded
 
 
+def test_where_no_answer_has_a_point_there_is_no_table_of_residuals(measured, page):
+    none = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
+    lost = measured(status=Verdict.CRASHED, claimed=None, **none)
+    found = section(page([lost]), "errors")
+
+    assert found.tables == ()
+    assert "no residuals" in found.prose[0]
+
+
 def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, page):
     found = section(page([measured(tol=0.05, dual=0.2, gap=0.05)]), "errors")
     (row,) = rows(found.tables[0])

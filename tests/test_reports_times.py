@@ -108,6 +108,13 @@ def test_the_drift_of_the_canary_is_that_of_the_machine(record, section):
     assert found[0]["canary"].value == pytest.approx(1.25e-5)
 
 
+def test_one_canary_has_no_spread(record, section):
+    first, *_ = rows(section([record(canary_seconds=1e-5)], "precision").tables[0])
+
+    assert (first["nine tenths"].text, first["nine tenths"].value) == ("–", None)
+    assert first["drift"].text == "–"
+
+
 def test_time_to_accuracy_is_that_of_the_cheapest_verified_answer(record, section):
     sweep = [
         record(tol=1e-2, accuracy=1e-6, total_seconds=0.001, status=Verdict.WRONG),

@@ -3,6 +3,8 @@
 const NEAR = 24; // px within which a point counts as pointed at
 const APART = 70; // px between the marks of a line that has few
 const LETTER = 6.2; // px, about as wide as one is
+const MARGIN = 66; // px left of the axis, at least
+const MOST = 0.4; // of the width that names left of the axis may take
 const PER_INCH = 104; // px of a printed inch
 
 /** One panel: axes, traces, what is pointed at; `linked` are those with the same x. */
@@ -14,6 +16,8 @@ function chart(box, content, linked, name) {
   const bar = make("div", { class: "bar" });
   const below = content.x.label ? 42 : content.x.numbered ? 24 : small ? 3 : 10; // px, for ticks and label
   const height = small ? 14 * content.traces.length + 6 + below : Math.min(Math.max(content.height * PER_INCH, 230), 460);
+  const top = content.title ? 24 : 8;
+  const titled = !small && axes.y.label ? 22 : 0; // px, for the label along the axis
   let points = [], at = -1, scale = null, band = null;
   const up = { x: (v) => (axes.x.log ? Math.log10(v) : v), y: (v) => (axes.y.log ? Math.log10(v) : v) };
   const down = { x: (v) => (axes.x.log ? 10 ** v : v), y: (v) => (axes.y.log ? 10 ** v : v) };
@@ -103,28 +107,34 @@ function chart(box, content, linked, name) {
     }
   }
 
+  const aside = () => labelled(axes.y, Math.max(2, Math.floor((height - below - top) / 45)));
+  function margin() { // what the texts left of the axis need
+    const texts = small ? [axes.y.label] : aside().map(([, text]) => text);
+    return Math.max(MARGIN, titled + 8 + Math.max(0, ...texts.map((text) => breadth(text, drawing))));
+  }
+
   function frame(W, H) {
     const parts = [];
     const grid = { stroke: "var(--rule)", "stroke-width": 0.6 };
     const label = (text, attributes) => parts.push(svg("text", attributes, text));
-    const given = (axis, most) => axes[axis].ticks?.map(([v, n]) => [v, n]) ?? ticks(axes[axis].view, axes[axis].log, most).map((v) => [v, number(v)]);
-    const room = (axis, v) => v >= axes[axis].view[0] && v <= axes[axis].view[1];
-    for (const [v, text] of given("x", Math.max(3, Math.floor((scale.right - scale.left) / 80)))) {
-      if (!room("x", v)) continue;
+    const beside = (text, y) => { // left of the axis
+      const shown = shortened(text, scale.left - 8 - titled, drawing);
+      label(shown, { x: scale.left - 6, y, "text-anchor": "end", "dominant-baseline": "central" });
+      if (shown !== text) parts.at(-1).append(svg("title", {}, text));
+    };
+    for (const [v, text] of labelled(axes.x, Math.max(3, Math.floor((scale.right - scale.left) / 80)))) {
       const p = scale.x(v).toFixed(1);
       if (!small) parts.push(svg("path", { d: `M${p} ${scale.top}V${scale.bottom}`, ...grid }));
       if (axes.x.numbered) label(text, { x: p, y: scale.bottom + 17, "text-anchor": "middle" });
     }
-    for (const [v, text] of given("y", Math.max(2, Math.floor((scale.bottom - scale.top) / 45)))) {
-      if (!room("y", v)) continue;
-      const q = scale.y(v).toFixed(1);
-      parts.push(svg("path", { d: `M${scale.left} ${q}H${scale.right}`, ...grid }));
-      label(text, { x: scale.left - 6, y: q, "text-anchor": "end", "dominant-baseline": "central" });
+    for (const [v, text] of aside()) {
+      parts.push(svg("path", { d: `M${scale.left} ${scale.y(v).toFixed(1)}H${scale.right}`, ...grid }));
+      beside(text, scale.y(v).toFixed(1));
     }
     parts.push(svg("path", { d: small ? `M${scale.left} ${scale.bottom}H${scale.right}` : `M${scale.left} ${scale.top}V${scale.bottom}H${scale.right}`, fill: "none", stroke: "currentColor", "stroke-width": 0.9 }));
     label(axes.x.label, { x: (scale.left + scale.right) / 2, y: H - 6, "text-anchor": "middle", class: "axis" });
     const middle = (scale.top + scale.bottom) / 2;
-    if (small) label(axes.y.label, { x: scale.left - 6, y: middle, "text-anchor": "end", "dominant-baseline": "central" });
+    if (small) beside(axes.y.label, middle);
     else label(axes.y.label, { transform: `translate(13 ${middle}) rotate(-90)`, "text-anchor": "middle", class: "axis" });
     if (content.title) label(content.title, { x: (scale.left + scale.right) / 2, y: 14, "text-anchor": "middle", class: "axis" });
     return parts;
@@ -151,15 +161,15 @@ function chart(box, content, linked, name) {
   function draw() {
     const W = drawing.clientWidth || box.clientWidth, H = height;
     if (!W) return;
-    scale = { left: 66, right: W - 14, top: content.title ? 24 : 8, bottom: H - below };
+    const left = Math.min(Math.max(...linked.map((one) => one.margin())), MOST * W);
+    scale = { left, right: W - 14, top, bottom: H - below };
     const line = (axis, from, to) => {
       const [a, b] = axes[axis].view.map(up[axis]);
       return (v) => from + ((up[axis](v) - a) / (b - a)) * (to - from);
     };
     scale.x = line("x", scale.left, scale.right);
     scale.y = line("y", scale.bottom, scale.top);
-    points = [];
-    at = -1;
+    [points, at] = [[], -1];
     tip.hidden = true;
     const clip = `${box.dataset.id}-clip`;
     const room = svg("clipPath", { id: clip }, svg("rect", { x: scale.left - 5, y: scale.top - 5, width: scale.right - scale.left + 10, height: scale.bottom - scale.top + 10 }));
@@ -186,9 +196,9 @@ function chart(box, content, linked, name) {
     if (run !== undefined) said.push(`run ${runs.id[run]}`);
     tip.replaceChildren(...said.filter(Boolean).map((s) => make("div", {}, s)));
     const above = q > (scale.top + scale.bottom) / 2 ? tip.offsetHeight + 28 : 0;
-    const top = drawing.getBoundingClientRect().top - box.getBoundingClientRect().top;
+    const from = drawing.getBoundingClientRect().top - box.getBoundingClientRect().top;
     tip.style.left = `${Math.max(0, Math.min(p + 14, box.clientWidth - tip.offsetWidth - 2))}px`;
-    tip.style.top = `${top + q + 14 - above}px`;
+    tip.style.top = `${from + q + 14 - above}px`;
   }
   function nearest(x, y) {
     let best = -1, least = NEAR ** 2;
@@ -286,5 +296,5 @@ function chart(box, content, linked, name) {
     box.append(bar);
   }
   box.append(drawing, tip);
-  return { draw, follow, label: content.x.label };
+  return { draw, follow, margin, label: content.x.label };
 }

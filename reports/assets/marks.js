@@ -45,12 +45,35 @@ function swatch(look) {
   return svg("svg", { width: 28, height: 14, "aria-hidden": "true" }, ...line, ...dot);
 }
 
+const pen = document.createElement("canvas").getContext("2d");
+
+/** How wide a text is, in px, in the font of a node. */
+function breadth(text, node) {
+  pen.font = getComputedStyle(node).font;
+  return pen.measureText(text).width;
+}
+
+/** A text without its middle, if it has not the room: names differ at their ends. */
+function shortened(text, room, node) {
+  let shown = text, letters = [...text];
+  while (letters.length > 3 && breadth(shown, node) > room) {
+    letters.splice(Math.floor((2 * letters.length) / 3), 1);
+    const front = Math.ceil((2 * letters.length) / 3);
+    shown = letters.slice(0, front).join("") + "…" + letters.slice(front).join("");
+  }
+  return shown;
+}
+
 const raised = (k) => (k < 0 ? "⁻" : "") + [...String(Math.abs(k))].map((d) => RAISED[d]).join("");
 
-function number(v) {
+const decade = (v) => Math.floor(Math.log10(Math.abs(v)) + 1e-9);
+const plain = (v) => v === 0 || (decade(v) >= -3 && decade(v) <= 4);
+
+/** A number as people write it; with its power of ten if it asks for one. */
+function number(v, powered = !plain(v)) {
   if (v === 0) return "0";
-  const size = Math.floor(Math.log10(Math.abs(v)) + 1e-9);
-  if (size >= -3 && size <= 4) return String(Number(v.toPrecision(5)));
+  const size = decade(v);
+  if (!powered) return String(Number(v.toPrecision(5)));
   const front = Number((v / 10 ** size).toPrecision(4));
   return (front === 1 ? "" : `${front}·`) + "10" + raised(size);
 }
@@ -71,4 +94,12 @@ function ticks([low, high], log, most) {
   const found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high * (1 + 1e-12) + 1e-9 * step; k++) found.push(Number((k * step).toPrecision(12)));
   return found;
+}
+
+/** Ticks within the view of an axis, those that are set or `most`, with texts of one kind. */
+function labelled({ view, log, ticks: set }, most) {
+  const within = (v) => v >= view[0] && v <= view[1];
+  if (set) return set.filter(([v]) => within(v));
+  const found = ticks(view, log, most).filter(within);
+  return found.map((v) => [v, number(v, !found.every(plain))]);
 }

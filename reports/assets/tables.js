@@ -144,7 +144,7 @@ function table(figure, content) {
 
 const collator = new Intl.Collator("en", { numeric: true });
 
-/** Say when a table is wider than its box. */
+/** Say when a table or a printed figure is wider than its box. */
 function measure(box) {
   const wide = box.scrollWidth > box.clientWidth + 1;
   box.classList.toggle("wide", wide);
