@@ -67,7 +67,10 @@ def energy_allowed(tol: float) -> float:
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
 ) -> tuple[Assessment, Deviation]:
-    """Measure `s`, a finite point of ``mechanics.primal``, against its solution."""
+    """Measure `s`, a finite point of ``mechanics.primal``, against its solution.
+
+    Where that is zero, against what the load would do without contact.
+    """
     exact, primal = mechanics.exact, mechanics.primal
     u, lam = s.x.astype(Real), s.z.astype(Real)
     gap = exact.c - exact.B @ u
@@ -75,22 +78,23 @@ def assess(
     off, off_rest = u - truth.u, at_rest - truth.equilibrium
     slope = exact.K @ truth.u - exact.f
     energy = float(slope @ off + 0.5 * (off @ (exact.K @ off)))
-    small: Extended = Real(energy_allowed(tol) * truth.norm) * np.sqrt(exact.loose)
+    length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
+    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
     closed, strict = _closed(exact, lam, gap, small)
     true_gap = exact.c - exact.B @ truth.u
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
     contradicted = (closed != true_closed) & strict & true_strict
     assessment = Assessment(
-        error=_over(mechanics.norm(off), truth.norm),
-        equilibrium_error=_over(mechanics.norm(off_rest), truth.norm),
-        energy=_over(energy, 0.5 * truth.norm**2),
+        error=_over(mechanics.norm(off), length),
+        equilibrium_error=_over(mechanics.norm(off_rest), length),
+        energy=_over(energy, 0.5 * length**2),
         penetration=float((-gap).max(initial=Real(0)) / mechanics.mesh_size),
         balance=_balance(mechanics.rigid, primal, s),
         active=int(closed.sum()),
         rows=_numbers(contradicted),
         pulls=_numbers(lam * exact.loose < -small),
     )
-    scale = truth.norm or 1.0
+    scale = length or 1.0
     return assessment, Deviation(
         np.asarray(off / scale, dtype=float), np.asarray(off_rest / scale, dtype=float)
     )

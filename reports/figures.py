@@ -77,10 +77,9 @@ def save_all(figure: Figure, paths: Sequence[Path]) -> list[Path]:
     """Write a figure in several formats, cut to what is drawn, which is found once."""
     with rc_context(STYLE):
         _lay_out(figure)
-        renderer = FigureCanvasAgg(figure).get_renderer()
-        box = figure.get_tightbbox(renderer).padded(
-            float(rcParams["savefig.pad_inches"])
-        )
+        canvas, pad = FigureCanvasAgg(figure), float(rcParams["savefig.pad_inches"])
+        renderer = canvas.get_renderer()  # type: ignore[no-untyped-call]
+        box = figure.get_tightbbox(renderer).padded(pad)
         for path in paths:
             figure.savefig(
                 path,

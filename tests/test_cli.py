@@ -718,8 +718,8 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     )
 
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        "accuracy", "crossval", "demo", "fleet", "large", "paper", "path", "scaling",
-        "smoke",
+        "accuracy", "crossval", "demo", "fleet", "large", "paper", "paper-accuracy",
+        "paper-fleet", "path", "scaling", "smoke",
     ]  # fmt: skip
 
 
