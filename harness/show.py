@@ -17,13 +17,14 @@ from harness.history import History
 from harness.record import Record, Verdict
 from harness.solution import Status
 
-#: of the quantities that the interface promises of elastic bodies; others are bare
+#: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {
     "energy": "J/m",
     "tip": "m",
     "contact_force": "N/m",
     "multiplier_sum": "N/m",
     "max_von_mises": "Pa",
+    "stress_error": "(dimensionless)",
 }
 
 
