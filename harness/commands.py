@@ -6,6 +6,7 @@ import json
 import sys
 from argparse import Namespace
 from collections.abc import Mapping
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -74,7 +75,9 @@ def list_(workbench: Workbench, options: Namespace) -> int:
                     "description": show.first_comment(path),
                     "path": str(path),
                 }
-                for path in sorted(workbench.suites.glob("*.toml"))
+                for path in sorted(
+                    workbench.suites.glob("*.toml"), key=attrgetter("stem")
+                )
             ]
     print(json.dumps(plain(rows)) if options.json else show.listing(rows))
     return 0
