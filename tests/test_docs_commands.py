@@ -41,6 +41,9 @@ SHORTER = {
         "mortarbench run suites/crossval.toml --out out/crossval "
         "--case 'contact-patch/*' --solver smalbe --solver clarabel"
     ),
+    "mortarbench run suites/accuracy.toml": (
+        "mortarbench run suites/accuracy.toml --repeats 1 --case 'obstacle/*'"
+    ),
     "mortarbench validate out/make-demo": "mortarbench validate out/demo",
     "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
     "mortarbench run mine.toml --out out/again": (
