@@ -35,8 +35,9 @@ def admissible(
     """
     B, c = mechanics.exact.B, mechanics.exact.c
     size = np.abs(u).max(initial=Real(0))  # of what is added up to get there
-    inside = _EPS * abs(B) @ (16 * np.abs(u) + 4 * size) + 16 * _EPS * np.abs(c)
-    held = closed & False
+    reach = abs(B) @ (16 * np.abs(u) + 4 * size)
+    inside = _EPS * (reach + 16 * np.abs(c))
+    held = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(ROUNDS):
         gap = c - B @ moved
