@@ -13,6 +13,14 @@ class InputError(Exception):
     """
 
 
+class FaultError(Exception):
+    """A fault of ours or of the machine, never a solver's: a full disk, a lost file.
+
+    One line says what failed. It costs no solver a verdict: what was being measured is
+    tried once more, and counts as not measured if that fails, too.
+    """
+
+
 PLUGINS = "; others come with --plugin FILE.py"  #: after the names that are known
 
 
