@@ -18,6 +18,7 @@ from typing import Any
 from harness.block import Block, Commands, Engine, Opens, Result, Unbuilt
 from harness.errors import InputError, some
 from harness.folder import differences
+from harness.recipe import Maker
 
 LOCAL = "local"
 CONNECT_SECONDS = 10
@@ -33,6 +34,7 @@ def on_cluster(
     address: str,
     *,
     plugins: Sequence[Path],
+    operators: Mapping[str, Maker],
     environment: Mapping[str, Any],
     keep: Keep,
     warn: Callable[[str], None],
@@ -42,6 +44,7 @@ def on_cluster(
     address : of a scheduler, or "local" for one with a worker for each CPU of this
         machine
     plugins : files that nodes find under the same paths
+    operators : what puts an operator P together, less what is in `plugins`
     environment : of this process, which nodes are compared with
     keep : stores a node's environment under its digest
     warn : told in a line what the user should know
@@ -70,7 +73,8 @@ def on_cluster(
             name = f"mortarbench-{client.id}"
             _forget_lost_runs(client)
             files = [file.resolve() for file in plugins]
-            client.register_plugin(Node(commands, files, _sharing(client)), name=name)
+            node = Node(commands, files, operators, _sharing(client))
+            client.register_plugin(node, name=name)
             stack.callback(_end, client, name)
             nodes = Nodes(environment, keep, warn)
             with _scheduler_there(client, address):

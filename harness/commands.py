@@ -6,6 +6,7 @@ import json
 import sys
 from argparse import Namespace
 from collections.abc import Mapping
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -29,6 +30,7 @@ from harness.names import completed
 from harness.noise import noise_floor
 from harness.overrides import with_overrides
 from harness.progress import Progress, shown_on
+from harness.recipe import Maker
 from harness.registry import options_of, resolve
 from harness.replay import compared
 from harness.replay import render as show_comparison
@@ -85,6 +87,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
 
 def run(workbench: Workbench, options: Namespace) -> int:
     """Measure what the result folder lacks of a suite, and report; 1 if not all."""
+    ours = workbench.operators
     workbench = workbench.with_files(options.plugin)
     path = workbench.suite_path(options.suite)
     suite = with_overrides(
@@ -112,7 +115,9 @@ def run(workbench: Workbench, options: Namespace) -> int:
             digest=digest(environment),
             progress=progress,
             fresh=options.fresh,
-            engine=_engine(options, out, environment, progress),
+            engine=_cluster(options, ours, out, environment, progress)
+            if options.dask is not None
+            else partial(one_by_one, operators=workbench.operators),
         )
     records = read_journal(out)
     print(show.summary(records, [s.label for s in suite.solvers]))
@@ -125,14 +130,17 @@ def run(workbench: Workbench, options: Namespace) -> int:
     return 1 if unbuilt_cases else 0
 
 
-def _engine(
-    options: Namespace, out: Path, environment: Mapping[str, Any], progress: Progress
+def _cluster(
+    options: Namespace,
+    operators: Mapping[str, Maker],
+    out: Path,
+    environment: Mapping[str, Any],
+    progress: Progress,
 ) -> Opens:
-    if options.dask is None:
-        return one_by_one
     return on_cluster(
         options.dask,
         plugins=options.plugin,
+        operators=operators,
         environment=environment,
         keep=lambda name, there: keep_environment(out, name, there),
         warn=progress.warn,
@@ -197,7 +205,10 @@ def replay(workbench: Workbench, options: Namespace) -> int:
     commands = workbench.commands([capsule.spec], options.plugin)
     with TemporaryDirectory(prefix="mortarbench-") as scratch:
         folder = Path(scratch)
-        with one_by_one(commands, folder, folder / "cases") as carry_out:
+        operators = workbench.operators
+        with one_by_one(
+            commands, folder, folder / "cases", operators=operators
+        ) as carry_out:
             *_, result = carry_out(iter([block]))
     if isinstance(result, Unbuilt):
         raise InputError(f"{capsule.record.run_id}: {result.reason}")

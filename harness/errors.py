@@ -21,6 +21,14 @@ class FaultError(Exception):
     """
 
 
+MOST_SHOWN = 200  #: characters of input that a message repeats
+
+
+def shortened(text: str, most: int = MOST_SHOWN) -> str:
+    """Cut what a message repeats of the input."""
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
 PLUGINS = "; others come with --plugin FILE.py"  #: after the names that are known
 
 
@@ -31,6 +39,7 @@ def unknown(
 
     more : what follows the known names
     """
+    got = shortened(got)  # also because the search takes a time ~ length²
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)

@@ -10,7 +10,7 @@ import fcntl
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,8 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from harness.block import Block, Commands, Result, Unbuilt
 from harness.environment import capture_in, digest
 from harness.errors import InputError
+from harness.recipe import Maker
+from harness.registry import load_plugin, merged
 from harness.station import Station
 from harness.supervisor import ONE_THREAD
 
@@ -43,15 +45,21 @@ class Node(WorkerPlugin):
 
     commands : of the parent; its Python is replaced by that of the node
     plugins : files, which must be there under the same paths
+    operators : what puts an operator P together, less what is in `plugins`
     sharing : Dask workers on one machine; more than one disturb each other, which
         makes another environment
     """
 
     def __init__(
-        self, commands: Commands, plugins: Sequence[Path], sharing: int
+        self,
+        commands: Commands,
+        plugins: Sequence[Path],
+        operators: Mapping[str, Maker],
+        sharing: int,
     ) -> None:
         self._commands = commands
         self._plugins = plugins
+        self._operators = dict(operators)
         self._sharing = sharing
         self._python = sys.executable
         self._open: _Open | None = None
@@ -124,7 +132,11 @@ class Node(WorkerPlugin):
             cpu = _own_cpu(stack)
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
-            station = Station(self._here(self._commands), scratch, scratch / "cases")
+            operators = self._operators
+            for path in self._plugins:
+                operators = merged("operator", operators, load_plugin(path).operators)
+            commands = self._here(self._commands)
+            station = Station(commands, scratch, scratch / "cases", operators)
             stack.enter_context(station)
             return _Open(
                 station=station,

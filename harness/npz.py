@@ -12,16 +12,25 @@ import os
 import zipfile
 from collections.abc import Mapping
 from io import BytesIO
+from math import prod
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from harness.datafile import check_size, opened
+from harness.errors import shortened
+
+EXPECTED = "an npz file"
 ALIGNMENT = 64
 _LOCAL_HEADER = 30  #: bytes before name and extra field of a member
 _PADDING = b"\xfe\xca"  #: an extra field that nobody knows, and all skip
+_ENCRYPTED = 1  #: among the flags of a member
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_KINDS = "biufcSU"  #: of types: neither objects, which are pickles, nor structures
+_PIECE = 2**20  #: bytes that are decompressed at once
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -31,6 +40,7 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     it held, while truncating it would kill them by SIGBUS.
     """
     new = path.with_name(f".{path.name}.new")
+    new.unlink(missing_ok=True)  # of one that was killed; a link is not followed
     try:
         _write(new, arrays)
         os.replace(new, path)
@@ -39,7 +49,7 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with path.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
+    with path.open("xb") as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             header = BytesIO()
             stored = np.ascontiguousarray(array).reshape(array.shape)
@@ -51,20 +61,54 @@ def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             archive.writestr(member, header.getvalue() + stored.tobytes())
 
 
-def mapped(path: Path) -> dict[str, NDArray[Any]]:
+def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
     """Map every array of a file; writing to one changes a private copy only.
+
+    limited : whether a file above the limit of `harness.datafile` is refused
 
     Raises
     ------
-    OSError, ValueError, BadZipFile
-        When the file cannot be read or holds something else.
+    InputError
+        As `harness.datafile.opened`.
+    ValueError, BadZipFile
+        When the file holds something else.
 
     """
-    with path.open("rb") as file:
+    with opened(path, EXPECTED, limited=limited) as file:
         memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
         with zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-        return {m.filename.removesuffix(".npy"): _array(memory, m) for m in members}
+            members = _members(archive)
+        return {name: _array(memory, m) for name, m in members.items()}
+
+
+def read(path: Path, only: str = "") -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file whose names begin with `only`, never unpickling.
+
+    Raises
+    ------
+    InputError
+        As `harness.datafile.opened`, and when the arrays would exceed its limit.
+    ValueError, BadZipFile
+        When the file holds something else.
+
+    """
+    with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
+        members = {k: m for k, m in _members(archive).items() if k.startswith(only)}
+        check_size(f"{path}: what it holds", sum(m.file_size for m in members.values()))
+        return {name: _read_array(archive, m) for name, m in members.items()}
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """List the arrays by name."""
+    found: dict[str, zipfile.ZipInfo] = {}
+    for member in archive.infolist():
+        name = member.filename.removesuffix(".npy")
+        if name == member.filename or name in found:
+            raise ValueError(f"{shortened(name)!r} is no array, or there twice")
+        if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
+            raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
+        found[name] = member
+    return found
 
 
 def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
@@ -78,14 +122,50 @@ def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
     if member.compress_type != zipfile.ZIP_STORED or begin % ALIGNMENT:
         raise ValueError(f"{member.filename} cannot be mapped")
     start = BytesIO(memory[begin : min(begin + 4096, begin + member.file_size)])
-    npy.read_magic(start)
-    shape, fortran, dtype = npy.read_array_header_1_0(start)
-    if dtype.hasobject or fortran:
-        raise ValueError(f"{member.filename} is no plain array in C order")
-    count = int(np.prod(shape, dtype=np.int64))
-    if start.tell() + count * dtype.itemsize > member.file_size:
-        raise ValueError(f"{member.filename} is truncated")
+    shape, fortran, dtype = _header(start)
+    if fortran:
+        raise ValueError(f"{member.filename} is no array in C order")
+    count = _count(shape, dtype, member.file_size - start.tell())
     if count == 0:
         return np.empty(shape, dtype)
     flat = np.frombuffer(memory, dtype, count, begin + start.tell())
     return flat.reshape(shape)
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Read one member, and not a byte more than it declared."""
+    with archive.open(member) as file:
+        shape, fortran, dtype = _header(file)
+        count = _count(shape, dtype, member.file_size - file.tell())
+        values = bytearray(count * dtype.itemsize)
+        view, begin = memoryview(values), 0
+        while begin < len(values):
+            piece = file.read(min(_PIECE, len(values) - begin))
+            if not piece:
+                raise ValueError(f"{member.filename} is truncated")
+            view[begin : begin + len(piece)] = piece
+            begin += len(piece)
+        file.read(1)  # the end, where the checksum is compared
+    if count == 0:
+        return np.empty(shape, dtype)
+    return np.frombuffer(values, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the header of an npy file: shape, whether in Fortran order, type."""
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    version = npy.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"an npy header of version {version}; expected 1.0 or 2.0")
+    shape, fortran, dtype = readers[version](file)
+    if dtype.kind not in _KINDS or not dtype.itemsize:
+        raise ValueError("no plain array of numbers or text")
+    return shape, fortran, dtype
+
+
+def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
+    """Count the values of an array that has `there` bytes at most."""
+    count = prod(shape)  # in Python's integers, which do not overflow
+    if min(shape, default=0) < 0 or count * dtype.itemsize > there:
+        raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
+    return count

@@ -24,10 +24,14 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, issparse
 
-from harness.errors import InputError
+from harness.datafile import check_size, json_object, opened, parsing
+from harness.errors import InputError, shortened
 from harness.qp import QP, Matrix, Vector, no_rows
-from harness.qpfile import explicit_matrices
+from harness.qpfile import check_symmetric, explicit_matrices, listed_dense
 
+_EXPECTED = "a Parquet file"
+_WRONG = "malformed; expected a Parquet file"
+_COPIES = 4  #: of what a file declares that its reader may hold
 _MATRICES = ("P", "G", "A")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
@@ -84,27 +88,43 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
         what it holds is no QP.
 
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        with path.open("rb") as file:  # threads of arrow's may abort Python at its end
-            table = pq.ParquetFile(file, pre_buffer=False).read(use_threads=False)
-    except (OSError, pa.ArrowException) as e:
-        why = f"{e.strerror}" if isinstance(e, OSError) and e.strerror else "malformed"
-        raise InputError(f"{path}: {why}; expected a Parquet file") from None
-    if table.num_rows != 1:
-        raise InputError(f"{path}: holds {table.num_rows} problems; expected one row")
-    if missing := [name for name in _COLUMNS if name not in table.column_names]:
-        raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
+    with opened(path, _EXPECTED) as file:
+        with parsing(path, _WRONG, 0):  # threads of arrow's may abort Python's end
+            parquet = pq.ParquetFile(file, pre_buffer=False)
+            told = parquet.metadata
+            columns = parquet.schema_arrow.names
+            size = _declared(told)
+        if told.num_rows != 1:
+            raise InputError(f"{path}: holds {told.num_rows} problems; expected one row")
+        if missing := [name for name in _COLUMNS if name not in columns]:
+            raise InputError(
+                f"{path}: no column {', '.join(missing)}; expected a problem"
+            )
+        check_size(f"{path}: what it holds", size)
+        with parsing(path, _WRONG, _COPIES * size):
+            table = parquet.read(columns=list(_COLUMNS), use_threads=False)
+            table.validate(full=True)
     given = {name: table.column(name)[0] for name in _COLUMNS}
     try:
-        meta = json.loads((table.schema.metadata or {}).get(_KEY, b"{}"))
-        if not isinstance(meta, dict):
-            raise ValueError("its metadata are no JSON object")
-        return _qp(given, meta.get("dense", _MATRICES)), meta
-    except (ValueError, TypeError) as e:
-        raise InputError(f"{path}: {' '.join(str(e).split())}") from None
+        meta = json_object((table.schema.metadata or {}).get(_KEY, b"{}"))
+        dense = listed_dense(meta) if "dense" in meta else set(_MATRICES)
+        qp = _qp(given, dense)
+        check_symmetric(qp.P)
+    except (ValueError, TypeError, OverflowError) as e:
+        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
+    return qp, meta
+
+
+def _declared(told: Any) -> int:
+    """Add up what the parts of a file will take, as its footer has it.
+
+    A page can say "the same value a billion times" in a few bytes, so values count, too.
+    """
+    groups = [told.row_group(i) for i in range(told.num_row_groups)]
+    chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
+    return sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
 
 
 def _qp(given: Mapping[str, Any], dense: Container[str]) -> QP:
@@ -128,9 +148,12 @@ def _numbers(name: str, scalar: Any) -> Vector | None:
     if not scalar.is_valid:
         return None
     try:
-        return np.array(scalar.values.to_numpy(zero_copy_only=False), dtype=float)
+        values = np.asarray(scalar.values.to_numpy(zero_copy_only=False))
     except (ValueError, TypeError, AttributeError):
-        raise ValueError(f"{name} is no list of numbers") from None
+        values = np.array("")
+    if values.dtype.kind not in "iuf" or values.ndim != 1:
+        raise ValueError(f"{name} is no list of numbers")
+    return values.astype(float)
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:

@@ -21,7 +21,8 @@ def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
     spec = SolverSpec(
         name=request["name"], label=request["name"], options=request["options"]
     )
-    serve(resolve(spec, workbench.solvers), int(request_fd), int(reply_fd))
+    solver = resolve(spec, workbench.solvers)
+    serve(solver, int(request_fd), int(reply_fd), workbench.operators)
     return 0
 
 

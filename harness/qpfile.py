@@ -16,18 +16,23 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import coo_array, csc_array, issparse
 
-from harness.errors import InputError
+from harness.datafile import check_size, json_object
+from harness.errors import InputError, shortened
 from harness.npz import write_mappable
 from harness.qp import QP, Matrix, Structure, Vector
-from harness.recipe import Recipe
+from harness.recipe import Maker, Recipe
 from harness.store import digest_of, mapped_arrays
+
+SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
+_STRIP = 256  #: rows of a dense matrix that are compared at once
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -101,8 +106,15 @@ def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[s
     return arrays, dense
 
 
-def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
+def load_qp(
+    path: Path, *, operators: Mapping[str, Maker] | None = None
+) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data.
+
+    operators : makers of operators (`harness.recipe`), for a file that a generator of
+        this very run wrote: it may hold an operator, and is as large as it is. Without
+        them the file may be anybody's: an operator is refused, and so is what exceeds
+        the limit of `harness.datafile`, or has no symmetric P
 
     Raises
     ------
@@ -111,44 +123,143 @@ def load_qp(path: Path) -> tuple[QP, dict[str, Any]]:
 
     """
     parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
-    arrays = mapped_arrays(path, (*_VECTORS, *parts, "meta"))
+    own = operators is not None
+    arrays = mapped_arrays(path, (*_VECTORS, *parts, "meta"), limited=not own)
     try:
-        meta = json.loads(str(arrays["meta"]))
-        if not isinstance(meta, dict):
-            raise ValueError("meta is no JSON object")
+        meta = _meta(arrays["meta"])
         vectors = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
+        dense = listed_dense(meta)
+        if not own:
+            _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
-        for name in set(_MATRICES).intersection(meta.get("dense", ())):
+        for name in dense:
             matrices[name] = _dense(matrices[name])
-        if "maker" in meta:
-            matrices["P"] = _recipe(meta["maker"], arrays, vectors["q"].size)
-        return QP(**vectors, **matrices, structure=structure), meta
-    except (ValueError, TypeError) as e:
-        raise InputError(f"{path}: {' '.join(str(e).split())}") from None
+        if operators is not None and "maker" in meta:
+            n, maker = vectors["q"].size, str(meta["maker"])
+            matrices["P"] = Recipe(n, maker, _ingredients(arrays), operators)
+        qp = QP(**vectors, **matrices, structure=structure)
+        if not own:
+            check_symmetric(qp.P)
+    except (ValueError, TypeError, OverflowError) as e:
+        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
+    except InputError as e:
+        raise InputError(f"{path}: {e}") from None
+    return qp, meta
+
+
+def listed_dense(meta: Mapping[str, Any]) -> set[str]:
+    """Take the names of dense matrices from meta data.
+
+    Raises
+    ------
+    ValueError
+        When they are no list of texts.
+
+    """
+    names = meta.get("dense", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError("meta: dense is no list of names")
+    return set(_MATRICES).intersection(names)
+
+
+def check_dense(name: str, M: Matrix) -> None:
+    """Refuse a matrix that would be too large if it were dense.
+
+    Raises
+    ------
+    InputError
+        As `harness.datafile.check_size`.
+
+    """
+    check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
+
+
+def check_symmetric(P: Matrix) -> None:
+    """Refuse a P that is not symmetric up to rounding: solvers would read another one.
+
+    Raises
+    ------
+    ValueError
+        With the entries that differ most.
+
+    """
+    where, worst = _asymmetry(P)
+    largest = abs(P).max() if prod(P.shape) else 0.0
+    if worst > SYMMETRIC * largest:
+        i, j = where
+        raise ValueError(
+            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
+        )
+
+
+def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
+    """Find the largest entry of |P − Pᵀ|; of a dense one in strips."""
+    if issparse(P):
+        difference = coo_array(abs(P - P.T))
+        if not difference.nnz:
+            return (0, 0), 0.0
+        at = int(difference.data.argmax())
+        i, j = (int(k[at]) for k in difference.coords)
+        return (i, j), float(difference.data[at])
+    found = (0, 0), 0.0
+    for begin in range(0, len(P), _STRIP):
+        strip = slice(begin, begin + _STRIP)
+        difference = abs(P[strip] - P[:, strip].T)
+        i, j = np.unravel_index(difference.argmax(), difference.shape)
+        if difference[i, j] > found[1]:
+            found = (begin + int(i), int(j)), float(difference[i, j])
+    return found
+
+
+def _check_foreign(
+    matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
+) -> None:
+    """Refuse what only our own runs write, and what would be too large."""
+    if "maker" in meta:
+        raise ValueError(
+            "holds P as an operator, which is read only where the run itself wrote it; "
+            "expected P as a matrix, as export writes it"
+        )
+    for name in dense:
+        check_dense(name, matrices[name])
+
+
+def _meta(array: NDArray[Any]) -> dict[str, Any]:
+    if array.dtype.kind != "U" or array.size != 1:
+        raise ValueError("meta is no text")
+    return json_object(str(array.item()))
 
 
 def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
     if missing := [name for name in parts if name not in arrays]:
         raise ValueError(f"{', '.join(missing)} missing beside fixed")
-    fixed = arrays["fixed"].astype(np.int64, casting="safe")
-    return Structure(K=_matrix(arrays, "K"), B=_matrix(arrays, "B"), fixed=fixed)
+    if arrays["fixed"].dtype.kind not in "iu":
+        raise ValueError("fixed must hold integers")
+    fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
+    K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
+    N = K.shape[0]
+    if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
+        raise ValueError("K, B and fixed do not fit each other, or q")
+    if ((fixed < 0) | (fixed >= N)).any():
+        raise ValueError(f"fixed holds indices out of range; expected 0 … {N - 1}")
+    return Structure(K=K, B=B, fixed=fixed)
 
 
-def _recipe(maker: str, arrays: Mapping[str, NDArray[Any]], n: int) -> Recipe:
-    ingredients = {
+def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {
         name.removeprefix(_INGREDIENT): array
         for name, array in arrays.items()
         if name.startswith(_INGREDIENT)
     }
-    return Recipe(n, maker, ingredients)
 
 
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
     if arrays[name].dtype.kind not in "iuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
-    return arrays[name].astype(float, copy=False)
+    with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
+        return arrays[name].astype(float, copy=False)
 
 
 def _dense(M: Any) -> Matrix:
@@ -169,6 +280,6 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     try:
         M = csc_array((data, indices, indptr), shape=tuple(shape.tolist()))
         M.check_format(full_check=True)
-    except ValueError as e:
+    except (ValueError, TypeError, OverflowError) as e:
         raise ValueError(f"{name} is no matrix in CSC parts: {e}") from None
     return M

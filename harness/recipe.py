@@ -4,12 +4,16 @@ A matrix-free P cannot be written to a file, but what it is made from can. It tr
 workers as these arrays and is put together there, on the clock: whatever an operator
 needs before its first product (a factor, say) is part of what the solver is charged to
 prepare.
+
+What is put together by is looked up by name in a table of *makers* that code fills: the
+``OPERATORS`` of a plug-in, or a package's own. A file can name one of them and nothing
+else; it never says what is imported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import import_module
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,30 +22,43 @@ from scipy.sparse.linalg import LinearOperator
 
 Arrays = Mapping[str, NDArray[Any]]
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+#: takes plain arrays and returns x ↦ Px, which must also take (n, k) matrices
+Maker = Callable[[Arrays], Product]
+NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 
 
 class Recipe(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
-    maker : ``"module:function"``; the function takes `arrays` and returns x ↦ Px, which
-        must also take (n, k) matrices. A worker imports it: it belongs at the top level
-        of a module of a package, or of a plug-in
+    maker : what puts it together, a name in `makers`
     arrays : plain arrays under names of your own
+    makers : the table; workers look the name up in theirs, which has the ``OPERATORS``
+        of the same plug-ins
+
+    Raises
+    ------
+    ValueError
+        When `makers` has no such name.
+
     """
 
-    def __init__(self, n: int, maker: str, arrays: Arrays) -> None:
+    def __init__(
+        self, n: int, maker: str, arrays: Arrays, makers: Mapping[str, Maker]
+    ) -> None:
         super().__init__(np.dtype(float), (n, n))
+        if maker not in makers:
+            known = ", ".join(sorted(makers)) or "none"
+            raise ValueError(f"P is the operator {maker!r:.200}; known: {known}")
         self.maker = maker
         self.arrays = arrays
+        self._make = makers[maker]
         self._product: Product | None = None
 
     def build(self) -> Product:
         """Put the operator together, unless it is."""
         if self._product is None:
-            module, _, function = self.maker.partition(":")
-            self._product = getattr(import_module(module), function)(self.arrays)
-        product: Product = self._product
-        return product
+            self._product = self._make(self.arrays)
+        return self._product
 
     def forget(self) -> None:
         """Drop what was built, so that the next one is charged with it again."""

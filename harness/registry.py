@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 
 from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver
+from harness.recipe import Maker
 
 T = TypeVar("T")
 
@@ -45,6 +46,7 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
+    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
     origin: str = ""  #: its file, or "entry points"
 
 
@@ -78,6 +80,8 @@ def options_of(solver: Solver) -> dict[str, Any]:
 def load_plugin(path: Path) -> Plugin:
     """Import a file that defines ``SOLVERS`` and/or ``PROBLEMS``.
 
+    Where families of it make operators, ``OPERATORS`` has what puts them together.
+
     Raises
     ------
     InputError
@@ -89,9 +93,15 @@ def load_plugin(path: Path) -> Plugin:
     module = _imported(path)
     if not hasattr(module, "SOLVERS") and not hasattr(module, "PROBLEMS"):
         raise InputError(f"{path}: defines neither SOLVERS nor PROBLEMS")
-    return _checked(
+    operators = getattr(module, "OPERATORS", {})
+    if not isinstance(operators, Mapping) or not all(
+        isinstance(name, str) and callable(make) for name, make in operators.items()
+    ):
+        raise InputError(f"{path}: OPERATORS is no dict from names to functions")
+    found = _checked(
         str(path), getattr(module, "SOLVERS", {}), getattr(module, "PROBLEMS", {})
     )
+    return replace(found, operators=dict(operators))
 
 
 def entry_point_plugins() -> Plugin:

@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from harness.cases import content_digest
 from harness.judge import certified, judged, noted, quantities_of
 from harness.measure import Measurement
 from harness.plugin import Case
@@ -108,7 +109,11 @@ def measured_once(
             worker,
             case.qp,
             record.but(qp=digest),
-            {"qp": str(qp_file), "out": str(scratch / "point.npz")},
+            {
+                "qp": str(qp_file),
+                "digest": content_digest(qp_file),
+                "out": str(scratch / "point.npz"),
+            },
             time_limit=inf,
             memory_limit=inf,
         )

@@ -16,6 +16,7 @@ from harness.measure import SAMPLE_SECONDS
 from harness.names import CaseName
 from harness.qp import QP
 from harness.qpfile import load_qp
+from harness.recipe import NO_MAKERS, Maker
 from harness.record import Record, Verdict
 from harness.remote import measured
 from harness.solution import Solution
@@ -28,12 +29,20 @@ class Station:
 
     scratch : for files that last as long as the station, of this station alone
     cases : folder of built cases, see `harness.cases`; several stations may share it
+    operators : what puts an operator P together, see `harness.recipe`
     """
 
-    def __init__(self, commands: Commands, scratch: Path, cases: Path) -> None:
+    def __init__(
+        self,
+        commands: Commands,
+        scratch: Path,
+        cases: Path,
+        operators: Mapping[str, Maker] = NO_MAKERS,
+    ) -> None:
         self._commands = commands
         self._scratch = scratch
         self._cases = cases
+        self._operators = operators
         self._generator = WorkerProcess(commands.generator, scratch / "generator.log")
         self._workers: dict[str, WorkerProcess] = {}
         self._loaded: dict[str, QP] = {}  # by digest, those of the last block
@@ -159,8 +168,11 @@ class Station:
 
     def _qp(self, at: Entry) -> QP:
         if at.digest not in self._loaded:
-            self._loaded[at.digest] = load_qp(at.qp)[0]
+            self._loaded[at.digest] = self._read(at)
         return self._loaded[at.digest]
+
+    def _read(self, at: Entry) -> QP:
+        return load_qp(at.qp, operators=self._operators)[0]
 
     @property
     def _point(self) -> Path:
@@ -168,9 +180,15 @@ class Station:
 
 
 @contextmanager
-def one_by_one(commands: Commands, scratch: Path, cases: Path) -> Iterator[OneByOne]:
+def one_by_one(
+    commands: Commands,
+    scratch: Path,
+    cases: Path,
+    *,
+    operators: Mapping[str, Maker] = NO_MAKERS,
+) -> Iterator[OneByOne]:
     """Open the engine that carries out one block at a time on this machine."""
-    with Station(commands, scratch, cases) as station:
+    with Station(commands, scratch, cases, operators) as station:
         yield OneByOne(station)
 
 

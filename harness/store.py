@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -10,19 +12,19 @@ from hashlib import sha256
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import InputError
+from harness import npz
+from harness.errors import InputError, shortened
 from harness.history import History, checked
-from harness.npz import mapped
 from harness.plugin import Fields
 from harness.solution import Solution, Status
 
 Arrays = Mapping[str, NDArray[Any]]
 
+_DIGEST = re.compile("[0-9a-f]{16}")
 _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces")
@@ -57,8 +59,8 @@ def load_history(folder: Path, digest: str) -> History:
         When it is missing or damaged.
 
     """
-    path = _path(folder, digest)
     with _restorable():
+        path = _path(folder, digest)
         return _history(path, read_arrays(path, (), only=_HISTORY))
 
 
@@ -80,11 +82,14 @@ def load_fields(folder: Path, digest: str) -> Fields:
     Raises
     ------
     InputError
-        When it is missing or damaged.
+        When it is missing or damaged, or its content is not that of the digest.
 
     """
     with _restorable():
-        arrays = read_arrays(_path(folder, digest), _ALWAYS)
+        path = _path(folder, digest)
+        arrays = read_arrays(path, _ALWAYS)
+        if digest_of(arrays) != digest:
+            raise InputError(f"{path}: its content is not what was stored")
     nodal = _with_prefix(_NODAL, arrays)
     known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
     return Fields(nodal=nodal, **known)
@@ -119,14 +124,19 @@ def read_arrays(
     Raises
     ------
     InputError
-        When the file cannot be read, is no npz, or lacks one of the `expected` arrays.
+        When the file cannot be read, is no npz, is larger than `harness.datafile`
+        allows, or lacks one of the `expected` arrays.
 
     """
-    return _expected(path, partial(_read, only=only), expected)
+    return _expected(path, partial(npz.read, only=only), expected)
 
 
-def mapped_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def mapped_arrays(
+    path: Path, expected: tuple[str, ...], *, limited: bool = True
+) -> dict[str, NDArray[Any]]:
     """Do as `read_arrays`, but map what can be mapped; see `harness.npz`.
+
+    limited : whether the size of a file that can be mapped has the limit, too
 
     Raises
     ------
@@ -134,20 +144,14 @@ def mapped_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[An
         As `read_arrays`.
 
     """
-    return _expected(path, _mapped, expected)
 
+    def mapped(path: Path) -> dict[str, NDArray[Any]]:
+        try:
+            return npz.mapped(path, limited=limited)
+        except ValueError:  # an npz file of somebody else
+            return npz.read(path)
 
-def _read(path: Path, only: str = "") -> dict[str, NDArray[Any]]:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-        names = [name for name in stored.files if name.startswith(only)]
-        return {name: stored[name] for name in names}
-
-
-def _mapped(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        return mapped(path)
-    except ValueError:  # an npz file of somebody else
-        return _read(path)
+    return _expected(path, mapped, expected)
 
 
 def _expected(
@@ -156,11 +160,12 @@ def _expected(
     expected: tuple[str, ...],
 ) -> dict[str, NDArray[Any]]:
     try:
-        arrays = read(path)
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror or e}; expected an npz file") from None
-    except (ValueError, TypeError, AttributeError, EOFError, BadZipFile):
-        # what numpy raises for a text, a pickle, one bare array, a truncated archive
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            arrays = read(path)
+    except InputError:
+        raise
+    except Exception:  # what a text, a pickle, a damaged archive lead zipfile to raise
         raise InputError(
             f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
         ) from None
@@ -202,6 +207,11 @@ def _restorable() -> Iterator[None]:
 
 
 def _path(folder: Path, digest: str) -> Path:
+    """Locate stored arrays; what is no digest could lead out of the folder."""
+    if not _DIGEST.fullmatch(digest):
+        raise InputError(
+            f"{folder}: {shortened(digest)!r} is no digest; expected 16 hex digits"
+        )
     return folder / "vectors" / f"{digest}.npz"
 
 

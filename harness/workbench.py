@@ -13,6 +13,7 @@ from harness.block import Commands
 from harness.discretisation import Discretisation
 from harness.errors import InputError, unknown
 from harness.plugin import Family, Fields, Reference, Solver
+from harness.recipe import Maker
 from harness.registry import Plugin, SolverSpec, load_plugin, merged
 
 SUITES = Path(__file__).parents[1] / "suites"  #: of the checkout
@@ -56,6 +57,7 @@ class Workbench:
     validation: Callable[
         [Path, Mapping[str, Any], Sequence[Discretisation]], list[Path]
     ] = lambda *_: []
+    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
     suites: Path = SUITES
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)
@@ -64,7 +66,7 @@ class Workbench:
     start: Sequence[str] = (sys.executable, "-P", "-m", "harness")
 
     def extended(self, plugin: Plugin) -> Workbench:
-        """Add the solvers and problems of a plug-in.
+        """Add the solvers, problems and operators of a plug-in.
 
         Raises
         ------
@@ -76,6 +78,7 @@ class Workbench:
             self,
             families=merged("problem", self.families, plugin.problems),
             solvers=merged("solver", self.solvers, plugin.solvers),
+            operators=merged("operator", self.operators, plugin.operators),
             origins={**self.origins, **dict.fromkeys(plugin.problems, plugin.origin)},
         )
 

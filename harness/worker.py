@@ -5,9 +5,9 @@ It answers the requests of `harness.serving` with these of its own:
 * the warm-up solves tiny QPs, so that imports which a solver puts off until its first
   solve are not timed
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
-  writes the point to `out`. Optional: ``digest`` of the file, which is checked;
-  ``memory_limit`` in MiB; ``sample_seconds``, see `harness.measure`; ``step`` 0,
-  1, … of a sequence
+  writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
+  without which the file may hold no operator; ``memory_limit`` in MiB;
+  ``sample_seconds``, see `harness.measure`; ``step`` 0, 1, … of a sequence
 * ``{"check": NAME}``: it runs one of `harness.conformance.CHECKS`
 
 Every measurement loads its QP afresh, so that nothing that a solver did to the last one
@@ -21,7 +21,7 @@ import gc
 import os
 import random
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
@@ -37,6 +37,7 @@ from harness.measure import Measurement, Prepare, measure, memory_mib
 from harness.plugin import Solver
 from harness.qp import QP, Vector, no_rows
 from harness.qpfile import load_qp
+from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.serving import answer_requests
 from harness.solution import Solution
@@ -45,17 +46,26 @@ from harness.store import write_point
 _MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
 
-def serve(solver: Solver, request_fd: int, reply_fd: int) -> None:
-    """Answer requests until there are no more."""
-    bench = _Bench(solver)
+def serve(
+    solver: Solver,
+    request_fd: int,
+    reply_fd: int,
+    operators: Mapping[str, Maker] = NO_MAKERS,
+) -> None:
+    """Answer requests until there are no more.
+
+    operators : what puts an operator P of a request together, see `harness.recipe`
+    """
+    bench = _Bench(solver, operators)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
 
 
 class _Bench:
     """One solver, what it was handed last, and the sequence that it is in."""
 
-    def __init__(self, solver: Solver) -> None:
+    def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
+        self._operators = operators
         self._chain: Prepare | None = None
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
         self._ballast = np.empty(0)
@@ -90,7 +100,8 @@ class _Bench:
         path = Path(request["qp"])
         self._shift_heap()
         self._check(path, request.get("digest"))
-        qp, _ = load_qp(path)
+        vouched = "digest" in request  # or it may be anybody's
+        qp, _ = load_qp(path, operators=self._operators if vouched else None)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
         start()

@@ -6,6 +6,9 @@ from hashlib import sha256
 from pathlib import Path
 
 from harness import InputError, Value
+from harness.datafile import opened
+
+_PIECE = 2**20  #: bytes that are read at once
 
 
 def digest(*paths: Path) -> str:
@@ -14,17 +17,15 @@ def digest(*paths: Path) -> str:
     Raises
     ------
     InputError
-        When one cannot be read.
+        When one cannot be read, is no regular file, or is larger than
+        `harness.datafile` allows.
 
     """
     content = sha256()
     for path in paths:
-        try:
-            content.update(path.read_bytes())
-        except OSError as e:
-            raise InputError(
-                f"{path}: {e.strerror}; expected a file that can be read"
-            ) from None
+        with opened(path, "a file that can be read") as file:
+            while piece := file.read(_PIECE):
+                content.update(piece)
     return content.hexdigest()[:12]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,7 +14,8 @@ import numpy as np
 from scipy.sparse import eye_array
 
 from harness import QP, Case, InputError, Reference, Solution, Value
-from harness.checked import located
+from harness.checked import is_number, located
+from harness.datafile import check_size, opened
 from harness.errors import unknown
 from harness.matfile import matrix, read_mat, to_qp, vector
 from harness.parquetfile import load_parquet
@@ -24,6 +26,8 @@ from problems.twosided import TwoSided, one_sided
 
 #: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
 Loaded = tuple[QP, float, float]
+
+_COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class FromFile:
 
 def _npz(path: Path) -> Loaded:
     qp, meta = load_qp(path)
-    return _with_units(qp, meta)
+    with located(str(path)):
+        return _with_units(qp, meta)
 
 
 def _mat(path: Path) -> Loaded:
@@ -91,12 +96,16 @@ def _mat(path: Path) -> Loaded:
 
 def _parquet(path: Path) -> Loaded:
     qp, meta = load_parquet(path)
-    return _with_units(qp, meta)
+    with located(str(path)):
+        return _with_units(qp, meta)
 
 
 def _qps(path: Path) -> Loaded:
+    with opened(path, "a QPS text") as file:
+        data = file.read()
+    check_size(f"{path}: what it says", _COPIES * len(data))
     try:
-        text = path.read_text("utf-8")
+        text = data.decode("utf-8")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8; expected a QPS text") from None
     with located(str(path)):
@@ -126,6 +135,8 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSided:
     P, q = read(matrix, "P", "Q"), read(vector, "q", "c")
     A, l, u = read(matrix, "A"), read(vector, "l"), read(vector, "u")
     r = float(vector(arrays, "r").sum()) if "r" in arrays else 0.0
+    if not all(np.isfinite(values).all() for values in (P.data, A.data, q, r)):
+        raise InputError("P, A, q or r hold inf; expected finite numbers")
     n, m = q.size, l.size
     for name, got, right in (("P", P.shape, (n, n)), ("A", A.shape, (m, n)),
                              ("u", u.shape, (m,))):  # fmt: skip
@@ -150,6 +161,8 @@ def _called(arrays: Mapping[str, Any], read: Callable[..., Any], *names: str) ->
 
 def _with_units(qp: QP, meta: Mapping[str, Any]) -> Loaded:
     scale, constant = meta.get("scale", 1.0), meta.get("constant", 0.0)
-    if not all(isinstance(v, int | float) for v in (scale, constant)):
-        raise InputError("meta: scale and constant are no numbers")
+    if not all(
+        is_number(v) and abs(v) <= sys.float_info.max for v in (scale, constant)
+    ):
+        raise InputError("meta: scale and constant are no finite numbers")
     return qp, float(scale), float(constant)

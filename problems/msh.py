@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from contextlib import redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,10 +15,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from harness import InputError
+from harness.datafile import check_size, opened, parsing
 from problems.mesh import Nodes
 
+_COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
 CONNECTED = {"vertex": 0, "line": 1, "quad": 2}  #: cells that we read → dimension
+FAR = 1e100  #: coordinates whose products overflow
 RECOMBINE = "expected first-order quadrilaterals: Mesh.RecombineAll = 1 in gmsh"
 
 
@@ -81,12 +87,24 @@ def read_msh(path: Path) -> NamedMesh:
 def _read(path: Path) -> Any:
     import meshio  # late: workers and other families do without it
 
-    try:
-        return meshio.gmsh.read(path)  # meshio.read would print and exit
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror or e}; expected a .msh file") from None
-    except Exception:  # meshio raises whatever a damaged file makes numpy raise
-        raise InputError(f"{path}: not a .msh file of format 2.2 or 4.1") from None
+    with opened(path, "a .msh file") as file:
+        size = os.fstat(file.fileno()).st_size
+    check_size(f"{path}: what it says", _COPIES * size)
+    with parsing(path, "not a .msh file of format 2.2 or 4.1", _COPIES * size):
+        with redirect_stderr(StringIO()):  # what meshio says of sections that it skips
+            mesh = meshio.gmsh.read(path)  # meshio.read would print and exit
+        points = np.asarray(mesh.points, dtype=float)
+        cells = [np.asarray(block.data) for block in mesh.cells]
+        tags = mesh.cell_data.get("gmsh:physical", [])
+        tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
+    if points.ndim != 2 or points.shape[1] < 2 or not (abs(points) < FAR).all():
+        raise InputError(f"{path}: coordinates beyond {FAR:g}, or none; expected some")
+    for nodes in cells:  # −1 is meshio's number of a node that there is none of
+        if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
+            raise InputError(f"{path}: cells of nodes that are not in the file")
+    if tags and not tagged:
+        raise InputError(f"{path}: not every cell has a tag; expected one for each")
+    return mesh
 
 
 def _named(path: Path, mesh: Any, kind: str) -> dict[str, Nodes]:

@@ -19,6 +19,7 @@ Undefined names and numbers that are none are refused, with their line: HiGHS' r
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -26,8 +27,13 @@ import numpy as np
 from scipy.sparse import coo_array
 
 from harness import InputError
-from harness.errors import unknown
+from harness.errors import shortened, unknown
 from problems.twosided import TwoSided
+
+
+_NUMBER = re.compile(
+    r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?", re.IGNORECASE | re.ASCII
+)
 
 
 @dataclass(eq=False)
@@ -44,11 +50,7 @@ class _Model:
     triangle: dict[tuple[str, str], float] = field(default_factory=dict)
     whole: dict[tuple[str, str], float] = field(default_factory=dict)
     sign: float = 1.0  #: −1 where the objective is maximised
-
-    @property
-    def objective(self) -> str:
-        """The first N row."""
-        return next((name for name, kind in self.rows.items() if kind == "N"), "")
+    objective: str = ""  #: the first N row
 
 
 def parse_qps(text: str) -> tuple[TwoSided, float]:
@@ -74,13 +76,15 @@ def parse_qps(text: str) -> tuple[TwoSided, float]:
             section = words[0].upper()
             _header(model, section, words)
         except InputError as e:
-            raise InputError(f"line {number}: {e}") from None
+            raise InputError(f"line {number}: {shortened(str(e), 400)}") from None
         if ended := section == "ENDATA":
             break
     if not ended:
         raise InputError("no ENDATA; the file is cut off, or no QPS")
     if not model.objective:
         raise InputError("no row of type N; expected the objective among ROWS")
+    if math.isinf(model.rhs.get(model.objective, 0.0)):
+        raise InputError("the constant of the objective is infinite")
     return _two_sided(model), model.sign
 
 
@@ -116,6 +120,8 @@ def _row(model: _Model, words: list[str]) -> None:
         raise unknown("row type", words[0], ("N", "L", "G", "E"))
     _new(name not in model.rows, f"row {name!r}")
     model.rows[name] = kind
+    if kind == "N" and not model.objective:
+        model.objective = name
 
 
 def _column(model: _Model, words: list[str]) -> None:
@@ -124,7 +130,7 @@ def _column(model: _Model, words: list[str]) -> None:
     _expect(len(words) in (3, 5), "a column and one or two pairs of row and number")
     name = words[0]
     model.columns.setdefault(name, len(model.columns))
-    for row, value in _pairs(model, words[1:]):
+    for row, value in _pairs(model, words[1:], _finite):
         _new((row, name) not in model.entries, f"row {row!r} of column {name!r}")
         model.entries[row, name] = value
 
@@ -135,7 +141,7 @@ def _sides(target: str) -> Callable[[_Model, list[str]], None]:
     def read(model: _Model, words: list[str]) -> None:
         _expect(2 <= len(words) <= 5, "one or two pairs of row and number")
         values: dict[str, float] = getattr(model, target)
-        for row, value in _pairs(model, words[len(words) % 2 :]):
+        for row, value in _pairs(model, words[len(words) % 2 :], _number):
             _new(row not in values, f"row {row!r}")
             values[row] = value
 
@@ -177,7 +183,7 @@ def _quadratic(target: str) -> Callable[[_Model, list[str]], None]:
             _known_column(model, j)
             twice = (i, j) in values or (target == "triangle" and (j, i) in values)
             _new(not twice, f"entry {i!r}, {j!r}")
-            values[i, j] = _number(number)
+            values[i, j] = _finite(number)
 
     return read
 
@@ -233,11 +239,13 @@ def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> co
     return coo_array((np.array(values, dtype=float), at), shape=shape)
 
 
-def _pairs(model: _Model, words: list[str]) -> list[tuple[str, float]]:
+def _pairs(
+    model: _Model, words: list[str], read: Callable[[str], float]
+) -> list[tuple[str, float]]:
     for row in words[::2]:
         if row not in model.rows:
             raise InputError(f"row {row!r} is not among ROWS")
-    return [(r, _number(v)) for r, v in zip(words[::2], words[1::2], strict=True)]
+    return [(r, read(v)) for r, v in zip(words[::2], words[1::2], strict=True)]
 
 
 def _known_column(model: _Model, name: str) -> None:
@@ -246,12 +254,21 @@ def _known_column(model: _Model, name: str) -> None:
 
 
 def _number(text: str) -> float:
-    try:
-        value = float(text.upper().replace("D", "E"))
-    except ValueError:
-        raise InputError(f"{text!r} is no number") from None
-    if math.isnan(value):
+    """Read a number as Fortran writes it, or ±inf, which is an absent limit."""
+    if not _NUMBER.fullmatch(text):
         raise InputError(f"{text!r} is no number")
+    if text[-1] not in "0123456789.":
+        return float(text)
+    value = float(text.upper().replace("D", "E"))
+    if math.isinf(value):
+        raise InputError(f"{text!r} exceeds 1.8e308")
+    return value
+
+
+def _finite(text: str) -> float:
+    """Read the coefficient of a matrix or of the objective."""
+    if math.isinf(value := _number(text)):
+        raise InputError(f"{text!r} is no finite number")
     return value
 
 

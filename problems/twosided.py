@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, csr_array, vstack
+from scipy.sparse import csc_array, csr_array, vstack
 
 from harness import QP, InputError, Vector
+from harness.qpfile import check_symmetric
 
 INFINITE = 1e20  #: bounds of at least this size mean that there is none
 
@@ -38,12 +39,10 @@ def one_sided(given: TwoSided) -> QP:
 
     """
     P, A = csc_array(given.P, dtype=float), csr_array(given.A, dtype=float)
-    asymmetry = coo_array(abs(P - P.T))
-    if asymmetry.nnz and (worst := asymmetry.data.max()) > 1e-12 * abs(P).max():
-        i, j = (int(k[asymmetry.data.argmax()]) for k in asymmetry.coords)
-        raise InputError(
-            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
-        )
+    try:
+        check_symmetric(P)
+    except ValueError as e:
+        raise InputError(str(e)) from None
     l, u = _limits("row", given.l, given.u)
     lb, ub = _limits("variable", given.lb, given.ub)
     equal = l == u
