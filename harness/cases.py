@@ -3,7 +3,9 @@
 ``FOLDER/KEY.json`` says which QP a case is: the key names the case and the environment
 that it was built in, so that another version of the code builds its own. Several
 processes may use one folder. An entry whose content is not that of its digest is built
-anew.
+anew, and so is one that another user wrote: a folder that somebody sent could else hold
+another QP under the name of a case, with verdicts that are true of that one. So entries
+are signed with a key that lies outside, ``~/.local/state/mortarbench/key``.
 """
 
 from __future__ import annotations
@@ -12,13 +14,19 @@ import fcntl
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b, file_digest, sha256
+from hmac import compare_digest
 from pathlib import Path
+from secrets import token_bytes
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 from harness.names import CaseName
+
+_KEY_BYTES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +64,8 @@ def entry(
             os.replace(new, folder / f"{digest}.npz")
         finally:
             new.unlink(missing_ok=True)
-        text = json.dumps({"digest": digest, "name": identity, "meta": meta})
+        index = {"digest": digest, "name": identity, "meta": meta}
+        text = json.dumps({**index, "signature": _signature(index)})
         temporary = folder / f"{key}.tmp"
         temporary.write_text(text, "utf-8")
         os.replace(temporary, folder / f"{key}.json")
@@ -73,18 +82,53 @@ def _found(folder: Path, key: str) -> Entry | None:
     """Look up an entry; None where there is none, or none that can be trusted."""
     try:
         index = json.loads((folder / f"{key}.json").read_text("utf-8"))
+        signature = index.pop("signature")
+        if not compare_digest(signature, _signature(index)):
+            return None
         path = folder / f"{index['digest']}.npz"
         if content_digest(path) != index["digest"]:
             return None
         return Entry(qp=path, digest=index["digest"], meta=index["meta"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
+
+
+def _signature(index: Mapping[str, Any]) -> str:
+    """Sign an entry, so that no other user can have written it."""
+    text = json.dumps(index, sort_keys=True).encode()
+    return blake2b(text, key=user_key(), digest_size=16).hexdigest()
+
+
+@cache
+def user_key() -> bytes:
+    """Read the key of this user, made at the first time.
+
+    Where no file can keep it, it is another one in every process: entries of earlier
+    runs are built again.
+    """
+    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    path = Path(os.path.expanduser(state)) / "mortarbench" / "key"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.exists():
+            with NamedTemporaryFile(dir=path.parent) as new:
+                new.write(token_bytes(_KEY_BYTES))
+                new.flush()
+                with suppress(FileExistsError):  # another process was first
+                    os.link(new.name, path)
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with os.fdopen(fd, "rb") as file:
+            private = os.fstat(fd).st_uid == os.getuid()
+            key = file.read(_KEY_BYTES)
+    except OSError:
+        return token_bytes(_KEY_BYTES)
+    return key if private and len(key) == _KEY_BYTES else token_bytes(_KEY_BYTES)
 
 
 @contextmanager
 def _held(lock: Path) -> Iterator[None]:
     """Have one process at a time look up or build a case."""
-    fd = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)
         yield

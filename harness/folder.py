@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
@@ -13,13 +14,60 @@ from pathlib import Path
 from typing import Any
 
 from harness.environment import VOLATILE
-from harness.errors import InputError, some
+from harness.errors import InputError, shortened, some
 from harness.suite import Suite
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
 _VERDICT = "validation.json"  #: of `mortarbench validate`
+_DIGEST = re.compile(r"[\w.-]{1,64}")
+_SCRATCH = ".scratch"
+#: how the names of files begin that are written beside the folders
+_BESIDE = (".lock", "environment.", "suite.", "validation.", "discretisation.")
+
+
+def refuse_links(folder: Path) -> None:
+    """Refuse a result folder that leads out of itself, or to what is no file.
+
+    It may come from anybody. A link in it would have us write over, or delete, a file
+    elsewhere; a pipe would have us wait for ever.
+
+    Raises
+    ------
+    InputError
+        With the first link, device or pipe.
+
+    """
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name in (*_FOLDERS, _SCRATCH):
+                if not entry.is_dir(follow_symlinks=False):
+                    raise _not_plain(entry.path, "a folder of its own")
+                _only_plain(entry.path)
+            elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
+                raise _not_plain(entry.path, "a file of its own")
+
+
+def _only_plain(folder: str) -> None:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if not _is_plain(entry):
+                raise _not_plain(entry.path, "a file or folder of its own")
+            if entry.is_dir(follow_symlinks=False):
+                _only_plain(entry.path)
+
+
+def _is_plain(entry: os.DirEntry[str]) -> bool:
+    is_file = entry.is_file(follow_symlinks=False)
+    return is_file or entry.is_dir(follow_symlinks=False)
+
+
+def _not_plain(path: str, expected: str) -> InputError:
+    return InputError(
+        f"{path} is a link, pipe or device; expected {expected}, as in every result "
+        "folder"
+    )
 
 
 def refuse_foreign(folder: Path) -> None:
@@ -28,9 +76,11 @@ def refuse_foreign(folder: Path) -> None:
     Raises
     ------
     InputError
-        When something there has a name that we use, but no run made it.
+        When something there has a name that we use, but no run made it, or is a link.
 
     """
+    if folder.is_dir():
+        refuse_links(folder)
     if all((folder / name).is_file() for name in _FILES):
         return
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
@@ -56,7 +106,7 @@ def locked(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        fd = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+        fd = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     except OSError as e:
         raise InputError(
             f"{folder}: {e.strerror}; expected a folder that can be written"
@@ -79,7 +129,7 @@ def scratch_in(folder: Path) -> Iterator[Path]:
 
     What a killed run left there is deleted first.
     """
-    scratch = folder / ".scratch"
+    scratch = folder / _SCRATCH
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     try:
@@ -149,9 +199,11 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
     Raises
     ------
     InputError
-        When the folder does not hold it.
+        When the folder does not hold it, or it is none.
 
     """
+    if not _DIGEST.fullmatch(digest):  # it could lead out of the folder
+        raise InputError(f"{folder}: {shortened(digest)!r} is no environment's digest")
     for path in (folder / "environment.json", _node_file(folder, digest)):
         if path.is_file() and (found := _environment(path))["digest"] == digest:
             return found

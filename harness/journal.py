@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Self
 
 from harness.errors import InputError
+from harness.folder import refuse_links
 from harness.record import Record
 
 
@@ -57,13 +58,14 @@ def read_journal(folder: Path) -> list[Record]:
     Raises
     ------
     InputError
-        When there is no folder, no journal, or a line other than a partial last one is
+        When there is no folder, no journal, a link in the folder, or a line other than a partial last one is
         bad.
 
     """
     if not folder.is_dir():
         wrong = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {wrong}; expected a result folder")
+    refuse_links(folder)
     paths = sorted((folder / "journal").glob("*.jsonl"))
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")

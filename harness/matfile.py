@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array, issparse
 
@@ -30,9 +31,15 @@ from harness.qpfile import (
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
-_HEADER, _TAG = 128, 8  #: bytes of a version 5 file, and of each element
-_COMPRESSED, _MATRIX = 15, 14  #: kinds of elements
-_CLASSES = frozenset(range(4, 16))  #: text, sparse matrices, numbers of every type
+_HEADER, _TAG = 128, 8  #: bytes of the head of a version 5 file, and of an element
+_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: kinds of elements, and of their parts
+_TYPES = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
+    13: "u8", 17: "u2", 18: "u4",
+}  # fmt: skip
+_TEXT, _SPARSE = 4, 5  #: classes of variables
+_CLASSES = frozenset((_TEXT, _SPARSE, *range(6, 16)))  #: and numbers of every type
+_COMPLEX = 0x800  #: among the flags of a variable
 _COPIES = 8  #: of a file that its parser may hold
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
@@ -63,7 +70,7 @@ def save_mat(
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read every variable of a .mat file that is numbers or a text.
+    """Read the variables of a .mat file; None stands for what is no number or text.
 
     Raises
     ------
@@ -77,25 +84,32 @@ def read_mat(path: Path) -> dict[str, Any]:
     if b"MATLAB 7.3" in data[:_HEADER] or data.startswith(b"\x89HDF"):
         raise InputError(f"{path}: a .mat file of version 7.3; save it with -v7")
     with parsing(path, _WRONG, _COPIES * len(data)):
-        is_4 = 0 in data[:4]  # version 4 has no head, and nothing is compressed
-        size = len(data) if is_4 else sum(map(_declared, _elements(data)))
+        if 0 in data[:4]:  # version 4, in which nothing is compressed
+            return dict(loadmat(BytesIO(data), spmatrix=False))
+        elements = list(_elements(data))
+        size = sum(map(_declared, elements))
         check_size(f"{path}: what it holds", size)
-    with parsing(path, _WRONG, _COPIES * (len(data) + size)):
-        plain = data if is_4 else _expanded(data)
-        return dict(loadmat(BytesIO(plain), spmatrix=False))
+    with parsing(path, _WRONG, _COPIES * size):
+        found: dict[str, Any] = {}
+        for element in elements:
+            name, value = _variable(element)
+            if name in found:
+                raise ValueError(f"{name} is there twice")
+            found[name] = value
+        return found
 
 
 class _Element(NamedTuple):
     """What a file of version 5 is made of, after its head."""
 
-    order: str  #: of bytes, as struct has it
+    order: str  #: of bytes, as struct and numpy have it
     kind: int
     body: bytes
 
 
 def _elements(data: bytes) -> Iterator[_Element]:
     """List the elements of a version 5 file."""
-    order = "<" if data[_HEADER - 2 : _HEADER] == b"IM" else ">"
+    order = {b"IM": "<", b"MI": ">"}[data[_HEADER - 2 : _HEADER]]
     at = _HEADER
     while at < len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
@@ -113,25 +127,8 @@ def _declared(element: _Element) -> int:
     return int(struct.unpack(f"{element.order}II", head)[1])
 
 
-def _expanded(data: bytes) -> bytes:
-    """Decompress every element, and not a byte beyond what its head declares.
-
-    Variables that are neither numbers nor text (cells, structures, objects) are left
-    out: none of ours, and nested without bound.
-    """
-    parts = [data[:_HEADER]]
-    for element in _elements(data):
-        plain = _decompressed(element) if element.kind == _COMPRESSED else element
-        head = f"{plain.order}II"
-        if plain.kind != _MATRIX:
-            raise ValueError("an element that is no variable")
-        (flags,) = struct.unpack_from(f"{plain.order}I", plain.body, _TAG)
-        if flags & 0xFF in _CLASSES:
-            parts += [struct.pack(head, plain.kind, len(plain.body)), plain.body]
-    return b"".join(parts)
-
-
 def _decompressed(element: _Element) -> _Element:
+    """Decompress an element, and not a byte beyond what its head declares."""
     inflate = zlib.decompressobj()
     head = inflate.decompress(element.body, _TAG)
     kind, size = struct.unpack(f"{element.order}II", head)
@@ -139,6 +136,54 @@ def _decompressed(element: _Element) -> _Element:
     if len(body) < size or inflate.decompress(inflate.unconsumed_tail, 1):
         raise ValueError("a compressed variable has not the size that it declares")
     return _Element(element.order, kind, body)
+
+
+def _variable(element: _Element) -> tuple[str, Any]:
+    """Read a variable: a text, an array, a sparse matrix, or None for anything else.
+
+    scipy's reader is not used: some damaged files crash Python in it (scipy 1.17.1).
+    """
+    if element.kind == _COMPRESSED:
+        element = _decompressed(element)
+    if element.kind != _MATRIX:
+        raise ValueError("an element that is no variable")
+    parts = _parts(element)
+    flags, shape = int(next(parts)[0]), tuple(map(int, next(parts)))
+    name = next(parts).tobytes().decode("latin-1")
+    kind = flags & 0xFF
+    if kind not in _CLASSES or flags & _COMPLEX:
+        return name, None
+    if min(shape) < 0:
+        raise ValueError(f"{name} is of shape {shape}")
+    if kind == _SPARSE:
+        rows, starts, values = (next(parts) for _ in range(3))
+        count = starts[-1]  # room for more may follow
+        return name, csc_array((values[:count], rows[:count], starts), shape=shape)
+    values = next(parts)
+    if kind == _TEXT:
+        return name, np.array("".join(map(chr, values.tolist())))
+    return name, values.reshape(shape, order="F")
+
+
+def _parts(element: _Element) -> Iterator[NDArray[Any]]:
+    """List the arrays of numbers that a variable is made of."""
+    order, _, body = element
+    at = 0
+    while at < len(body):
+        (kind,) = struct.unpack_from(f"{order}I", body, at)
+        if kind >> 16:  # four bytes at most, in the tag itself
+            kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
+            at += _TAG
+        else:
+            (size,) = struct.unpack_from(f"{order}I", body, at + 4)
+            begin, at = at + _TAG, at + _TAG + size + -size % _TAG
+        if begin + size > len(body):
+            raise ValueError("truncated")
+        if kind == _UTF_8:
+            text = body[begin : begin + size].decode("utf-8")
+            yield np.array([ord(letter) for letter in text], dtype=np.uint32)
+        else:
+            yield np.frombuffer(body[begin : begin + size], order + _TYPES[kind])
 
 
 def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
@@ -184,7 +229,7 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
     """Take a matrix of numbers, dense or sparse, as csc."""
     if name not in arrays:
         raise InputError(f"{name} is missing")
-    if np.dtype(getattr(arrays[name], "dtype", object)).kind not in "iufb":
+    if getattr(arrays[name], "dtype", np.dtype(object)).kind not in "iufb":
         raise InputError(f"{name} is no matrix of numbers")
     given = arrays[name]
     if given.ndim > 2:

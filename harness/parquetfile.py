@@ -17,6 +17,8 @@ References
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,18 +26,16 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, issparse
 
-from harness.datafile import check_size, json_object, opened, parsing
+from harness.datafile import check_size, json_object, most_bytes, opened
 from harness.errors import InputError, shortened
 from harness.qp import QP, Matrix, Vector, no_rows
 from harness.qpfile import check_symmetric, explicit_matrices, listed_dense
 
-_EXPECTED = "a Parquet file"
-_WRONG = "malformed; expected a Parquet file"
-_COPIES = 4  #: of what a file declares that its reader may hold
 _MATRICES = ("P", "G", "A")
+_KEY = "mortarbench"
+_READER = Path(__file__).with_name("parquetreader.py")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
-_KEY = b"mortarbench"
 #: entries of a matrix, 1 GiB: a row lies in one page, whose size is an int32
 _MOST = 2**27
 
@@ -88,72 +88,67 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
         what it holds is no QP.
 
     """
-    import pyarrow.parquet as pq
-
-    with opened(path, _EXPECTED) as file:
-        with parsing(path, _WRONG, 0):  # threads of arrow's may abort Python's end
-            parquet = pq.ParquetFile(file, pre_buffer=False)
-            told = parquet.metadata
-            columns = parquet.schema_arrow.names
-            size = _declared(told)
-        if told.num_rows != 1:
-            raise InputError(f"{path}: holds {told.num_rows} problems; expected one row")
-        if missing := [name for name in _COLUMNS if name not in columns]:
-            raise InputError(
-                f"{path}: no column {', '.join(missing)}; expected a problem"
-            )
-        check_size(f"{path}: what it holds", size)
-        with parsing(path, _WRONG, _COPIES * size):
-            table = parquet.read(columns=list(_COLUMNS), use_threads=False)
-            table.validate(full=True)
-    given = {name: table.column(name)[0] for name in _COLUMNS}
+    flat, text = _columns(path)
     try:
-        meta = json_object((table.schema.metadata or {}).get(_KEY, b"{}"))
+        meta = json_object(text)
         dense = listed_dense(meta) if "dense" in meta else set(_MATRICES)
-        qp = _qp(given, dense)
+        qp = _qp(flat, dense)
         check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
     return qp, meta
 
 
-def _declared(told: Any) -> int:
-    """Add up what the parts of a file will take, as its footer has it.
+def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
+    """Have `harness.parquetreader` read the columns, and what lies under our key.
 
-    A page can say "the same value a billion times" in a few bytes, so values count, too.
+    Raises
+    ------
+    InputError
+        When the file is no Parquet, not of one row, too large, or lacks a column.
+
     """
-    groups = [told.row_group(i) for i in range(told.num_row_groups)]
-    chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
-    return sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
+    command = [sys.executable, "-I", str(_READER), str(most_bytes()), _KEY]
+    with opened(path, "a Parquet file") as file:
+        done = subprocess.run(
+            [*command, *_COLUMNS], stdin=file, capture_output=True, check=False
+        )
+    line, _, numbers = done.stdout.partition(b"\n")
+    if done.returncode or not line:
+        raise InputError(f"{path}: malformed; expected a Parquet file")
+    told = json.loads(line)
+    if told["rows"] != 1:
+        raise InputError(f"{path}: holds {told['rows']} problems; expected one row")
+    if missing := told["missing"]:
+        raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
+    check_size(f"{path}: what it holds", told["bytes"])
+    flat: dict[str, Vector | None] = {}
+    begin = 0
+    for name, count in told["columns"].items():
+        if count == -1:
+            raise InputError(f"{path}: {name} is no list of numbers")
+        end = begin + 8 * (count or 0)
+        flat[name] = None if count is None else np.frombuffer(numbers[begin:end])
+        begin = end
+    return flat, told["meta"]
 
 
-def _qp(given: Mapping[str, Any], dense: Container[str]) -> QP:
-    """Put a QP together from arrow's scalars, which are lists, or null if absent."""
-    flat = {name: _numbers(name, scalar) for name, scalar in given.items()}
-    if flat["P"] is None or flat["q"] is None:
+def _qp(flat: Mapping[str, Vector | None], dense: Container[str]) -> QP:
+    """Put a QP together from lists, None where they are absent."""
+    P, q = flat["P"], flat["q"]
+    if P is None or q is None:
         raise ValueError("P or q is null; expected lists of numbers")
-    n = flat["q"].size
-    parts: dict[str, Any] = {"q": flat["q"]}
+    n = q.size
+    parts: dict[str, Any] = {"q": q}
     for name in _MATRICES:
         M = flat[name]
         parts[name] = no_rows(n) if M is None else _matrix(name, M, n, name in dense)
     for name in _RIGHT_HAND_SIDE.values():
-        parts[name] = np.zeros(0) if flat[name] is None else flat[name]
+        parts[name] = np.zeros(0) if (rhs := flat[name]) is None else rhs
     for name, absent in (("lb", -np.inf), ("ub", np.inf)):
-        parts[name] = np.full(n, absent) if flat[name] is None else flat[name]
+        bound = flat[name]
+        parts[name] = np.full(n, absent) if bound is None else bound
     return QP(**parts)
-
-
-def _numbers(name: str, scalar: Any) -> Vector | None:
-    if not scalar.is_valid:
-        return None
-    try:
-        values = np.asarray(scalar.values.to_numpy(zero_copy_only=False))
-    except (ValueError, TypeError, AttributeError):
-        values = np.array("")
-    if values.dtype.kind not in "iuf" or values.ndim != 1:
-        raise ValueError(f"{name} is no list of numbers")
-    return values.astype(float)
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:

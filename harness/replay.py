@@ -17,7 +17,7 @@ from harness.folder import differences
 from harness.record import Record, finite
 from harness.show import aligned
 from harness.solution import Status
-from harness.store import Arrays, load_solution
+from harness.store import Arrays, digest_of, load_solution, point_arrays
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
@@ -160,9 +160,12 @@ def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
     if then.vectors is None or point is None:
         return None
     try:
-        stored = load_solution(folder, then.vectors, Status.SOLVED).x
+        solution = load_solution(folder, then.vectors, Status.SOLVED)
     except InputError:  # the vectors may have been thrown away: records suffice
         return None
+    if digest_of(point_arrays(solution)) != then.vectors:  # not what was stored
+        return None
+    stored = solution.x
     if stored.shape != point["x"].shape:
         return None
     scale = np.abs(stored).max(initial=0.0) or 1.0

@@ -206,6 +206,11 @@ def _restorable() -> Iterator[None]:
         raise InputError(f"{e}; restore the file, or run with --fresh") from None
 
 
+def is_stored(folder: Path, digest: str) -> bool:
+    """Whether a folder has arrays of that digest."""
+    return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
+
+
 def _path(folder: Path, digest: str) -> Path:
     """Locate stored arrays; what is no digest could lead out of the folder."""
     if not _DIGEST.fullmatch(digest):

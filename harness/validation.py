@@ -23,7 +23,7 @@ from harness.qpfile import qp_digest
 from harness.rebuilt import rebuilt
 from harness.record import Record, Verdict
 from harness.solution import Status
-from harness.store import digest_of, load_solution, point_arrays
+from harness.store import digest_of, is_stored, load_solution, point_arrays
 from harness.truth import Given
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
@@ -103,7 +103,7 @@ def validated(
 
     """
     records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
-    if not any(r.vectors and _file(path, r).exists() for r in records):
+    if not any(r.vectors and is_stored(path, r.vectors) for r in records):
         raise InputError(f"{path}: {_pointless(records)}")
     twins: dict[tuple[str, str], set[str]] = {}
     for r in records:

@@ -22,6 +22,7 @@ _COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
 CONNECTED = {"vertex": 0, "line": 1, "quad": 2}  #: cells that we read → dimension
 FAR = 1e100  #: coordinates whose products overflow
+CORNERS = {"vertex": 1, "line": 2, "quad": 4}
 RECOMBINE = "expected first-order quadrilaterals: Mesh.RecombineAll = 1 in gmsh"
 
 
@@ -99,7 +100,11 @@ def _read(path: Path) -> Any:
         tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
     if points.ndim != 2 or points.shape[1] < 2 or not (abs(points) < FAR).all():
         raise InputError(f"{path}: coordinates beyond {FAR:g}, or none; expected some")
-    for nodes in cells:  # −1 is meshio's number of a node that there is none of
+    for block, nodes in zip(mesh.cells, cells, strict=True):
+        corners = CORNERS.get(block.type, nodes.shape[-1])
+        if nodes.ndim != 2 or nodes.shape[1] != corners:
+            raise InputError(f"{path}: {block.type} cells of {nodes.shape[-1]} nodes")
+        # −1 is meshio's number of a node that there is none of
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
             raise InputError(f"{path}: cells of nodes that are not in the file")
     if tags and not tagged:

@@ -30,9 +30,9 @@ from harness import InputError
 from harness.errors import shortened, unknown
 from problems.twosided import TwoSided
 
-
 _NUMBER = re.compile(
-    r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?", re.IGNORECASE | re.ASCII
+    r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",
+    re.IGNORECASE | re.ASCII,
 )
 
 

@@ -1,0 +1,303 @@
+"""Damaged data files, at random from a seed: what readers must refuse or read."""
+
+import io
+import json
+import signal
+import struct
+from contextlib import contextmanager
+
+import numpy as np
+import pyarrow.parquet as pq
+from scipy.io import savemat
+from scipy.sparse import csc_array, random_array
+
+from harness import QP, InputError
+from harness.matfile import save_mat
+from harness.parquetfile import save_parquet
+from harness.qpfile import save_qp
+from problems import PROBLEMS
+from problems.msh import read_msh
+
+EXTREMES = (
+    0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),
+    2**64 - 1, 10**9,
+)  # fmt: skip
+WORDS = (
+    b"nan", b"inf", b"-inf", b"1e400", b"1_0", b"-1", b"0", b"99999999999999999999",
+    b"\x00", b"\xff", b"\n", b" ", b"(", b"[" * 300, b"'", b"$End", b"-0.0", b"1e308",
+)  # fmt: skip
+
+QPS = b"""NAME          TINY
+ROWS
+ N  COST
+ L  UPPER
+ G  LOWER
+ E  EQUAL
+COLUMNS
+    X1        COST      1.0   UPPER     1.0
+    X1        EQUAL     2.0
+    X2        COST     -1.0   LOWER     1.5
+    X2        EQUAL     1.0
+RHS
+    RHS       COST     -3.0   UPPER     4.0
+    RHS       LOWER     0.5   EQUAL     2.0
+RANGES
+    RNG       UPPER     2.5
+BOUNDS
+ UP BND       X1        4.0
+ MI BND       X2
+QUADOBJ
+    X1        X1        2.0
+    X1        X2       -0.5
+    X2        X2        2.0
+ENDATA
+"""
+
+
+def tiny_qp(dense=False):
+    """A QP with every kind of constraint."""
+    rng = np.random.default_rng(7)
+    P = random_array((6, 6), density=0.4, rng=rng)
+    P = csc_array(P @ P.T + 2 * np.eye(6))
+    return QP(
+        P=P.toarray() if dense else P, q=rng.normal(size=6), A=csc_array(np.eye(6)[:1]),
+        b=np.ones(1), G=csc_array(np.eye(6)[2:4]), h=np.ones(2),
+        lb=np.array([-np.inf, -1.0] * 3), ub=np.array([np.inf, 2.0] * 3),
+    )  # fmt: skip
+
+
+def seeds(folder):
+    """Whole files of every kind, by the ending of their names."""
+    qp, meta = tiny_qp(), {"name": "tiny", "scale": 2.0, "constant": 1.0}
+    found = {kind: [] for kind in ("npz", "mat", "parquet", "qps", "msh")}
+
+    def written(kind, write):
+        path = folder / f"seed.{kind}"
+        write(path)
+        found[kind].append(path.read_bytes())
+
+    for each in (qp, tiny_qp(dense=True)):
+        written("npz", lambda path, each=each: save_qp(path, each, meta))
+        written("mat", lambda path, each=each: save_mat(path, each, meta, {}))
+        written("parquet", lambda path, each=each: save_parquet(path, each, meta))
+    with np.load(io.BytesIO(found["npz"][0])) as arrays:
+        for save in (np.savez, np.savez_compressed):
+            written("npz", lambda path, s=save, a=dict(arrays): s(path, **a))
+    maros = {
+        "P": qp.P, "q": qp.q, "A": csc_array(np.eye(6)), "l": -np.ones(6),
+        "u": np.ones(6), "r": 3.0, "n": 6, "m": 6,
+    }  # fmt: skip
+    for form in ("4", "5"):
+        written("mat", lambda path, f=form: savemat(path, maros, format=f))
+    for compression in ("none", "gzip"):
+        written("parquet", lambda path, c=compression: repacked(path, c))
+    found["qps"] = [QPS]
+    found["msh"] = [msh_22(), *meshes(folder)]
+    return found
+
+
+def repacked(path, compression):
+    """Write the Parquet file that is there once more, compressed otherwise."""
+    pq.write_table(pq.ParquetFile(path).read(), path, compression=compression)
+
+
+def msh_22():
+    """Two quadrilaterals and an edge, in the text format 2.2."""
+    points = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
+    nodes = "\n".join(f"{i} {x} {y} 0" for i, (x, y) in enumerate(points, 1))
+    return f"""$MeshFormat
+2.2 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "side"
+2 2 "body"
+$EndPhysicalNames
+$Nodes
+6
+{nodes}
+$EndNodes
+$Elements
+3
+1 1 2 1 1 1 2
+2 3 2 2 1 1 2 5 4
+3 3 2 2 1 2 3 6 5
+$EndElements
+""".encode()
+
+
+def meshes(folder):
+    """The same, as meshio writes it in format 4.1, as text and binary."""
+    import meshio
+
+    (folder / "text.msh").write_bytes(msh_22())
+    mesh = meshio.gmsh.read(folder / "text.msh")
+    for binary in (False, True):
+        path = folder / f"{binary}.msh"
+        meshio.gmsh.write(path, mesh, fmt_version="2.2", binary=binary)
+        yield path.read_bytes()
+    yield MSH_41
+
+
+MSH_41 = b"""$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "side"
+2 2 "body"
+$EndPhysicalNames
+$Entities
+0 1 1 0
+1 0 0 0 1 0 0 1 1 0
+1 0 0 0 2 1 0 1 2 0
+$EndEntities
+$Nodes
+1 6 1 6
+2 1 0 6
+1
+2
+3
+4
+5
+6
+0 0 0
+1 0 0
+2 0 0
+0 1 0
+1 1 0
+2 1 0
+$EndNodes
+$Elements
+2 3 1 3
+1 1 1 1
+1 1 2
+2 1 3 2
+2 1 2 5 4
+3 2 3 6 5
+$EndElements
+"""
+
+
+def flipped(rng, data, at, others):
+    """Flip a bit."""
+    return data[:at] + bytes([data[at] ^ (1 << rng.integers(0, 8))]) + data[at + 1 :]
+
+
+def truncated(rng, data, at, others):
+    """Cut off the end."""
+    return data[:at]
+
+
+def spliced(rng, data, at, others):
+    """Put in a piece of another file."""
+    other = others[rng.integers(0, len(others))]
+    start = int(rng.integers(0, len(other)))
+    return over(data, at, other[start : start + int(rng.integers(1, 200))])
+
+
+def numbered(rng, data, at, others):
+    """Write an extreme integer, as heads have them."""
+    value = EXTREMES[rng.integers(0, len(EXTREMES))] % 2**64
+    return over(data, at, struct.pack("<Q", value)[: (2, 4, 8)[rng.integers(0, 3)]])
+
+
+def worded(rng, data, at, others):
+    """Write an odd word, or put it in."""
+    word = WORDS[rng.integers(0, len(WORDS))]
+    return over(data, at, word) if rng.random() < 0.5 else data[:at] + word + data[at:]
+
+
+def refielded(rng, data, at, others):
+    """Replace a field of a text."""
+    fields = data.split(b" ")
+    fields[rng.integers(0, len(fields))] = WORDS[rng.integers(0, len(WORDS))]
+    return b" ".join(fields)
+
+
+def doubled(rng, data, at, others):
+    """Write forty bytes twice."""
+    return data[:at] + data[max(at - 40, 0) :]
+
+
+def shortened(rng, data, at, others):
+    """Leave out some bytes."""
+    return data[:at] + data[at + int(rng.integers(1, 40)) :]
+
+
+def over(data, at, piece):
+    """Write `piece` over what is there."""
+    return data[:at] + piece + data[at + len(piece) :]
+
+
+DAMAGES = (
+    flipped, truncated, spliced, numbered, worded, refielded, doubled, shortened
+)  # fmt: skip
+
+
+def damaged(rng, data, others):
+    """Damage `data` in one to three places."""
+    for _ in range(rng.integers(1, 4)):
+        if data:
+            damage = DAMAGES[rng.integers(0, len(DAMAGES))]
+            data = damage(rng, data, int(rng.integers(0, len(data))), others)
+    return data
+
+
+def read(path):
+    """Read a file as cases do; return whether it was read, which needs a valid QP."""
+    try:
+        if path.suffix == ".msh":
+            mesh = read_msh(path)
+            assert mesh.cells.max() < len(mesh.points)
+            assert np.isfinite(mesh.points).all()
+            return True
+        family = PROBLEMS["file"]
+        params = family.complete({"path": str(path)})
+        case = family.build("qp", params, None)
+    except InputError as e:
+        text = str(e)
+        assert "\n" not in text
+        assert len(text) < 1000
+        return False
+    qp = case.qp
+    x = np.ones(qp.q.size)
+    with np.errstate(all="ignore"):
+        qp.P @ x, qp.A @ x, qp.G @ x
+    assert qp.P.shape == (qp.q.size, qp.q.size)
+    json.dumps([case.scale, case.constant], allow_nan=False)
+    return True
+
+
+class HangError(BaseException):
+    """No exception that a reader could catch."""
+
+
+@contextmanager
+def alarm(seconds):
+    """Raise `HangError` in what takes longer."""
+
+    def ring(*_):
+        raise HangError
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def fuzz(kind, count, seed, folder, seconds):
+    """Read `count` damaged files of a kind; count those that were read all the same."""
+    rng = np.random.default_rng(seed)
+    whole = seeds(folder)[kind]
+    path = folder / f"damaged.{kind}"
+    survived = 0
+    for _ in range(count):
+        data = damaged(rng, whole[rng.integers(0, len(whole))], whole)
+        path.write_bytes(data)
+        with alarm(seconds):
+            survived += read(path)
+    return survived
