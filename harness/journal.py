@@ -58,8 +58,8 @@ def read_journal(folder: Path) -> list[Record]:
     Raises
     ------
     InputError
-        When there is no folder, no journal, a link in the folder, or a line other than a partial last one is
-        bad.
+        When there is no folder, no journal, a link in the folder, or a line other than
+        a partial last one is bad.
 
     """
     if not folder.is_dir():

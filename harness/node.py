@@ -9,9 +9,10 @@ from __future__ import annotations
 import fcntl
 import os
 import platform
+import stat
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
@@ -129,7 +130,7 @@ class Node(WorkerPlugin):
         if self._sharing > 1:
             environment["machine"]["shared_by_workers"] = self._sharing
         with ExitStack() as stack:
-            cpu = _own_cpu(stack)
+            cpu = own_cpu(stack)
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
             operators = self._operators
@@ -186,27 +187,59 @@ class _Open:
     stack: ExitStack
 
 
-def _own_cpu(stack: ExitStack) -> int:
+def own_cpu(stack: ExitStack) -> int:
     """Take a CPU that no other station on this machine has; the kernel gives it back.
 
     Raises
     ------
     InputError
-        When there is none left.
+        When there is none left, or somebody else has made the folder of the locks.
 
     """
     usable = sorted(os.sched_getaffinity(os.getpid()), reverse=True)
-    for cpu in usable:
-        lock = Path(gettempdir()) / f"mortarbench-{os.getuid()}-cpu{cpu}.lock"
-        fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(fd)
-            continue
-        stack.callback(os.close, fd)
-        return cpu
+    with _lock_folder() as folder:
+        for cpu in usable:
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+            fd = os.open(f"cpu{cpu}.lock", flags, 0o600, dir_fd=folder)
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(fd)
+                continue
+            stack.callback(os.close, fd)
+            return cpu
     raise InputError(
         f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
         "measure there already; start fewer"
     )
+
+
+@contextmanager
+def _lock_folder() -> Iterator[int]:
+    """Open the folder of this user's locks, in that of temporary files, which all share.
+
+    Raises
+    ------
+    InputError
+        When what is there is a link or a file, is another user's, or open to others:
+        they could plant links in it, or hold the locks.
+
+    """
+    path = Path(gettempdir()) / f"mortarbench-{os.getuid()}"
+    with suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    wrong = InputError(
+        f"{platform.node()}: {path} is not a folder of this user's alone; remove it, "
+        "or set TMPDIR to another folder, the same for all Dask workers there"
+    )
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        raise wrong from None
+    try:
+        found = os.fstat(fd)
+        if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
+            raise wrong
+        yield fd
+    finally:
+        os.close(fd)

@@ -46,7 +46,7 @@ def started(*arguments, env):
 class Cluster:
     """A scheduler, and workers that can be killed."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, *options):
         self.folder = folder
         self.starts = folder / "starts"
         self.starts.touch()
@@ -54,7 +54,7 @@ class Cluster:
         self._file = folder / "scheduler.json"
         self.scheduler = started(
             "scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
-            "--scheduler-file", str(self._file), env=self._env,
+            "--scheduler-file", str(self._file), *options, env=self._env,
         )  # fmt: skip
         self.workers = []
         while not (self._file.exists() and self._file.read_text()):

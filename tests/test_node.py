@@ -1,0 +1,81 @@
+"""Locks of CPUs lie where all users of a machine may write: nobody else plants them."""
+
+import os
+import tempfile
+from contextlib import ExitStack
+
+import pytest
+
+from harness import InputError
+from harness.node import own_cpu
+
+
+@pytest.fixture
+def shared(tmp_path, monkeypatch):
+    """A folder of temporary files of this test alone."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def ours(shared):
+    return shared / f"mortarbench-{os.getuid()}"
+
+
+def test_stations_on_one_machine_have_different_cpus_until_there_are_none(shared):
+    usable = os.sched_getaffinity(0)
+    with ExitStack() as stack:
+        assert {own_cpu(stack) for _ in usable} == usable
+        with pytest.raises(InputError, match="start fewer"):
+            own_cpu(stack)
+    with ExitStack() as stack:
+        assert own_cpu(stack) in usable
+
+
+def test_only_this_user_can_enter_the_folder_of_locks(shared):
+    with ExitStack() as stack:
+        own_cpu(stack)
+    assert ours(shared).stat().st_mode & 0o777 == 0o700
+
+
+def link_elsewhere(path, elsewhere):
+    path.symlink_to(elsewhere)
+
+
+def file_instead(path, elsewhere):
+    path.write_text("")
+
+
+def open_to_all(path, elsewhere):
+    path.mkdir()
+    path.chmod(0o777)
+
+
+@pytest.mark.parametrize("plant", [link_elsewhere, file_instead, open_to_all])
+def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant):
+    elsewhere = shared / "elsewhere"
+    elsewhere.mkdir(mode=0o700)
+    plant(ours(shared), elsewhere)
+
+    with ExitStack() as stack, pytest.raises(InputError, match="this user's alone"):
+        own_cpu(stack)
+    assert not list(elsewhere.iterdir())
+
+
+def test_a_folder_of_locks_of_another_user_is_refused(shared, monkeypatch):
+    us = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: us + 1)
+    ours(shared).mkdir(mode=0o700)  # which is ours, not that other user's
+
+    with ExitStack() as stack, pytest.raises(InputError, match="this user's alone"):
+        own_cpu(stack)
+
+
+def test_a_lock_that_is_a_link_is_not_followed(shared):
+    ours(shared).mkdir(mode=0o700)
+    victim = shared / "victim"
+    for cpu in os.sched_getaffinity(0):
+        (ours(shared) / f"cpu{cpu}.lock").symlink_to(victim)
+
+    with ExitStack() as stack, pytest.raises(OSError, match="symbolic links"):
+        own_cpu(stack)
+    assert not victim.exists()
