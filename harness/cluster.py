@@ -228,9 +228,9 @@ def _connected(address: str, stack: ExitStack) -> Any:
         if not address.startswith("tls:"):
             raise
         raise InputError(
-            f"--dask {address}: Dask's configuration has no certificate for it; expected "
-            "distributed.comm.tls: ca-file, client.cert and client.key, such as "
-            "DASK_DISTRIBUTED__COMM__TLS__CA_FILE in the environment"
+            f"--dask {address}: Dask's configuration has no certificate for it; "
+            "expected distributed.comm.tls: ca-file, client.cert and client.key, in a "
+            "file or as DASK_DISTRIBUTED__COMM__TLS__CA_FILE in the environment"
         ) from e
     except (OSError, ValueError) as e:
         why = " ".join(str(e).split()) or type(e).__name__

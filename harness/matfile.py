@@ -23,8 +23,10 @@ from harness.datafile import check_size, json_object, opened, parsing
 from harness.errors import InputError, shortened
 from harness.qp import QP, Matrix, Vector
 from harness.qpfile import (
+    canonical,
     check_dense,
     check_symmetric,
+    compressed,
     explicit_matrices,
     listed_dense,
 )
@@ -158,7 +160,7 @@ def _variable(element: _Element) -> tuple[str, Any]:
     if kind == _SPARSE:
         rows, starts, values = (next(parts) for _ in range(3))
         count = starts[-1]  # room for more may follow
-        return name, csc_array((values[:count], rows[:count], starts), shape=shape)
+        return name, compressed(values[:count], rows[:count], starts, shape)
     values = next(parts)
     if kind == _TEXT:
         return name, np.array("".join(map(chr, values.tolist())))
@@ -239,9 +241,9 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
     try:
         with np.errstate(over="ignore"):
             M = csc_array(given, dtype=float)
-        M.check_format(full_check=True)  # scipy does not, where it reads a file
     except (ValueError, TypeError, OverflowError, IndexError) as e:
         raise InputError(f"{name} is no matrix: {shortened(str(e))}") from None
+    M = canonical(M)
     if np.isnan(M.data).any():
         raise InputError(f"{name} holds NaN; expected numbers")
     return M

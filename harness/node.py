@@ -216,7 +216,7 @@ def own_cpu(stack: ExitStack) -> int:
 
 @contextmanager
 def _lock_folder() -> Iterator[int]:
-    """Open the folder of this user's locks, in that of temporary files, which all share.
+    """Open the folder of this user's locks, in that of everybody's temporary files.
 
     Raises
     ------

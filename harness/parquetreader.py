@@ -6,10 +6,10 @@
 
 prints a line of JSON with the number of ``rows``, the columns ``missing``, the
 ``bytes`` that the file declares, at most MOST if it is to be read, and as ``meta`` the
-text under KEY in the metadata of its schema. Of a file of one row ``columns`` follows, the length
-of each column's list, null where it is null, -1 where it is no list of numbers; then
-the numbers of one column after the other, as float64. It imports nothing of ours, to
-start fast.
+text under KEY in the metadata of its schema. Of a file of one row ``columns`` follows,
+the length of each column's list, null where it is null, -1 where it is no list of
+numbers; then the numbers of one column after the other, as float64. It imports nothing
+of ours, to start fast.
 """
 
 from __future__ import annotations

@@ -278,8 +278,38 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
         raise ValueError(f"{name}_indices, _indptr and _shape must hold integers")
     try:
-        M = csc_array((data, indices, indptr), shape=tuple(shape.tolist()))
-        M.check_format(full_check=True)
+        return compressed(data, indices, indptr, tuple(shape.tolist()))
     except (ValueError, TypeError, OverflowError) as e:
         raise ValueError(f"{name} is no matrix in CSC parts: {e}") from None
+
+
+def compressed(
+    data: NDArray[Any], indices: NDArray[Any], indptr: NDArray[Any], shape: Any
+) -> Matrix:
+    """Make a matrix of its compressed columns; a wrong index would crash a product.
+
+    Raises
+    ------
+    ValueError, TypeError, OverflowError
+        When they fit neither each other nor `shape`.
+
+    """
+    if (
+        indptr[1:] < indptr[:-1]
+    ).any():  # scipy (1.17.1) looks at differences: overflow
+        raise ValueError("indptr decreases")
+    M = csc_array((data, indices, indptr), shape=shape)
+    M.check_format(full_check=True)
+    return canonical(M)
+
+
+def canonical(M: Matrix) -> Matrix:
+    """Sort the entries of a sparse matrix and add up those of one place.
+
+    Somebody else's need not be so, and what is frozen cannot be made so later.
+    """
+    if M.has_canonical_format:
+        return M
+    M = M.copy()
+    M.sum_duplicates()
     return M
