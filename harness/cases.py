@@ -18,6 +18,7 @@ from hashlib import blake2b, file_digest, sha256
 from pathlib import Path
 from typing import Any
 
+from harness.durable import replace_file
 from harness.names import CaseName
 
 
@@ -57,9 +58,7 @@ def entry(
         finally:
             new.unlink(missing_ok=True)
         text = json.dumps({"digest": digest, "name": identity, "meta": meta})
-        temporary = folder / f"{key}.tmp"
-        temporary.write_text(text, "utf-8")
-        os.replace(temporary, folder / f"{key}.json")
+        replace_file(folder / f"{key}.json", text.encode())
         return Entry(qp=folder / f"{digest}.npz", digest=digest, meta=meta)
 
 

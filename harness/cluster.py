@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from harness.block import Block, Commands, Engine, Opens, Result, Unbuilt
+from harness.block import Block, Commands, Engine, Opens, Outcome, Unbuilt
 from harness.errors import InputError, some
 from harness.folder import differences
 
@@ -135,7 +135,7 @@ class _Cluster:
         self._address = address
         self._warn = warn
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Result | Unbuilt]:
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
         under_way: dict[Any, Block] = {}
         try:
@@ -180,7 +180,7 @@ class _Cluster:
 
     def _results(
         self, future: Any, block: Block, under_way: dict[Any, Block]
-    ) -> list[Result | Unbuilt]:
+    ) -> list[Outcome]:
         from distributed import KilledWorker
 
         if future.status in ("cancelled", "lost") and self._client.status == "running":
@@ -193,7 +193,7 @@ class _Cluster:
             reason = f"{case} was given up: every Dask worker that took it was lost"
             return [Unbuilt(block=block, reason=reason)]
         self._nodes.meet(done.node, done.digest, done.environment)
-        results: list[Result | Unbuilt] = done.results
+        results: list[Outcome] = done.results
         return results
 
 

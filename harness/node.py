@@ -21,7 +21,7 @@ from typing import Any, cast
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
-from harness.block import Block, Commands, Result, Unbuilt
+from harness.block import Block, Commands, Outcome
 from harness.environment import capture_in, digest
 from harness.errors import InputError
 from harness.station import Station
@@ -32,7 +32,7 @@ from harness.supervisor import ONE_THREAD
 class Done:
     """What came of a block, and where."""
 
-    results: list[Result | Unbuilt]
+    results: list[Outcome]
     node: str  #: host name
     digest: str  #: of the environment
     environment: dict[str, Any]
