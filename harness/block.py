@@ -48,6 +48,7 @@ class Result:
     """One measurement of a block."""
 
     record: Record  #: complete but for the digests of what is to be stored
+    part: int = 0  #: of its block; parts of one block were not measured together
     point: Arrays | None = None  #: where the solver returned one
     fields: Arrays | None = None  #: the deformed state, where it is to be stored
 
@@ -61,6 +62,18 @@ class Unbuilt:
     trace: str = ""  #: of the family's code
 
 
+@dataclass(frozen=True, kw_only=True)
+class Unmade:
+    """Instead of a result: a fault of ours or of the machine prevented it."""
+
+    record: Record  #: of what was to be measured
+    reason: str  #: one line
+    tried_again: bool  #: at once: another `Unmade`, or a `Result`, follows
+
+
+Outcome = Result | Unbuilt | Unmade
+
+
 class Engine(Protocol):
     """Where blocks are carried out: on this machine one by one, or elsewhere.
 
@@ -69,7 +82,7 @@ class Engine(Protocol):
     made as they are taken: the less is taken ahead, the sooner a run can stop.
     """
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Result | Unbuilt]:
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
 
 

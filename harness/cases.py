@@ -24,6 +24,7 @@ from secrets import token_bytes
 from tempfile import NamedTemporaryFile
 from typing import Any
 
+from harness.durable import replace_file
 from harness.names import CaseName
 
 _KEY_BYTES = 32
@@ -66,9 +67,7 @@ def entry(
             new.unlink(missing_ok=True)
         index = {"digest": digest, "name": identity, "meta": meta}
         text = json.dumps({**index, "signature": _signature(index)})
-        temporary = folder / f"{key}.tmp"
-        temporary.write_text(text, "utf-8")
-        os.replace(temporary, folder / f"{key}.json")
+        replace_file(folder / f"{key}.json", text.encode())
         return Entry(qp=folder / f"{digest}.npz", digest=digest, meta=meta)
 
 

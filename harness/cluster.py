@@ -1,28 +1,45 @@
 """More than one machine: the blocks of a run as tasks of Dask distributed.
 
 Every Dask worker carries out one block at a time, with the supervisor that a run on one
-machine uses. Dask gives the blocks of a worker that is lost to another one; a result
-comes back once. The parent alone writes the result folder.
+machine uses, and gives back each measurement as soon as it is made, before it makes the
+next. What a worker that is lost has not given back is done by another one, as a block
+of its own. The parent alone writes the result folder.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
-from harness.block import Block, Commands, Engine, Opens, Result, Unbuilt
+from harness.block import (
+    Block,
+    Commands,
+    Engine,
+    Opens,
+    Outcome,
+    Result,
+    Unbuilt,
+    Unmade,
+)
 from harness.errors import InputError, some
 from harness.folder import differences
 from harness.recipe import Maker
 
+if TYPE_CHECKING:  # it needs the package distributed
+    from harness.node import Delivery
+
 LOCAL = "local"
 CONNECT_SECONDS = 10
-LOOK_SECONDS = 2.0  #: for workers that joined
+LOOK_SECONDS = 2.0  #: for workers that joined or were lost
+MOST_LOST = 4  #: workers that a block may cost
 
 Keep = Callable[[str, Mapping[str, Any]], None]
 
@@ -122,8 +139,43 @@ class Nodes:
             self._warn(f"{node} is another environment ({digest}): other {keys}")
 
 
+@dataclass(eq=False, kw_only=True)
+class _Task:
+    """A block, or what is left of one, with the Dask worker that it was given to."""
+
+    block: Block
+    part: int = 0  #: one more whenever a worker was lost after the first results
+    lost: int = 0  #: workers that it has cost
+    delivered: set[str] = field(default_factory=set)  #: run ids, of all parts
+    worker: str = ""  #: its address
+    future: Any = None
+    key: str = field(default_factory=lambda: f"mortarbench-{uuid4().hex}")  #: in Dask
+
+    def rest(self) -> _Task | None:
+        """Make the task of what was not delivered; None where nothing is left.
+
+        Of a sequence begun, all steps are left: what the solver carried is lost.
+        """
+        ids = [{record.run_id for record in turn} for turn in self.block.turns]
+        pairs = zip(self.block.turns, ids, strict=True)
+        turns = tuple(turn for turn, own in pairs if not own <= self.delivered)
+        if not turns:
+            return None
+        has_begun = any(own & self.delivered for own in ids)
+        return _Task(
+            block=replace(self.block, turns=turns),
+            part=self.part + has_begun,
+            lost=self.lost + 1,
+            delivered=self.delivered,
+        )
+
+
 class _Cluster:
-    """The engine: as many blocks under way as there are Dask workers."""
+    """The engine: every Dask worker has one block, and gives back each measurement.
+
+    Blocks are bound to their workers, so that what is left of a block whose worker was
+    lost is known here to be another block, measured elsewhere or later.
+    """
 
     def __init__(
         self,
@@ -138,67 +190,139 @@ class _Cluster:
         self._nodes = nodes
         self._address = address
         self._warn = warn
+        self._told: SimpleQueue[str] = SimpleQueue()  # keys that have something to give
+        self._under_way: dict[str, _Task] = {}
+        self._left: deque[_Task] = deque()
+        client.subscribe_topic(name, lambda event: self._told.put(event[1]))
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Result | Unbuilt]:
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
-        under_way: dict[Any, Block] = {}
         try:
-            more = self._top_up(under_way, blocks)
-            while under_way or more:
-                for future in self._finished(under_way):
-                    block = under_way.pop(future)
-                    yield from self._results(future, block, under_way)
-                more = more and self._top_up(under_way, blocks)
+            while self._top_up(blocks):
+                for task in self._with_news():
+                    yield from self._collected(task)
+                    if task.key in self._under_way and task.future.done():
+                        yield from self._ended(task)
+                yield from self._recovered()
         finally:
-            for future in under_way:
-                future.cancel()
+            for task in self._under_way.values():
+                task.future.cancel()
 
-    def _top_up(self, under_way: dict[Any, Block], blocks: Iterator[Block]) -> bool:
-        """Give every worker a block to do; False when there are no more."""
-        workers = len(self._client.nthreads())
-        if workers == 0 and not under_way:
-            self._warn(f"waiting for Dask workers to join {self._address}")
-            self._client.wait_for_workers(1)
-            workers = 1
-        while len(under_way) < workers:
-            block = next(blocks, None)
-            if block is None:
-                return False
-            under_way[self._submitted(block)] = block
-        return True
+    def _top_up(self, blocks: Iterator[Block]) -> bool:
+        """Give every idle worker a block to do; False when all blocks are done."""
+        idle = self._workers() - {task.worker for task in self._under_way.values()}
+        while True:
+            if not self._left and (block := next(blocks, None)) is not None:
+                self._left.append(_Task(block=block))
+            if not self._left or (not idle and self._under_way):
+                return bool(self._left or self._under_way)
+            if not idle:
+                self._warn(f"waiting for Dask workers to join {self._address}")
+                self._client.wait_for_workers(1)
+                idle = self._workers()
+            elif idle:
+                self._submit(self._left.popleft(), idle.pop())
 
-    def _submitted(self, block: Block) -> Any:
+    def _workers(self) -> set[str]:
+        """List the addresses of the workers that are there."""
+        try:
+            return set(self._client.nthreads())
+        except OSError as e:
+            raise _SchedulerGoneError from e
+
+    def _submit(self, task: _Task, worker: str) -> None:
         from harness.node import carry_out
 
-        return self._client.submit(carry_out, self._name, block, pure=False)
+        key = task.key
+        task.worker = worker
+        task.future = self._client.submit(
+            carry_out,
+            self._name,
+            key,
+            task.block,
+            key=key,
+            workers=[worker],
+            pure=False,
+        )
+        self._under_way[key] = task
+        task.future.add_done_callback(lambda _: self._told.put(key))
 
-    def _finished(self, under_way: Mapping[Any, Block]) -> list[Any]:
-        """Wait a moment for some to finish; see whether the scheduler is there."""
-        from distributed import wait
+    def _with_news(self) -> Iterator[_Task]:
+        """Wait a moment for something to come from a block; list those with news."""
+        with suppress(Empty):
+            keys = {self._told.get(timeout=LOOK_SECONDS): None}
+            while not self._told.empty():
+                keys[self._told.get()] = None
+            for key in keys:
+                if key in self._under_way:
+                    yield self._under_way[key]
+        if self._client.status != "running":
+            raise _SchedulerGoneError
 
-        try:
-            done = wait(list(under_way), LOOK_SECONDS, "FIRST_COMPLETED").done
-        except TimeoutError:
-            return []
-        return [future for future in under_way if future in done]
+    def _collected(self, task: _Task) -> Iterator[Outcome]:
+        """Fetch what a worker has measured; nothing if it cannot be reached."""
+        from harness.node import collect
 
-    def _results(
-        self, future: Any, block: Block, under_way: dict[Any, Block]
-    ) -> list[Result | Unbuilt]:
+        with suppress(OSError):  # it is lost, or about to be found so
+            found = self._client.run(
+                collect, self._name, task.key, workers=[task.worker], on_error="ignore"
+            )
+            yield from self._given(task, found.get(task.worker))
+
+    def _ended(self, task: _Task) -> Iterator[Outcome]:
+        """Take the last of a block; what it lacks is measured elsewhere."""
         from distributed import KilledWorker
 
-        if future.status in ("cancelled", "lost") and self._client.status == "running":
-            under_way[self._submitted(block)] = block
-            return []
-        try:
-            done = future.result()
-        except KilledWorker:
-            case = block.turns[0][0].case
-            reason = f"{case} was given up: every Dask worker that took it was lost"
-            return [Unbuilt(block=block, reason=reason)]
-        self._nodes.meet(done.node, done.digest, done.environment)
-        results: list[Result | Unbuilt] = done.results
-        return results
+        del self._under_way[task.key]
+        if task.future.status not in ("cancelled", "lost"):
+            with suppress(KilledWorker):
+                yield from self._given(task, task.future.result())
+        yield from self._again(task)
+
+    def _recovered(self) -> Iterator[Outcome]:
+        """Give the blocks of workers that were lost to others."""
+        there = self._workers()
+        for task in [t for t in self._under_way.values() if t.worker not in there]:
+            del self._under_way[task.key]
+            task.future.cancel()
+            yield from self._again(task)
+
+    def _again(self, task: _Task) -> Iterator[Outcome]:
+        """Have done what a block still lacks, unless it has cost too many workers."""
+        rest = task.rest()
+        if rest is None:
+            return
+        if rest.lost < MOST_LOST:
+            self._left.append(rest)
+            return
+        case = rest.block.turns[0][0].case
+        reason = f"{case} was given up: every Dask worker that took it was lost"
+        yield Unbuilt(block=rest.block, reason=reason)
+
+    def _given(self, task: _Task, delivery: Delivery | None) -> Iterator[Outcome]:
+        """Give back what is new of a delivery."""
+        if delivery is None:
+            return
+        self._nodes.meet(delivery.node, delivery.digest, delivery.environment)
+        for outcome in delivery.outcomes:
+            match outcome:
+                case Unbuilt():
+                    task.delivered |= {
+                        r.run_id for turn in task.block.turns for r in turn
+                    }
+                case Unmade(tried_again=True):
+                    pass
+                case Result() | Unmade():
+                    if outcome.record.run_id in task.delivered:
+                        continue
+                    task.delivered.add(outcome.record.run_id)
+            if isinstance(outcome, Result):
+                outcome = replace(outcome, part=task.part)
+            yield outcome
+
+
+class _SchedulerGoneError(Exception):
+    pass
 
 
 def _connected(address: str, stack: ExitStack) -> Any:
@@ -253,7 +377,8 @@ def _scheduler_there(client: Any, address: str) -> Iterator[None]:
     try:
         yield
     except Exception as e:
-        if isinstance(e, InputError) or client.status == "running":
+        is_gone = isinstance(e, _SchedulerGoneError) or client.status != "running"
+        if isinstance(e, InputError) or not is_gone:
             raise
         raise InputError(
             f"the Dask scheduler at {address} is gone; start one, and the same command "

@@ -15,14 +15,16 @@ from typing import Any
 from rich.console import Console
 
 from harness import show
-from harness.block import Opens, Unbuilt
+from harness.block import Opens, Unbuilt, Unmade
 from harness.capsule import block_of, open_capsule
 from harness.checked import positive
 from harness.cluster import on_cluster
 from harness.describe import in_a_line, solvers_page
 from harness.doctor import as_json, examine, load_advice, render
+from harness.durable import full_disk_told
 from harness.environment import capture, digest
-from harness.errors import InputError, some, unknown
+from harness.errors import FaultError, InputError, some, unknown
+from harness.faults import in_words
 from harness.folder import keep_environment
 from harness.journal import read_journal
 from harness.judge import plain
@@ -105,7 +107,7 @@ def run(workbench: Workbench, options: Namespace) -> int:
     if load_advice(load := environment["now"]["load"]):
         say(f"other programs keep {load:.1f} cores busy; times will be less certain")
     with shown_on(sys.stderr) as progress:
-        unbuilt_cases = run_suite(
+        missing = run_suite(
             suite,
             families=workbench.families,
             out=out,
@@ -121,13 +123,16 @@ def run(workbench: Workbench, options: Namespace) -> int:
         )
     records = read_journal(out)
     print(show.summary(records, [s.label for s in suite.solvers]))
-    if unbuilt_cases:
-        cases = "case" if len(unbuilt_cases) == 1 else "cases"
-        print(f"{len(unbuilt_cases)} {cases} could not be built: {some(unbuilt_cases)}")
-    written = workbench.report(out, FORMATS) if records else []
+    if count := len(missing.unbuilt):
+        cases = "case" if count == 1 else "cases"
+        print(f"{count} {cases} could not be built: {some(missing.unbuilt)}")
+    if missing.faults:
+        print(f"{in_words(missing.faults)}; the same command tries again")
+    with full_disk_told(out):
+        written = workbench.report(out, FORMATS) if records else []
     for page in (file for file in written if file.suffix == ".html"):
         print(page)
-    return 1 if unbuilt_cases else 0
+    return 1 if missing.unbuilt or missing.faults else 0
 
 
 def _cluster(
@@ -155,12 +160,14 @@ def report(workbench: Workbench, options: Namespace) -> int:
             raise unknown("format", form, FORMATS, where="--format")
     factor = positive("--factor", options.factor)
     if options.other is None:
-        for file in workbench.report(options.folder, formats, factor=factor):
-            print(file)
+        with full_disk_told(options.folder):
+            written = workbench.report(options.folder, formats, factor=factor)
+        print(*written, sep="\n")
         return 0
-    said, written = workbench.compare(
-        options.folder, options.other, formats, factor=factor
-    )
+    with full_disk_told(options.other):
+        said, written = workbench.compare(
+            options.folder, options.other, formats, factor=factor
+        )
     pages = [file for file in written if file.suffix == ".html"]
     print(*said, *(pages or written), sep="\n")
     return 0
@@ -174,7 +181,9 @@ def paper(workbench: Workbench, options: Namespace) -> int:
         raise InputError(
             f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
         ) from None
-    for file in workbench.paper(options.out, options.quick, say):
+    with full_disk_told(options.out):
+        written = workbench.paper(options.out, options.quick, say)
+    for file in written:
         if file.suffix == ".html":
             print(file)
     return 0
@@ -212,6 +221,8 @@ def replay(workbench: Workbench, options: Namespace) -> int:
             *_, result = carry_out(iter([block]))
     if isinstance(result, Unbuilt):
         raise InputError(f"{capsule.record.run_id}: {result.reason}")
+    if isinstance(result, Unmade):
+        raise FaultError(f"{capsule.record.run_id}: {result.reason}")
     comparison = compared(options.folder, capsule, result, environment)
     if options.json:
         print(json.dumps(comparison.to_dict()))

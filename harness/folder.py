@@ -9,22 +9,26 @@ import re
 import shutil
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from harness.durable import full_disk_told, remove_unfinished, replace_file
 from harness.environment import VOLATILE
 from harness.errors import InputError, shortened, some
+from harness.faults import FAULTS
 from harness.suite import Suite
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-_VERDICT = "validation.json"  #: of `mortarbench validate`
+_CONCLUDED = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+_LOCK = ".lock"
+_MARK = b"held by runs of mortarbench\n"  #: what is in it
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
 #: how the names of files begin that are written beside the folders
-_BESIDE = (".lock", "environment.", "suite.", "validation.", "discretisation.")
+_BESIDE = (_LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.")
 
 
 def refuse_links(folder: Path) -> None:
@@ -85,7 +89,10 @@ def refuse_foreign(folder: Path) -> None:
         return
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
-    ours = (*_FOLDERS, *_FILES, _VERDICT)
+    with suppress(OSError):
+        if (folder / _LOCK).read_bytes() == _MARK:  # of a run that was cut off at once
+            return
+    ours = (*_FOLDERS, *_FILES, *_CONCLUDED)
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
@@ -94,9 +101,64 @@ def refuse_foreign(folder: Path) -> None:
         )
 
 
+class Held:
+    """A result folder that this process holds against every other run.
+
+    Raises
+    ------
+    InputError
+        When another run holds it.
+    OSError
+        When it cannot be made or written.
+
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._take()
+
+    def is_there(self) -> bool:
+        """Whether it is still the folder that we took; if not, it was deleted.
+
+        A lock that was deleted is taken anew, and so is a folder.
+
+        Raises
+        ------
+        InputError
+            When the folder was moved away, or another run took it meanwhile.
+
+        """
+        there = _leads_to(self._folder, self._there)
+        if not there:
+            now = os.readlink(f"/proc/self/fd/{self._there}")
+            if not now.endswith(" (deleted)"):
+                raise InputError(
+                    f"{self._folder} was moved to {now} while the run wrote to it; all "
+                    "that was measured is there, and --out with that path continues"
+                )
+        if not (there and _leads_to(self._folder / _LOCK, self._lock)):
+            self.close()
+            self._take()
+        return there
+
+    def _take(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._lock = _locked(self._folder)
+        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+        self._there = os.open(self._folder, flags)
+
+    def close(self) -> None:
+        """Let others have it."""
+        for name in ("_lock", "_there"):
+            if (fd := vars(self).pop(name, None)) is not None:
+                os.close(fd)  # which unlocks
+
+
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[Held]:
     """Keep every other run off a result folder, which is made if need be.
+
+    What writers that were killed left unfinished there is deleted.
 
     Raises
     ------
@@ -105,22 +167,50 @@ def locked(folder: Path) -> Iterator[None]:
 
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        fd = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        with full_disk_told(folder):
+            held = Held(folder)
     except OSError as e:
         raise InputError(
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
+        remove_unfinished(folder, [folder / name for name in _FOLDERS])
+        yield held
+    finally:
+        held.close()
+
+
+def _locked(folder: Path) -> int:
+    """Open the lock of a folder and lock it, until the file descriptor is closed.
+
+    The file tells, too, that one of our runs began here: one that was killed at once
+    left nothing else by which it could be known.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    while True:
+        fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _leads_to(folder / _LOCK, fd):  # else it was deleted before we locked it
+                os.pwrite(fd, _MARK, 0)
+                return fd
         except BlockingIOError:
+            os.close(fd)
             raise InputError(
                 f"{folder} is being written by another run; wait, or choose another"
             ) from None
-        yield
-    finally:
-        os.close(fd)  # which unlocks
+        except BaseException:
+            os.close(fd)
+            raise
+        os.close(fd)
+
+
+def _leads_to(path: Path, fd: int) -> bool:
+    """Whether a path is that of an open file or folder."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(fd))
+    except FileNotFoundError:
+        return False
 
 
 @contextmanager
@@ -155,8 +245,21 @@ def claim(
     if fresh:
         for name in _FOLDERS:
             shutil.rmtree(out / name, ignore_errors=True)
-        for name in (*_FILES, _VERDICT):
+        for name in _CONCLUDED:
             (out / name).unlink(missing_ok=True)
+    else:
+        _check_same(out, suite, environment)
+    describe(out, suite, environment)
+
+
+def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
+    """Write down what is measured, and where; `environment` as for `claim`."""
+    replace_file(out / "suite.toml", suite.text.encode())
+    text = json.dumps(environment, indent=1) + "\n"
+    replace_file(out / "environment.json", text.encode())
+
+
+def _check_same(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
     remedy = "choose another --out or use --fresh"
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
     if suite_file.exists() and _toml(suite_file) != tomllib.loads(suite.text):
@@ -172,8 +275,6 @@ def claim(
                 f"{out} was measured in another environment ({then['digest']}, now "
                 f"{environment['digest']}{keys and f': {keys} changed'}); {remedy}"
             )
-    _replace_text(suite_file, suite.text)
-    _replace_text(environment_file, json.dumps(environment, indent=1) + "\n")
 
 
 def suite_text(folder: Path) -> str:
@@ -212,10 +313,8 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
     """Store what one machine of a cluster is, under its digest."""
-    path = _node_file(folder, digest)
-    path.parent.mkdir(exist_ok=True)
-    text = json.dumps({"digest": digest, **environment}, indent=1)
-    _replace_text(path, text + "\n")
+    text = json.dumps({"digest": digest, **environment}, indent=1) + "\n"
+    replace_file(_node_file(folder, digest), text.encode())
 
 
 def _node_file(folder: Path, digest: str) -> Path:
@@ -255,10 +354,3 @@ def _environment(path: Path) -> dict[str, Any]:
             "wrote; restore it, or run with --fresh"
         ) from None
     return environment
-
-
-def _replace_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(text, "utf-8")
-    os.replace(temporary, path)

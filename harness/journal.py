@@ -7,13 +7,14 @@ it off.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from json import JSONDecodeError
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from harness.durable import Lines
 from harness.errors import InputError
 from harness.folder import refuse_links
 from harness.record import Record
@@ -23,22 +24,39 @@ class Journal:
     """The writer's end of one file ``FOLDER/journal/NAME.jsonl``.
 
     Hold `harness.folder.locked` while one is open: a second writer could cut off a line
-    that this one is writing.
+    that this one is writing. Whatever files there are beside it are held open, too, so
+    that a journal that is deleted meanwhile can be written again.
+
+    restored : told in a line when that was necessary
     """
 
-    def __init__(self, folder: Path, name: str) -> None:
-        path = folder / "journal" / f"{name}.jsonl"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._fd = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
-        whole = _whole_lines(path.read_bytes())
-        os.truncate(self._fd, len(whole))
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        restored: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        own = folder / "journal" / f"{name}.jsonl"
+        others = sorted({*own.parent.glob("*.jsonl")} - {own})
+        self._files = ExitStack()
+        self._own, *self._others = (
+            self._files.enter_context(Lines(path, restored)) for path in (own, *others)
+        )
 
     def append(self, record: Record) -> None:
-        """Write one line and return when it is on the disk."""
-        line = memoryview((record.to_json() + "\n").encode())
-        while line:  # a write to a full disk may be short
-            line = line[os.write(self._fd, line) :]
-        os.fsync(self._fd)
+        """Write one line and return when it is on the disk, or raise and write none.
+
+        Raises
+        ------
+        InputError
+            When another program writes to the journal.
+        OSError
+            When the disk is full, say.
+
+        """
+        for file in self._others:
+            file.restore()
+        self._own.append(record.to_json())
 
     def __enter__(self) -> Self:
         return self
@@ -49,7 +67,7 @@ class Journal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        os.close(self._fd)
+        self._files.close()
 
 
 def read_journal(folder: Path) -> list[Record]:

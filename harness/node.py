@@ -11,18 +11,18 @@ import os
 import platform
 import stat
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from threading import Lock
+from threading import Event, Lock
 from typing import Any, cast
 
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
-from harness.block import Block, Commands, Result, Unbuilt
+from harness.block import Block, Commands, Outcome
 from harness.environment import capture_in, digest
 from harness.errors import InputError
 from harness.recipe import Maker
@@ -30,12 +30,14 @@ from harness.registry import load_plugin, merged
 from harness.station import Station
 from harness.supervisor import ONE_THREAD
 
+COLLECT_SECONDS = 10.0  #: that a worker waits for its parent to fetch a result
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Done:
-    """What came of a block, and where."""
+class Delivery:
+    """What came of a block since the last delivery, and where."""
 
-    results: list[Result | Unbuilt]
+    outcomes: list[Outcome]
     node: str  #: host name
     digest: str  #: of the environment
     environment: dict[str, Any]
@@ -72,6 +74,9 @@ class Node(WorkerPlugin):
         The kernel kills solver processes with the thread that started them.
         """
         self._busy = Lock()
+        self._outcomes: list[Outcome] = []  # of the block `_key`, not yet fetched
+        self._key = ""
+        self._fetched = Event()
 
     def teardown(self, worker: Worker | None = None) -> None:
         """End the processes of the station, at the latest when a measurement is made.
@@ -79,6 +84,7 @@ class Node(WorkerPlugin):
         Dask cannot stop a block that is being carried out; its thread comes here last.
         """
         self._ended = True
+        self._fetched.set()
         if not self._busy.acquire(blocking=False):
             return
         if self._open is not None:
@@ -86,8 +92,14 @@ class Node(WorkerPlugin):
             self._open = None
         self._busy.release()
 
-    def carry_out(self, block: Block) -> Done:
+    def carry_out(self, key: str, block: Block, tell: Callable[[], None]) -> Delivery:
         """Measure a block, or what can be measured of it before the run ends.
+
+        Returns what was not fetched meanwhile. After each measurement it waits a while
+        for that, so that the next one is not disturbed by it.
+
+        key : of the block, for `collect`
+        tell : called when there is something to fetch
 
         Raises
         ------
@@ -97,33 +109,57 @@ class Node(WorkerPlugin):
         """
         try:
             with self._busy:
-                return self._carried_out(block)
+                return self._carried_out(key, block, tell)
+        except InputError as e:
+            raise InputError(f"{platform.node()}: {e}") from None
         finally:
             if self._ended:
                 self.teardown()
 
-    def _carried_out(self, block: Block) -> Done:
+    def collect(self, key: str) -> Delivery | None:
+        """Give away what a block has come to since the last time; runs in Dask's loop.
+
+        None where that block is not the one under way.
+        """
+        if key != self._key or self._open is None:
+            return None
+        outcomes = []
+        while self._outcomes:  # `_carried_out` may add one meanwhile
+            outcomes.append(self._outcomes.pop(0))
+        self._fetched.set()
+        return Delivery(
+            outcomes=outcomes,
+            node=platform.node(),
+            digest=self._open.digest,
+            environment=self._open.environment,
+        )
+
+    def _carried_out(
+        self, key: str, block: Block, tell: Callable[[], None]
+    ) -> Delivery:
         opened = self._open = self._open or self._opened()
         os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
-        results = []
-        for result in opened.station.carry_out(replace(block, turns=turns)):
-            results.append(result)
+        self._key, self._outcomes = key, []
+        is_fetched = True
+        for outcome in opened.station.carry_out(replace(block, turns=turns)):
+            self._fetched.clear()
+            self._outcomes.append(outcome)
+            tell()
+            if is_fetched:  # else nobody is there any longer
+                is_fetched = self._fetched.wait(COLLECT_SECONDS)
             if self._ended:
                 break
-        return Done(
-            results=results,
-            node=platform.node(),
-            digest=opened.digest,
-            environment=opened.environment,
-        )
+        delivery = self.collect(key)
+        assert delivery is not None
+        return delivery
 
     def _opened(self) -> _Open:
         for path in self._plugins:
             if not path.is_file():
                 raise InputError(
-                    f"{platform.node()}: no plug-in {path}; "
+                    f"no plug-in {path}; "
                     "expected the same files under the same paths on every node"
                 )
         environment = capture_in(ONE_THREAD, self._plugins)
@@ -159,8 +195,10 @@ class Node(WorkerPlugin):
         )
 
 
-def carry_out(name: str, block: Block) -> Done:
+def carry_out(name: str, key: str, block: Block) -> Delivery:
     """Have the node plug-in of that name measure a block; runs in a Dask worker.
+
+    Whenever there is something to `collect`, it says so under the topic `name`.
 
     Raises
     ------
@@ -175,7 +213,14 @@ def carry_out(name: str, block: Block) -> Done:
             f"{worker.state.nthreads} blocks at a time, so that they would disturb "
             "each other; start it with --nthreads 1"
         )
-    return cast(Node, worker.plugins[name]).carry_out(block)
+    node = cast(Node, worker.plugins[name])
+    return node.carry_out(key, block, lambda: worker.log_event(name, key))
+
+
+def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
+    """Fetch what that block has come to since the last time; runs in Dask's loop."""
+    node = cast(Node | None, dask_worker.plugins.get(name))
+    return None if node is None else node.collect(key)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -209,8 +254,8 @@ def own_cpu(stack: ExitStack) -> int:
             stack.callback(os.close, fd)
             return cpu
     raise InputError(
-        f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
-        "measure there already; start fewer"
+        f"it has {len(usable)} usable CPUs, and as many Dask workers measure there "
+        "already; start fewer"
     )
 
 

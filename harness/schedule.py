@@ -43,6 +43,7 @@ class Schedule:
     _declined: set[tuple[str, Cell]] = field(default_factory=set)
     _done: set[str] = field(default_factory=set)  #: run ids
     _next: int = 0  #: number of a new block
+    _parts: dict[tuple[int, int], int] = field(default_factory=dict)  # their numbers
 
     @property
     def cells(self) -> int:
@@ -63,6 +64,17 @@ class Schedule:
         """Whether nothing is left to be learnt from measuring that."""
         declined = (record.solver, _cell(record)) in self._declined
         return declined or record.run_id in self._done
+
+    def made(self, run_id: str) -> bool:
+        """Whether that measurement is in the journal."""
+        return run_id in self._done
+
+    def number_of_part(self, block: int, part: int) -> int:
+        """Give what was measured later or elsewhere of a block a number of its own."""
+        if (block, part) not in self._parts:
+            self._parts[block, part] = self._next
+            self._next += 1
+        return self._parts[block, part]
 
     def give_up(self, block: Block) -> bool:
         """Leave out the cases of a block that cannot be built; False if known."""

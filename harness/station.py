@@ -9,8 +9,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from harness.block import Block, Commands, Result, Unbuilt
+from harness.block import Block, Commands, Outcome, Result, Unbuilt, Unmade
 from harness.cases import Entry, entry
+from harness.durable import full_disk_told, refuse_full_disk
+from harness.errors import FaultError
 from harness.judge import has_point, noted
 from harness.measure import SAMPLE_SECONDS
 from harness.names import CaseName
@@ -45,7 +47,8 @@ class Station:
         self._operators = operators
         self._generator = WorkerProcess(commands.generator, scratch / "generator.log")
         self._workers: dict[str, WorkerProcess] = {}
-        self._loaded: dict[str, QP] = {}  # by digest, those of the last block
+        self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
+        self._loaded: dict[str, QP] = {}  # theirs, by digest
 
     def __enter__(self) -> Self:
         return self
@@ -59,25 +62,60 @@ class Station:
         for process in (*self._workers.values(), self._generator):
             process.close()
 
-    def carry_out(self, block: Block) -> Iterator[Result | Unbuilt]:
-        """Measure a block; each result comes as soon as it is there."""
-        entries = []
-        for name in block.cases:
+    def carry_out(self, block: Block) -> Iterator[Outcome]:
+        """Measure a block; each result comes as soon as it is there.
+
+        Raises
+        ------
+        InputError
+            When the disk is full.
+
+        """
+        with full_disk_told(self._scratch):
             try:
-                entries.append(self._entry(name, block))
+                self._entries = ()
+                for turn in block.turns:
+                    yield from self._turn(block, turn)
             except _UnbuiltError as e:
                 yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
-                return
-        self._loaded = {e.digest: self._qp(e) for e in entries}
-        for turn in block.turns:
-            yield from self._turn(block, turn, entries)
 
-    def _turn(
-        self, block: Block, turn: tuple[Record, ...], entries: list[Entry]
-    ) -> Iterator[Result]:
+    def _turn(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Outcome]:
+        """Measure one solver; after a fault that is not its own, once more.
+
+        Of a sequence all steps are driven again, since what the solver carried is lost;
+        none is given back twice.
+        """
+        made: set[str] = set()
+        for tried_again in (True, False):
+            try:
+                for result in self._results(block, turn):
+                    if result.record.run_id not in made:
+                        made.add(result.record.run_id)
+                        yield result
+                return
+            except (FaultError, OSError) as e:
+                reason = _in_a_line(e)
+                refuse_full_disk(self._scratch, reason)
+            self._start_anew(turn[0].solver)
+            missing = [record for record in turn if record.run_id not in made]
+            for record in missing[: 1 if tried_again else None]:
+                yield Unmade(record=record, reason=reason, tried_again=tried_again)
+
+    def _results(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Result]:
+        """Measure one solver once on each case.
+
+        Raises
+        ------
+        FaultError, OSError
+            When something else than the solver failed.
+
+        """
+        if not self._entries:
+            self._entries = tuple(self._entry(name, block) for name in block.cases)
+            self._loaded = {e.digest: self._qp(e) for e in self._entries}
         worker = self._worker(turn[0].solver)
         for step, (name, record, at) in enumerate(
-            zip(block.cases, turn, entries, strict=True)
+            zip(block.cases, turn, self._entries, strict=True)
         ):
             request = {
                 "qp": str(at.qp),
@@ -98,6 +136,8 @@ class Station:
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
             )
+            if record.status in (Verdict.CRASHED, Verdict.FAILED):
+                refuse_full_disk(self._scratch, "")  # whatever it died of
             yield self._described(block, name, record, solution)
             stopped = record.status is not Verdict.DECLINED and (
                 solution is None or not has_point(solution)
@@ -154,9 +194,13 @@ class Station:
             if reply.answer is not None:
                 break
         else:
+            refuse_full_disk(self._scratch, reply.message)
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
+        if "fault" in reply.answer:
+            raise FaultError(reply.answer["fault"])
         if "unbuilt" in reply.answer:
+            refuse_full_disk(self._scratch, reply.answer["unbuilt"])
             raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
         return reply.answer
 
@@ -165,6 +209,12 @@ class Station:
             log = self._scratch / f"worker-{len(self._workers)}.log"
             self._workers[label] = WorkerProcess(self._commands.solvers[label], log)
         return self._workers[label]
+
+    def _start_anew(self, label: str) -> None:
+        """Have files that may be lost made again, and a worker started."""
+        self._entries = ()
+        self._scratch.mkdir(parents=True, exist_ok=True)
+        self._worker(label).close()
 
     def _qp(self, at: Entry) -> QP:
         if at.digest not in self._loaded:
@@ -198,7 +248,7 @@ class OneByOne:
     def __init__(self, station: Station) -> None:
         self._station = station
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Result | Unbuilt]:
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
         for block in blocks:
             yield from self._station.carry_out(block)
@@ -209,6 +259,11 @@ def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
         yield Result(record=record.but(status=end.status, message=reason))
+
+
+def _in_a_line(e: Exception) -> str:
+    text = " ".join(str(e).split())
+    return text if isinstance(e, FaultError) else f"{type(e).__name__}: {text}"
 
 
 class _UnbuiltError(Exception):

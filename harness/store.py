@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness import npz
+from harness.durable import replace_file
 from harness.errors import InputError, shortened
 from harness.history import History, checked
 from harness.plugin import Fields
@@ -226,12 +226,9 @@ def save(folder: Path, arrays: Arrays) -> str:
     path = _path(folder, digest)
     if path.exists():
         return digest
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
-        file.flush()
-        os.fsync(file.fileno())  # before the journal line that will refer to it
-    os.replace(file.name, path)
+    archive = BytesIO()
+    np.savez(archive, **arrays)  # type: ignore[arg-type]
+    replace_file(path, archive.getbuffer())  # before the line that will refer to it
     return digest
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -24,6 +25,7 @@ pytest.importorskip("distributed")
 
 WELLS = Path(__file__).with_name("wells.py")
 PLUGIN = load_plugin(WELLS)
+SOLVERS = 4  #: measurements of a whole block
 SUITE = """
 name = "wells"
 repeats = {repeats}
@@ -121,6 +123,14 @@ def measured(folder):
     return found
 
 
+def halved(folder):
+    """The numbers of blocks of which some measurements are in a journal, not all."""
+    with suppress(InputError):
+        counts = Counter(r.block for r in read_journal(Path(folder)))
+        return [number for number, count in counts.items() if count < SOLVERS]
+    return []
+
+
 def parent(process):
     """The parent of a process; None when it has ended."""
     with suppress(OSError):
@@ -173,8 +183,39 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     (there,) = {r.environment for r in records}
     stored = environment_of(tmp_path / "both", there)
     assert stored.pop("digest") == digest(stored) == there
-    for number in {r.block for r in records}:  # blocks stay whole
+    for number in {r.block for r in records}:  # blocks are of one case
         assert len({r.case for r in records if r.block == number}) == 1
+
+
+def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
+    cli, cluster, tmp_path
+):
+    victim = cluster.join()
+    cut = []
+
+    def kill():
+        wait_for(lambda: cut or cut.extend(halved("d")))
+        victim.kill()  # what it had given back of that block is in the journal
+        cluster.join()
+
+    with meanwhile(kill):
+        code, _, err = cli("run", "wells.toml", "--out", "d", "--dask", cluster.address)
+    records = read_journal(tmp_path / "d")
+    blocks = {}
+    for r in records:
+        blocks.setdefault(r.block, []).append(r)
+    (number,) = cut
+
+    assert code == 0, err
+    assert len(measured("d")) == 6 * SOLVERS
+    assert len(blocks) == 6 + 1
+    (rest,) = [
+        n for n, block in blocks.items() if n != number
+        and block[0].case == blocks[number][0].case
+    ]  # fmt: skip
+    both = blocks[number] + blocks[rest]
+    assert sorted(r.solver for r in both) == ["dies", "exact", "picky", "slow"]
+    assert 0 < len(blocks[number]) < SOLVERS
 
 
 def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
@@ -208,7 +249,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
     cluster.join()
 
     def kill():
-        wait_for(lambda: len(cluster.started_solvers()) >= 2)
+        wait_for(lambda: halved("d"))  # a worker is in the middle of a block
         cluster.scheduler.kill()
 
     with meanwhile(kill):
@@ -262,7 +303,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     )
     command = [sys.executable, "-c", program, str(WELLS.parent), "run", "wells.toml"]
     run = subprocess.Popen([*command, "--out", "d", "--dask", cluster.address])
-    wait_for(lambda: len(cluster.started_solvers()) >= 3)
+    wait_for(lambda: halved("d"))  # the worker is in the middle of a block
     run.kill()
     run.wait()
     before = measured("d")

@@ -89,7 +89,7 @@ def measure(tmp_path):
         environment=None,
     ):
         tally = Tally(interrupt_after)
-        tally.unbuilt = run(
+        missing = run(
             suite,
             families=FAMILIES,
             out=out,
@@ -103,6 +103,7 @@ def measure(tmp_path):
             progress=tally,
             fresh=fresh,
         )
+        tally.unbuilt, tally.faults = missing.unbuilt, missing.faults
         return tally
 
     return measure
