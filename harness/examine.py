@@ -8,12 +8,11 @@ from argparse import Namespace
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from harness import show
 from harness.conformance import CHECKS, FINDS, KEEPS, Grade, Result
 from harness.registry import SolverSpec, resolve
+from harness.remote import scratch_folder
 from harness.supervisor import WorkerProcess
 from harness.weaknesses import weaknesses_page
 from harness.workbench import Workbench
@@ -81,7 +80,7 @@ def examined(
     command : starts the worker; two file descriptors are appended to it
     """
     with ExitStack() as stack:
-        scratch = Path(stack.enter_context(TemporaryDirectory(prefix="mortarbench-")))
+        scratch = stack.enter_context(scratch_folder())
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
         for name in checks:

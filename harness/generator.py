@@ -18,7 +18,7 @@ case that is on file is built again when a point of it comes.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -30,7 +30,7 @@ from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference
 from harness.qpfile import save_qp
 from harness.record import finite
-from harness.serving import answer_requests
+from harness.serving import Events, answer_requests
 from harness.solution import Status
 from harness.store import field_arrays, read_point, write_arrays
 
@@ -89,8 +89,8 @@ class Generator:
 def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
     """Answer requests until there are no more."""
 
-    def handle(request: dict[str, Any], start: Callable[[], None]) -> dict[str, Any]:
-        start()
+    def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:
+        events.start()
         return generator.answer(request)
 
     answer_requests(handle, lambda: None, request_fd, reply_fd)

@@ -5,21 +5,28 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
+from scipy.sparse import issparse
 
 from harness.history import usable
 from harness.plugin import Solver
-from harness.qp import QP
+from harness.qp import QP, Matrix, Vector
 from harness.recipe import Recipe
 from harness.solution import Solution, Status
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
 MOST_INNER = 100
+LARGEST_COUNT = 2**53
+LONGEST_MESSAGE = 1900  #: characters
+
+_VECTORS = ("x", "y", "z", "z_box")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -33,6 +40,7 @@ class Measurement:
     prepare_peak_mib: float | None = None  #: largest resident memory while it ran
     solve_peak_mib: float | None = None
     inner: int = 1  #: times that it was prepared and solved; seconds are the mean
+    first_seconds: float | None = None  #: of the first time, where there were others
 
     @property
     def peak_mib(self) -> float | None:
@@ -51,8 +59,10 @@ def measure(
     *,
     prepare: Prepare | None = None,
     sample_seconds: float = 0.0,
+    starts: Callable[[], None] = lambda: None,
+    ends: Callable[[], None] = lambda: None,
 ) -> Measurement:
-    """Let `solver` prepare and solve `qp`, both timed.
+    """Let `solver` prepare and solve `qp`, both timed; asking it first is preparing.
 
     Nothing that the solver does wrong raises: an exception, a missing library or a
     malformed answer becomes the status and message of a solution without a point.
@@ -60,26 +70,32 @@ def measure(
     prepare : where that is a step of a sequence, see `harness.plugin.Chained`
     sample_seconds : what takes less is prepared afresh and solved again until all that
         takes as long; the answer is the first, the times are the mean of the others,
-        since the first meets cold caches
+        since the first meets cold caches. Each time the QP is made of other objects,
+        so that nothing is found again by who it is
+    starts, ends : called just before the clock starts, and when it has stopped
     """
+    ask = _Asked(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
+        starts()
         try:  # only the solver's own code: a bug of ours must not pass for its failure
-            if (reason := solver.declines(qp)) is not None:
-                return _without_point(qp, Status.DECLINED, reason)
-            begin = prepare or (lambda qp: solver.prepare(qp, tol))
-            answer, seconds, peaks = _timed(begin, qp)
-            inner = _inner(sum(seconds), sample_seconds)
+            answer, seconds, peaks = _timed(ask, qp)
+            first = sum(seconds)
+            inner = _inner(first, sample_seconds)
             if inner > 1:
-                again = [_timed(begin, qp, peaks=False)[1] for _ in range(inner)]
+                again = [_timed(ask, _anew(qp), peaks=False)[1] for _ in range(inner)]
                 seconds = tuple(
                     sum(phase) / inner for phase in zip(*again, strict=True)
                 )
+        except _DeclinedError as e:
+            return _without_point(qp, Status.DECLINED, str(e))
         except ImportError as e:
             name = e.name or str(e)
             message = f"not installed: {name} (pip install {name.partition('.')[0]})"
             return _without_point(qp, Status.DECLINED, message)
         except (Exception, SystemExit) as e:
-            return _without_point(qp, Status.FAILED, f"{type(e).__name__}: {e}")
+            return _without_point(qp, Status.FAILED, f"{type(e).__name__}: {_said(e)}")
+        finally:
+            ends()
     return Measurement(
         solution=_checked(answer, qp),
         prepare_seconds=seconds[0],
@@ -88,7 +104,27 @@ def measure(
         prepare_peak_mib=peaks[0],
         solve_peak_mib=peaks[1],
         inner=inner,
+        first_seconds=first if inner > 1 else None,
     )
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What of a solver is timed as preparing: whether it takes a QP, and `prepare`."""
+
+    solver: Solver
+    prepare: Prepare
+
+    def __call__(self, qp: QP) -> Callable[[], Solution]:
+        if (reason := self.solver.declines(qp)) is not None:
+            raise _DeclinedError(reason)
+        if isinstance(qp.P, Recipe):
+            qp.P.build()
+        return self.prepare(qp)
+
+
+class _DeclinedError(Exception):
+    """A solver does not take a QP; the message is its reason."""
 
 
 def _timed(
@@ -97,8 +133,6 @@ def _timed(
     """Prepare and solve once: the answer, and both phases' seconds and peaks in MiB."""
     reset = peaks and _reset_peak()
     start = perf_counter()
-    if isinstance(qp.P, Recipe):
-        qp.P.build()
     solve = prepare(qp)
     ready = perf_counter()
     prepare_peak = memory_mib("VmHWM") if reset else None
@@ -110,6 +144,23 @@ def _timed(
     if isinstance(qp.P, Recipe):
         qp.P.forget()
     return answer, (ready - start, end - again), (prepare_peak, solve_peak)
+
+
+def _anew(qp: QP) -> QP:
+    """Give the same QP as objects of its own; the numbers are shared."""
+
+    def other(M: Matrix) -> Matrix:
+        if isinstance(M, np.ndarray):
+            return M.view()
+        if issparse(M) and hasattr(M, "indptr"):
+            M = copy(M)
+            M.data, M.indices, M.indptr = (
+                M.data.view(), M.indices.view(), M.indptr.view(),
+            )  # fmt: skip
+        return M
+
+    parts = ("P", "q", "A", "b", "G", "h", "lb", "ub")
+    return replace(qp, **{name: other(getattr(qp, name)) for name in parts})
 
 
 def _inner(seconds: float, sample_seconds: float) -> int:
@@ -142,8 +193,22 @@ def _reset_peak() -> bool:
 
 
 def _without_point(qp: QP, status: Status, message: str) -> Measurement:
-    one_line = " ".join(str(message).split())
-    return Measurement(solution=Solution.without_point(qp, status, one_line))
+    return Measurement(solution=Solution.without_point(qp, status, one_line(message)))
+
+
+def one_line(message: object) -> str:
+    """Give what a solver says as one line that any file can hold."""
+    whole = " ".join(str(message).split())
+    text = whole.encode(errors="backslashreplace").decode()
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}…"
+
+
+def _said(e: BaseException) -> str:
+    """Show an exception of a solver, whose own code may fail again at that."""
+    try:
+        return str(e)
+    except Exception:
+        return "(it cannot be shown)"
 
 
 def _checked(answer: object, qp: QP) -> Solution:
@@ -151,34 +216,49 @@ def _checked(answer: object, qp: QP) -> Solution:
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)
-    try:
+    try:  # reading the solver's objects runs its code
         if (mismatch := answer.mismatch(qp)) is not None:
             return Solution.without_point(qp, Status.FAILED, mismatch)
         return _plain(answer)
-    except (TypeError, ValueError, AttributeError) as e:
-        message = f"malformed Solution: {e}"
+    except Exception as e:
+        message = one_line(f"malformed Solution: {_said(e)}")
         return Solution.without_point(qp, Status.FAILED, message)
 
 
 def _plain(s: Solution) -> Solution:
     """Replace whatever compares or prints like the right type by the right type."""
     history, objection = usable(s.history)
-    message = "; ".join(filter(None, [str(s.message), objection]))
+    vectors = {name: _numbers(name, getattr(s, name)) for name in _VECTORS}
+    iterations = None if s.iterations is None else _count("iterations", s.iterations)
     return replace(
         s,
         status=Status(s.status),
-        x=np.asarray(s.x, dtype=float),
-        y=np.asarray(s.y, dtype=float),
-        z=np.asarray(s.z, dtype=float),
-        z_box=np.asarray(s.z_box, dtype=float),
-        iterations=None if s.iterations is None else int(s.iterations),
-        counts={str(name): int(count) for name, count in s.counts.items()},
-        message=" ".join(message.split()),
+        **vectors,
+        iterations=iterations,
+        counts={str(k): _count(f"counts[{k!r}]", n) for k, n in s.counts.items()},
+        message=one_line("; ".join(filter(None, [str(s.message), objection]))),
         history=history,
         reported={
-            str(k): v if isinstance(v, str) else float(v) for k, v in s.reported.items()
+            str(k): one_line(v) if isinstance(v, str) else float(v)
+            for k, v in s.reported.items()
         },
     )
+
+
+def _numbers(name: str, values: object) -> Vector:
+    """Take a vector of real numbers for what it is; nothing is made one."""
+    array = np.asarray(values)
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")
+    return np.asarray(array, dtype=float)
+
+
+def _count(name: str, value: Any) -> int:
+    count = int(value)
+    if not 0 <= count <= LARGEST_COUNT:
+        got = count if abs(count) < 10 * LARGEST_COUNT else "a number far out of range"
+        raise ValueError(f"{name} = {got}, expected 0 to 2**53")
+    return count
 
 
 @contextmanager

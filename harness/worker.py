@@ -39,9 +39,9 @@ from harness.qp import QP, Vector, no_rows
 from harness.qpfile import load_qp
 from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
-from harness.serving import answer_requests
+from harness.serving import Events, answer_requests
 from harness.solution import Solution
-from harness.store import write_point
+from harness.store import point_arrays
 
 _MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
@@ -90,31 +90,31 @@ class _Bench:
         gc.freeze()  # the modules that are loaded by now need no further collecting
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
 
-    def answer(
-        self, request: dict[str, Any], start: Callable[[], None]
-    ) -> dict[str, Any]:
+    def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
         """Measure once, or run one check."""
         if "check" in request:
-            start()
+            events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        path = Path(request["qp"])
+        path, out = Path(request["qp"]), Path(request["out"])
+        out.unlink(missing_ok=True)
         self._shift_heap()
         self._check(path, request.get("digest"))
         vouched = "digest" in request  # or it may be anybody's
         qp, _ = load_qp(path, operators=self._operators if vouched else None)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        start()
         m = _measured_here(
             self._solver,
             qp,
             request["tol"],
             prepare=self._step(request),
             sample_seconds=request.get("sample_seconds", 0.0),
+            starts=events.start,
+            ends=events.timed,
         )
         _limit_memory(None)
         s = m.solution
-        write_point(Path(request["out"]), s)
+        _write_new(out, s)
         return {
             "claimed": s.status,
             "message": s.message,
@@ -124,6 +124,7 @@ class _Bench:
             "prepare_seconds": m.prepare_seconds,
             "solve_seconds": m.solve_seconds,
             "total_seconds": m.total_seconds,
+            "first_seconds": m.first_seconds,
             "peak_mib": m.peak_mib,
             "prepare_peak_mib": m.prepare_peak_mib,
             "solve_peak_mib": m.solve_peak_mib,
@@ -212,10 +213,25 @@ def _limit_memory(mib: float | None) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def _measured_here(solver: Solver, qp: QP, tol: float, **how: Any) -> Measurement:
+def _measured_here(
+    solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
+    **how: Any,
+) -> Measurement:  # fmt: skip
     """Measure; a child that the solver forked and let return to us ends here."""
     process = os.getpid()
-    measurement = measure(solver, qp, tol, **how)
-    if os.getpid() != process:
-        os._exit(0)
-    return measurement
+
+    def ends_here() -> None:
+        if os.getpid() != process:
+            os._exit(0)
+        ends()
+
+    return measure(solver, qp, tol, ends=ends_here, **how)
+
+
+def _write_new(path: Path, solution: Solution) -> None:
+    """Write a point to a file that is not there yet.
+
+    Where there is something, the solver put it there: the parent will say what.
+    """
+    with suppress(FileExistsError), path.open("xb") as file:
+        np.savez(file, **point_arrays(solution))  # type: ignore[arg-type]

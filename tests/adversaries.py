@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from threading import Timer
 
 import numpy as np
@@ -314,13 +315,18 @@ class Forks(Honest):
         return replace(at_the_row(qp), counts={"child": child})
 
 
+def above(process):
+    """The parent of a process."""
+    return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+
+
 class ReturnsTwice(Honest):
-    """Lets a child return first; tells whose child it is that returned."""
+    """Lets a child return first; tells whose grandchild it is that returned."""
 
     def act(self, qp):
         if os.fork() != 0:
             time.sleep(0.2)
-        return replace(at_the_row(qp), counts={"parent": os.getppid()})
+        return replace(at_the_row(qp), counts={"above": above(os.getppid())})
 
 
 class WrongShape(Honest):

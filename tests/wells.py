@@ -135,7 +135,8 @@ class Murders(Exact):
 
     def prepare(self, qp, tol):
         if qp.q[0] == -4:
-            os.kill(os.getppid(), signal.SIGKILL)
+            reaper = Path(f"/proc/{os.getppid()}/stat").read_text()
+            os.kill(int(reaper.rpartition(")")[2].split()[1]), signal.SIGKILL)
         return super().prepare(qp, tol)
 
 
