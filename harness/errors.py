@@ -30,12 +30,12 @@ class FaultError(Exception):
 def shown(value: object) -> str:
     """Show a value of somebody's input in a message, the middle left out if need be."""
     try:
-        return cut(repr(value))
+        return shortened(repr(value))
     except (RecursionError, ValueError):  # nested for ever; an integer of many digits
         return f"a {type(value).__name__} too long to show"
 
 
-def cut(text: str, most: int = MOST_SHOWN) -> str:
+def shortened(text: str, most: int = MOST_SHOWN) -> str:
     """Leave the middle out of what is too long; names differ at their ends."""
     tail = most // 4
     return text if len(text) <= most else f"{text[: most - tail - 1]}…{text[-tail:]}"
@@ -57,10 +57,10 @@ def one_line(message: str) -> str:
         if len(text) > MOST_SHOWN and os.path.lexists(text.strip("'\"").rstrip(":,;")):
             paths.append(text)
             return text
-        return cut(text)
+        return shortened(text)
 
     line = _PIECES.sub(brief, line)
-    return cut(line, _MOST_WORDS + sum(map(len, paths)))
+    return shortened(line, _MOST_WORDS + sum(map(len, paths)))
 
 
 PLUGINS = "; others come with --plugin FILE.py"  #: after the names that are known
@@ -75,7 +75,7 @@ def unknown(
     """
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
-    got = cut(got)
+    got = shortened(got)  # also because the search takes a time ~ length²
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
@@ -86,4 +86,4 @@ def unknown(
 def some(names: Iterable[str], most: int = 3) -> str:
     """Enumerate the first few of `names`, and say how many more there are."""
     first, rest = (listed := list(names))[:most], len(listed) - most
-    return ", ".join(map(cut, first)) + (f" and {rest} more" if rest > 0 else "")
+    return ", ".join(map(shortened, first)) + (f" and {rest} more" if rest > 0 else "")

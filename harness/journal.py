@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from harness.errors import InputError, shown, some
-from harness.reading import open_file
+from harness.reading import opened
 from harness.record import Record
 
 LONGEST_LINE = 2**24  #: bytes that are read of one
@@ -130,7 +130,7 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
 
 def _lines(path: Path) -> Iterator[bytes]:
     """Read the whole lines of a file one by one; a partial one at the end is none."""
-    with open_file(path) as file:
+    with opened(path) as file:
         for number in count(1):
             line = file.readline(LONGEST_LINE)
             if line.endswith(b"\n"):

@@ -13,6 +13,8 @@ import re
 import stat
 import sys
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -31,8 +33,9 @@ _LONG_KEY = re.compile(
 )
 
 
-def open_file(path: Path, expected: str = "a file") -> BinaryIO:
-    """Open a regular file to read bytes from it.
+@contextmanager
+def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
+    """Open a regular file to be read; pipes and devices could give without end.
 
     expected : what to say instead of "a file"
     """
@@ -45,7 +48,8 @@ def open_file(path: Path, expected: str = "a file") -> BinaryIO:
         os.close(fd)
         wrong = "a folder" if path.is_dir() else "a device or a pipe"
         raise InputError(f"{path}: {wrong}; expected {expected}")
-    return os.fdopen(fd, "rb")
+    with os.fdopen(fd, "rb") as file:
+        yield file
 
 
 def read_text(
@@ -57,7 +61,7 @@ def read_text(
     most : MiB, unless the user set another limit
     """
     limit = _limit(most)
-    with open_file(path, expected) as file:
+    with opened(path, expected) as file:
         data = file.read(int(limit * 2**20) + 1)
     if len(data) > limit * 2**20:
         raise InputError(
