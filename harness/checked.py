@@ -10,7 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from harness.errors import InputError, unknown
+from harness.errors import InputError, shown, unknown
+
+LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
+MOST_REPEATS = 1_000_000  #: of anything
 
 
 @contextmanager
@@ -29,17 +32,34 @@ def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
             raise unknown("key", key, known)
 
 
-def at_least_one(where: str, value: object) -> int:
-    """Take a positive integer; neither 2.0 nor true is one."""
+def at_least_one(where: str, value: object, most: int = MOST_REPEATS) -> int:
+    """Take a positive integer up to `most`; neither 2.0 nor true is one."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise InputError(f"{where} = {value!r}; expected an integer of at least 1")
+        raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
+    if value > most:
+        raise InputError(
+            f"{where} = {shown(value)}; expected an integer of at most {most}"
+        )
     return value
 
 
 def positive(where: str, value: Any) -> float:
     """Take a positive finite number."""
     if not is_number(value) or not 0 < value <= sys.float_info.max:
-        raise InputError(f"{where} = {value!r}; expected a positive number")
+        raise InputError(f"{where} = {shown(value)}; expected a positive number")
+    return float(value)
+
+
+def physical(where: str, value: Any) -> float:
+    """Take a number whose products with others stay numbers, in SI units.
+
+    Zero, or between 1e-30 and 1e30 in size: Young's modulus of steel is 2e11 Pa.
+    """
+    if not is_number(value) or not (value == 0 or LEAST <= abs(value) <= MOST):
+        raise InputError(
+            f"{where} = {shown(value)}; expected a number between {LEAST:g} and "
+            f"{MOST:g} in size, or 0"
+        )
     return float(value)
 
 
@@ -51,14 +71,23 @@ def is_number(value: object) -> bool:
 def text(where: str, value: object) -> str:
     """Take a text that is not empty."""
     if not isinstance(value, str) or not value:
-        raise InputError(f"{where} = {value!r}; expected a text, not empty")
+        raise InputError(f"{where} = {shown(value)}; expected a text, not empty")
+    if has_control(value):
+        raise InputError(
+            f"{where} = {shown(value)}; expected a text without control characters"
+        )
     return value
+
+
+def has_control(text: str) -> bool:
+    """Whether a text holds a control character, which no name and no path should."""
+    return any(c < " " or c == "\x7f" for c in text)
 
 
 def any_list(where: str, value: object) -> list[Any]:
     """Take a list, empty or not."""
     if not isinstance(value, list):
-        raise InputError(f"{where} = {value!r}; expected a list")
+        raise InputError(f"{where} = {shown(value)}; expected a list")
     return value
 
 
@@ -73,5 +102,5 @@ def filled_list(where: str, value: object) -> list[Any]:
 def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
     """Take a table."""
     if not isinstance(value, dict):
-        raise InputError(f"{where} = {value!r}; expected {instead}")
+        raise InputError(f"{where} = {shown(value)}; expected {instead}")
     return value

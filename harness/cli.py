@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness import commands, examine, one, processes, validate
-from harness.errors import InputError
+from harness.errors import InputError, one_line
 from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
 from harness.workbench import FORMATS, Workbench
@@ -43,7 +43,7 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
     try:
         return _run(workbench, argv)
     except InputError as e:
-        return _complain(" ".join(str(e).splitlines()))
+        return _complain(str(e))
     except KeyboardInterrupt:
         goes_on = "; the same command continues" if argv[:1] == ["run"] else ""
         _complain(f"interrupted{goes_on}")
@@ -82,7 +82,7 @@ def _remedied(e: OSError, path: Path) -> str:
 
 def _complain(message: str) -> int:
     """Say in one line what is wrong, and return the exit code of wrong input."""
-    print(f"mortarbench: {message}", file=sys.stderr)
+    print(f"mortarbench: {one_line(message)}", file=sys.stderr)
     return 2
 
 

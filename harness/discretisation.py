@@ -39,6 +39,7 @@ from harness.halving import prolongation
 from harness.mechanics import Extended, Grid, Mechanics, Real
 from harness.names import CaseName, assemble, canonical
 from harness.plugin import Family, Reference
+from harness.reading import read_json
 from harness.references import UnsolvedError, reference_point
 
 FILE = "discretisation.json"  #: in the result folder
@@ -160,7 +161,7 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
     if not path.exists():
         return {}
     try:
-        data = json.loads(path.read_text("utf-8"))
+        data = read_json(path)
         if data["schema"] != SCHEMA:
             raise InputError(f"{path}: schema {data['schema']!r}; expected {SCHEMA}")
         rows = [

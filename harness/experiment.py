@@ -18,6 +18,7 @@ from typing import Any
 
 from harness.errors import InputError
 from harness.plugin import Fields, Value
+from harness.reading import read_json
 from harness.store import load_fields, save_fields
 
 Row = Mapping[str, Value]
@@ -59,7 +60,7 @@ def load_experiment(folder: Path) -> Experiment:
     """
     path = folder / "setting.json"
     try:
-        index = json.loads(path.read_text("utf-8"))
+        index = read_json(path)
         tables = {name: _read_csv(folder / f"{name}.csv") for name in index["tables"]}
     except OSError as e:
         raise InputError(f"{e.filename}: cannot be read: {e.strerror}") from None

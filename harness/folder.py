@@ -7,7 +7,6 @@ import json
 import os
 import re
 import shutil
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +16,7 @@ from harness.durable import full_disk_told, remove_unfinished, replace_file
 from harness.environment import VOLATILE
 from harness.errors import InputError, shortened, some
 from harness.faults import FAULTS
+from harness.reading import MOST_TOML, read_json, read_text, read_toml, toml
 from harness.suite import Suite
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
@@ -262,7 +262,7 @@ def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
 def _check_same(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
     remedy = "choose another --out or use --fresh"
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
-    if suite_file.exists() and _toml(suite_file) != tomllib.loads(suite.text):
+    if suite_file.exists() and _toml(suite_file) != toml(suite.text):
         raise InputError(
             f"{out} holds another suite ({suite_file} is not {suite.name!r} as it is "
             f"now); {remedy}"
@@ -283,15 +283,10 @@ def suite_text(folder: Path) -> str:
     Raises
     ------
     InputError
-        When it is missing.
+        When it is missing, or no text.
 
     """
-    try:
-        return (folder / "suite.toml").read_text("utf-8")
-    except OSError as e:
-        raise InputError(
-            f"{folder}/suite.toml: {e.strerror}; expected a result folder"
-        ) from None
+    return read_text(folder / "suite.toml", "the suite of a result folder", MOST_TOML)
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:
@@ -338,19 +333,21 @@ def differences(
 
 def _toml(path: Path) -> dict[str, Any] | None:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except ValueError:  # no TOML, or no UTF-8: no suite of ours
+        return read_toml(path)
+    except InputError:  # no suite of ours
         return None
 
 
 def _environment(path: Path) -> dict[str, Any]:
     try:
-        environment = json.loads(path.read_text("utf-8"))
-    except ValueError:
+        environment = read_json(path)
+    except InputError:
         environment = None
-    if not isinstance(environment, dict) or "digest" not in environment:
+    if not isinstance(environment, dict) or not isinstance(
+        environment.get("digest"), str
+    ):
         raise InputError(
             f"{path}: no JSON object with a digest; expected the file that the run "
             "wrote; restore it, or run with --fresh"
-        ) from None
+        )
     return environment

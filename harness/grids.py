@@ -3,51 +3,45 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import prod
 from pathlib import Path
+from typing import Any
 
 from harness import checked
-from harness.errors import PLUGINS, InputError, some, unknown
+from harness.errors import PLUGINS, InputError, shown, some, unknown
 from harness.names import CaseName, assemble, canonical
 from harness.plugin import Family
 
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 
 
-def cold_cases(
-    blocks: object, families: Mapping[str, Family], folder: Path
-) -> tuple[CaseName, ...]:
-    """All cold cases in the order written; one that two blocks share is kept once.
+def planned(
+    blocks: object, families: Mapping[str, Family], folder: Path, most: int
+) -> tuple[tuple[CaseName, ...], tuple[tuple[CaseName, ...], ...]]:
+    """All cold cases in the order written, and all sequences of cases.
+
+    A case that two blocks share is kept once. A sequence are the cases that differ in
+    its key only, in the order of that key.
 
     folder : of the suite; a path that leads nowhere from here is sought there
+    most : cases that the blocks may span in all
     """
-    found: dict[str, CaseName] = {}
-    for block in _blocks(blocks, families, folder):
+    cold: dict[str, CaseName] = {}
+    sequences: dict[str, tuple[CaseName, ...]] = {}
+    for block in _blocks(blocks, families, folder, most):
         if block.along is None:
             for case in block.cases:
-                found.setdefault(canonical(case, block.family), case)
-    return tuple(found.values())
-
-
-def sequences(
-    blocks: object, families: Mapping[str, Family], folder: Path
-) -> tuple[tuple[CaseName, ...], ...]:
-    """Group the cases that differ in the key of their sequence only, in its order.
-
-    folder : as for `cold_cases`
-    """
-    found: dict[str, tuple[CaseName, ...]] = {}
-    for block in _blocks(blocks, families, folder):
-        if block.along is None:
+                cold.setdefault(canonical(case, block.family), case)
             continue
         steps: dict[str, list[CaseName]] = {}
         for case in block.cases:
             rest = {k: v for k, v in case.params.items() if k != block.along}
             steps.setdefault(f"{case.form} {rest}", []).append(case)
-        found |= {repr(cases): tuple(cases) for cases in steps.values()}
-    return tuple(found.values())
+        sequences |= {repr(cases): tuple(cases) for cases in steps.values()}
+    return tuple(cold.values()), tuple(sequences.values())
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,9 +52,10 @@ class _Block:
 
 
 def _blocks(
-    blocks: object, families: Mapping[str, Family], folder: Path
+    blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Iterator[_Block]:
     """Read the tables under problems, one by one."""
+    spanned = 0
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
             table = checked.table("entry", block)
@@ -71,12 +66,22 @@ def _blocks(
             if name not in families:
                 raise unknown("family", name, families, more=PLUGINS)
             family = families[name]
-            params = table.get("params", {})
+            params = checked.table("params", table.get("params", {}))
+            for key in params:
+                if key not in family.defaults:
+                    raise unknown("key", key, family.defaults, where=name)
             along = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
+            axes = _axes(params, table.get("zip", []))
+            spanned += prod(map(len, axes)) * len(forms)
+            if spanned > most:
+                raise InputError(
+                    f"the grid spans {spanned} cases; expected at most {most} in all; "
+                    f"take fewer values, or set max_cases = {spanned} in the suite"
+                )
             cases = [
                 assemble(family, _located(point, folder), checked.text("forms", form))
-                for point in _grid(params, table.get("zip", []))
+                for point in _points(axes)
                 for form in forms
             ]
             yield _Block(family=family, cases=cases, along=along)
@@ -91,25 +96,23 @@ def _located(point: dict[str, object], folder: Path) -> dict[str, object]:
     return point
 
 
-def _along(key: object, params: object) -> str | None:
+def _along(key: object, params: Mapping[str, Any]) -> str | None:
     """Check the key that a sequence runs along."""
     if key is None:
         return None
-    params = checked.table("params", params)
     values = params.get(checked.text("sequence", key))
     if not isinstance(values, list) or len(values) < 2:
         lists = [k for k, v in params.items() if isinstance(v, list)]
         hint = f"; there are {some(lists)}" if lists else ""
         raise InputError(
-            f"sequence = {key!r} is no list in params; expected the key whose values "
-            f"are the steps{hint}"
+            f"sequence = {shown(key)} is no list in params; expected the key whose "
+            f"values are the steps{hint}"
         )
     return str(key)
 
 
-def _grid(params: object, groups: object) -> list[dict[str, object]]:
-    """Span the grid of `params`, first key slowest; zipped keys run together."""
-    table = checked.table("params", params)
+def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:
+    """List what each axis of a grid runs through; zipped keys run together."""
     columns = {
         key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
         for key, v in table.items()
@@ -122,7 +125,7 @@ def _grid(params: object, groups: object) -> list[dict[str, object]]:
                 or key in zipped
             ):
                 raise InputError(
-                    f"zip: {key!r} is no list in params, or is paired twice; "
+                    f"zip: {shown(key)} is no list in params, or is paired twice; "
                     'expected groups of such keys, like [["Nr", "Nh"]]'
                 )
             zipped[key] = group
@@ -135,6 +138,10 @@ def _grid(params: object, groups: object) -> list[dict[str, object]]:
         if key == min(together, key=list(columns).index):
             rows = zip(*(columns[k] for k in together), strict=True)
             axes.append([dict(zip(together, row, strict=True)) for row in rows])
-    return [
-        {k: v for part in point for k, v in part.items()} for point in product(*axes)
-    ]
+    return axes
+
+
+def _points(axes: Sequence[list[dict[str, object]]]) -> Iterator[dict[str, object]]:
+    """Span the grid of some axes, the first one slowest."""
+    for point in product(*axes):
+        yield {k: v for part in point for k, v in part.items()}

@@ -7,17 +7,21 @@ it off.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
+from itertools import count
 from json import JSONDecodeError
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from harness.durable import Lines
-from harness.errors import InputError
+from harness.errors import InputError, shown, some
 from harness.folder import refuse_links
+from harness.reading import opened
 from harness.record import Record
+
+LONGEST_LINE = 2**24  #: bytes that are read of one
 
 
 class Journal:
@@ -70,14 +74,22 @@ class Journal:
         self._files.close()
 
 
-def read_journal(folder: Path) -> list[Record]:
+def read_journal(
+    folder: Path, tell: Callable[[str], None] = lambda _: None
+) -> list[Record]:
     """Read every record of a result folder, file by file in the order of their names.
+
+    Every run_id is there once: a line that repeats another one, field by field, is left
+    out. Equal texts and tables of different records are one in memory.
+
+    tell : is told, in a line, how many lines were left out
 
     Raises
     ------
     InputError
-        When there is no folder, no journal, a link in the folder, or a line other than
-        a partial last one is bad.
+        When there is no folder, no journal, a link in the folder, when a line other
+        than a partial last one is bad, or when two lines tell different things of one
+        run_id.
 
     """
     if not folder.is_dir():
@@ -87,13 +99,47 @@ def read_journal(folder: Path) -> list[Record]:
     paths = sorted((folder / "journal").glob("*.jsonl"))
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
-    return [record for path in paths for record in _records(path)]
+    records: list[Record] = []
+    at: dict[str, int] = {}  # run_id → index
+    repeated = []
+    for path in paths:
+        for number, record in _records(path):
+            first = at.setdefault(record.run_id, len(records))
+            if first == len(records):
+                records.append(record)
+                continue
+            repeated.append(f"{path}, line {number}")
+            if record != records[first]:
+                raise InputError(
+                    f"{repeated[-1]}: tells of run_id {shown(record.run_id)} another "
+                    f"thing than {_first_place(paths, record.run_id)}; expected one "
+                    "line for each; delete the one that is wrong"
+                )
+    if repeated:
+        lines = "line is" if len(repeated) == 1 else "lines are"
+        tell(
+            f"{len(repeated)} journal {lines} there before, word for word, and left "
+            f"out: {some(repeated)}"
+        )
+    return records
 
 
-def _records(path: Path) -> Iterator[Record]:
-    for number, line in enumerate(_whole_lines(path.read_bytes()).splitlines(), 1):
+def _first_place(paths: Iterable[Path], run_id: str) -> str:
+    """Name the first line about a measurement."""
+    return next(
+        f"{path}, line {number}"
+        for path in paths
+        for number, record in _records(path)
+        if record.run_id == run_id
+    )
+
+
+def _records(path: Path) -> Iterator[tuple[int, Record]]:
+    """Read the records of one file with the numbers of their lines."""
+    shared: dict[Any, Any] = {}
+    for number, line in enumerate(_lines(path), 1):
         try:
-            yield Record.from_json(line.decode())
+            yield number, Record.from_json(line, shared)
         except (JSONDecodeError, UnicodeDecodeError):
             raise InputError(
                 f"{path}, line {number}: damaged; expected a JSON object, as a run "
@@ -101,6 +147,22 @@ def _records(path: Path) -> Iterator[Record]:
             ) from None
         except ValueError as e:
             raise InputError(f"{path}, line {number}: {e}") from None
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """Read the whole lines of a file one by one; a partial one at the end is none."""
+    with opened(path) as file:
+        for number in count(1):
+            line = file.readline(LONGEST_LINE)
+            if line.endswith(b"\n"):
+                yield line
+            elif len(line) < LONGEST_LINE:
+                return
+            else:
+                raise InputError(
+                    f"{path}, line {number}: longer than {LONGEST_LINE >> 20} MiB; "
+                    "expected a journal line, as a run appends it"
+                )
 
 
 def _whole_lines(text: bytes) -> bytes:

@@ -18,12 +18,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from harness.errors import PLUGINS, InputError, unknown
+from harness.checked import has_control
+from harness.errors import PLUGINS, InputError, shortened, shown, unknown
 from harness.plugin import Family, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+_REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _TOO_LARGE = 2**63  #: integers from here on fit into no array
-_SHOWN = 40  #: characters of a wrong value
 _CALLED = {
     int: "an integer, such as 4",
     float: "a finite number, such as 0.5",
@@ -63,13 +64,17 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
             return assemble(family, given, family.forms[0], texts=True)
     if not parts or "=" in parts[-1]:
         forms = ", ".join(family.forms)
-        raise InputError(f"{text}: no form at the end; expected one of {forms}")
+        raise InputError(
+            f"{shortened(text)}: no form at the end; expected one of {forms}"
+        )
     for part in parts[:-1]:
         key, equals, value = part.partition("=")
         if not equals:
-            raise InputError(f"{head}: malformed part {part!r}; expected key=value")
+            raise InputError(
+                f"{head}: malformed part {shown(part)}; expected key=value"
+            )
         if key in given:
-            raise InputError(f"{head}: key {key!r} is set twice; set it once")
+            raise InputError(f"{head}: key {shown(key)} is set twice; set it once")
         given[key] = value
     return assemble(family, given, parts[-1], texts=True)
 
@@ -140,20 +145,22 @@ def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
     """Split what follows ``FAMILY:`` into the path and the other parts."""
     path = text[len(head) + 1 :]
     if text[len(head) : len(head) + 1] != ":" or not path:
-        raise InputError(f"{text}: no file; expected {head}:PATH{suffix}")
+        raise InputError(f"{shortened(text)}: no file; expected {head}:PATH{suffix}")
     if not suffix:
         return path, []
     parts = path.split("/")
     ends = [i for i, part in enumerate(parts, 1) if part.endswith(suffix)]
     if not ends:
-        raise InputError(f"{text}: no file; expected {head}:PATH{suffix}/…/FORM")
+        raise InputError(
+            f"{shortened(text)}: no file; expected {head}:PATH{suffix}/…/FORM"
+        )
     return "/".join(parts[: ends[0]]), parts[ends[0] :]
 
 
 def _number(text: str, kind: type) -> object:
     """Read a finite number; what is none, or absurdly long, stays a text."""
-    if kind is int and not _INTEGER.fullmatch(text):
-        return text
+    if not (_INTEGER if kind is int else _REAL).fullmatch(text):
+        return text  # 1_0 and digits of other scripts are numbers to Python alone
     try:
         number = kind(text)
         return number if math.isfinite(number) else text
@@ -168,12 +175,12 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
     """
     match value:
         case str() if kind is str and value and (free or not set("/=") & set(value)):
-            return value
+            if not has_control(value):
+                return value
         case bool():
             pass
         case int() if kind is int and abs(value) < _TOO_LARGE:
             return value
         case int() | float() if kind is float and abs(value) <= sys.float_info.max:
-            return float(value)
-    shown = f"{value!r}" if len(f"{value!r}") <= _SHOWN else f"{value!r:.{_SHOWN}}…"
-    raise InputError(f"{where}={shown}; expected {_CALLED[kind]}")
+            return float(value) + 0.0  # not -0
+    raise InputError(f"{where}={shown(value)}; expected {_CALLED[kind]}")

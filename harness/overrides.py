@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from harness import checked
 from harness.errors import InputError, some
 from harness.names import CaseName, canonical, match, parse
 from harness.plugin import Family, Solver
+from harness.reading import toml
 from harness.registry import SolverSpec, resolve
 from harness.suite import NULL, Suite
 
@@ -60,7 +60,7 @@ def _with_limit(text: str, key: str, limit: float) -> str:
     solvers, cases or repeats: they make another suite.
     """
     line = f"{key} = {limit!r}"
-    if key not in tomllib.loads(text):
+    if key not in toml(text):
         return f"{line}\n{text}"
     return re.sub(rf"^[ \t]*{key}[ \t]*=.*$", line, text, count=1, flags=re.MULTILINE)
 

@@ -4,19 +4,37 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
-from typing import Any, Self
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Self
+
+from harness.errors import shown
+
+if TYPE_CHECKING:
+    from msgspec.json import Decoder
 
 SCHEMA = 1  #: version of the journal line; raised whenever a field changes its meaning
+READABLE = (1,)  #: the versions that `Record.from_json` takes
+LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
+MOST_LEVELS = 20  #: of what is nested in a field
 
-
-_JSON_TYPES: Mapping[str, set[type]] = {
-    "None": {type(None)}, "str": {str}, "Verdict": {str}, "int": {int},
-    "float": {int, float}, "Mapping": {dict},
-}  # fmt: skip
+_WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
+_TOO_LARGE = "expected an integer of at most 64 bits"
+#: fields that many lines share
+_TEXTS = ("case", "family", "form", "solver", "claimed", "mode", "qp", "environment")
+_TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
+_NOT_NEGATIVE = (
+    "repeat", "block", "prepare_seconds", "solve_seconds", "total_seconds", "peak_mib",
+    "prepare_peak_mib", "solve_peak_mib", "inner", "build_seconds", "dualise_seconds",
+    "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
+    "dual", "complementarity", "gap", "energy_bound",
+)  # fmt: skip
+_texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
+_not_negative = attrgetter(*_NOT_NEGATIVE)
 
 
 class Verdict(StrEnum):
@@ -34,7 +52,7 @@ class Verdict(StrEnum):
     DECLINED = "declined"  #: it said beforehand why it cannot
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Record:
     """One solver on one case at one tolerance, once: plain scalars, one JSON line.
 
@@ -100,45 +118,124 @@ class Record:
         """Copy with some fields changed."""
         return replace(self, **changes)
 
-    def to_json(self) -> str:
-        """Serialise to one line of strict JSON: NaN and inf become null."""
-        return json.dumps(finite(vars(self)), allow_nan=False)
+    def to_dict(self) -> dict[str, Any]:
+        """Give every field by its name; what is nested is not copied."""
+        return {name: getattr(self, name) for name in self.__slots__}
 
-    @classmethod
-    def from_json(cls, line: str) -> Self:
+    def to_json(self) -> str:
+        """Serialise to one line of strict JSON.
+
+        NaN, inf and integers that no reader can hold become null.
+        """
+        return json.dumps(finite(self.to_dict()), allow_nan=False)
+
+    @staticmethod
+    def from_json(line: str | bytes, shared: dict[Any, Any] | None = None) -> Record:
         """Parse what `to_json` wrote; fields that we do not know are ignored.
 
-        A lone surrogate, which no file can hold, is spelt out.
+        A lone surrogate, which no file can hold, is spelt out. Of a key that is there
+        twice the last one counts.
+
+        shared : texts and tables of the lines before; what equals one of them is held
+            in memory once
 
         Raises
         ------
         ValueError
             When the line is no JSON object, lacks a field, has another schema, or a
-            field of the wrong type.
+            field of the wrong type or out of its range.
 
         """
-        row = json.loads(line)
-        if "\\ud" in line:  # or the half of a pair that is whole
-            row = _spelt(row)
-        if not isinstance(row, dict) or row.get("schema") != SCHEMA:
-            raise ValueError(f"not a journal line of schema {SCHEMA}")
-        known = {f.name: str(f.type) for f in fields(cls)}
-        given = {k: v for k, v in row.items() if k in known}
-        for name, value in given.items():
-            if type(value) not in _json_types(known[name]):
-                raise ValueError(f"{name} = {value!r}; expected {known[name]}")
+        import msgspec  # here: the processes that measure read no journal
+
         try:
-            record = cls(**given)
-        except TypeError as e:
-            raise ValueError(f"incomplete journal line: {e}") from None
-        return replace(record, status=Verdict(record.status))
+            try:
+                record = _decoder().decode(line)
+            except msgspec.ValidationError:
+                raise
+            except msgspec.DecodeError:  # no JSON, or a lone surrogate
+                record = msgspec.convert(_spelt(json.loads(line)), Record)
+            _check(record)
+            return _share(record, {} if shared is None else shared)
+        except msgspec.ValidationError as e:
+            raise ValueError(_explained(e, json.loads(line))) from None
+        except RecursionError:
+            raise ValueError(f"nested deeper than {MOST_LEVELS} levels") from None
 
 
 @cache
-def _json_types(annotation: str) -> set[type]:
-    """List what JSON gives for a field with that annotation, e.g. "float | None"."""
-    kinds = [kind.partition("[")[0] for kind in annotation.split(" | ")]
-    return set().union(*(_JSON_TYPES[kind] for kind in kinds))
+def _decoder() -> Decoder[Record]:
+    from msgspec.json import Decoder
+
+    return Decoder(Record)
+
+
+def _explained(e: Exception, row: object) -> str:
+    """Say which field of a journal line has the wrong type, and its value."""
+    if not isinstance(row, dict) or row.get("schema") not in READABLE:
+        return _WRONG_SCHEMA
+    place = re.search(r"at `\$\.(\w+)", str(e))
+    if place is None:
+        return f"incomplete journal line: {e}"
+    name = place[1]
+    annotation = next(str(f.type) for f in fields(Record) if f.name == name)
+    if annotation == "Verdict" and isinstance(row[name], str):
+        annotation = f"one of {', '.join(Verdict)}"
+    return f"{name} = {shown(row[name])}; expected {annotation}"
+
+
+def _check(r: Record) -> None:
+    """Refuse a record with a value out of its range.
+
+    Raises
+    ------
+    ValueError
+        With the field, its value, and what would be right.
+
+    """
+    if r.schema not in READABLE:
+        raise ValueError(_WRONG_SCHEMA)
+    if not r.run_id:
+        raise ValueError("run_id is empty; expected a text")
+    for name, at in (("tol", r.tol), ("accuracy", r.accuracy)):
+        if at is not None and not 0 < at <= 1:
+            raise ValueError(f"{name} = {at!r}; expected a number above 0, at most 1")
+    numbers = [n for n in _not_negative(r) if n]
+    if numbers and not 0 < min(numbers) <= max(numbers) <= LARGEST_INTEGER:
+        for name, value in zip(_NOT_NEGATIVE, _not_negative(r), strict=True):
+            if (value or 0) < 0:
+                raise ValueError(f"{name} = {value!r}; expected no negative number")
+            _check_nested(name, value, 0)
+    _check_nested("iterations", r.iterations, 0)
+    _check_nested("reported", r.reported, MOST_LEVELS)
+
+
+def _share(record: Record, shared: dict[Any, Any]) -> Record:
+    """Replace texts and tables by equal ones met before; check those that are new."""
+    for name, text in zip(_TEXTS, _texts(record), strict=True):
+        object.__setattr__(record, name, shared.setdefault(text, text))
+    for name, table in zip(_TABLES, _tables(record), strict=True):
+        key = (repr(table),)  # a tuple: no text is taken for a table
+        if key not in shared:
+            _check_nested(name, table, MOST_LEVELS)
+            shared[key] = table
+        object.__setattr__(record, name, shared[key])
+    return record
+
+
+def _check_nested(where: str, data: Any, levels: int) -> None:
+    """Refuse what is nested too deeply, and integers that no reader can hold."""
+    match data:
+        case dict() | list() if not levels:
+            raise ValueError(f"{where} is nested deeper than {MOST_LEVELS} levels")
+        case dict():
+            for key, value in data.items():
+                _check_nested(f"{where}.{key}", value, levels - 1)
+        case list():
+            for value in data:
+                _check_nested(where, value, levels - 1)
+        case int() if abs(data) > LARGEST_INTEGER:
+            raise ValueError(f"{where} = {shown(data)}; {_TOO_LARGE}")
 
 
 def _spelt(data: Any) -> Any:
@@ -155,10 +252,15 @@ def _spelt(data: Any) -> Any:
 
 
 def finite(data: Any) -> Any:
-    """Replace every non-finite float inside nested plain data by None."""
+    """Replace numbers inside nested plain data that JSON's readers cannot hold by None.
+
+    These are NaN, inf and integers beyond 64 bits.
+    """
     match data:
         case float():
             return data if math.isfinite(data) else None
+        case int():
+            return data if abs(data) <= LARGEST_INTEGER else None
         case dict():
             return {k: finite(v) for k, v in data.items()}
         case list() | tuple():

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from harness import checked
-from harness.errors import InputError, unknown
-from harness.grids import cold_cases, sequences
+from harness.errors import InputError, shown, unknown
+from harness.grids import planned
 from harness.names import CaseName
 from harness.plugin import Family, Solver
+from harness.reading import MOST_TOML, read_text, toml
 from harness.registry import SolverSpec, resolve
 
 DEFAULTS: Mapping[str, Any] = {
@@ -26,6 +26,7 @@ DEFAULTS: Mapping[str, Any] = {
     "budget": 600,
     "accuracy": None,
     "null_arm": None,
+    "max_cases": 100_000,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _SOLVER_KEYS = ("name", "label", "options")
@@ -73,18 +74,24 @@ def load_suite(
         With the file and the place in it, and what would be right.
 
     """
-    text = _read(path)
+    text = read_text(path, "a TOML file", MOST_TOML)
     with checked.located(f"{path}"):
-        table = {**DEFAULTS, **_toml(text)}
+        table = {**DEFAULTS, **toml(text)}
         checked.only_keys(table, _SUITE_KEYS)
         for key in ("name", "solvers", "problems"):
             if key not in table:
                 raise InputError(f"{key} is missing")
         if not re.fullmatch(r"[\w.-]*\w[\w.-]*", checked.text("name", table["name"])):
             raise InputError(
-                f"name = {table['name']!r} is no name of a folder; "
+                f"name = {shown(table['name'])} is no name of a folder; "
                 "expected letters, digits, '.', '-' and '_'"
             )
+        cases, sequences = planned(
+            table["problems"],
+            families,
+            path.parent,
+            checked.at_least_one("max_cases", table["max_cases"], most=10**9),
+        )
         return Suite(
             name=table["name"],
             tolerances=_tolerances(table["tolerances"]),
@@ -92,8 +99,8 @@ def load_suite(
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
             solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
-            cases=cold_cases(table["problems"], families, path.parent),
-            sequences=sequences(table["problems"], families, path.parent),
+            cases=cases,
+            sequences=sequences,
             precision=_between("precision", table["precision"]),
             max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
             budget=checked.positive("budget", table["budget"]),
@@ -104,7 +111,7 @@ def load_suite(
 
 def asked_solvers(text: str) -> dict[str, SolverSpec]:
     """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
-    table = _toml(text)
+    table = toml(text)
     specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
     return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
 
@@ -120,7 +127,9 @@ def steps_up_to(
         When no sequence has it.
 
     """
-    for steps in sequences(_toml(text).get("problems"), families, Path()):
+    table = {**DEFAULTS, **toml(text)}
+    most = checked.at_least_one("max_cases", table["max_cases"], most=10**9)
+    for steps in planned(table.get("problems"), families, Path(), most)[1]:
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")
@@ -128,30 +137,11 @@ def steps_up_to(
 
 def limits(text: str) -> tuple[float, float]:
     """Read the limits of a measurement from a suite's TOML, s and MiB."""
-    table = {**DEFAULTS, **_toml(text)}
+    table = {**DEFAULTS, **toml(text)}
     time_limit, memory_limit = (
         checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
     )
     return time_limit, memory_limit
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror}; expected a TOML file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8; expected a TOML file") from None
-
-
-def _toml(text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as e:  # "Expected … (at line 3, column 5)"
-        what, _, place = str(e).removesuffix(")").rpartition(" (at ")
-        raise InputError(f"{place}: {what}") from None
-    except ValueError:  # Python's own limit
-        raise InputError("an integer with too many digits") from None
 
 
 def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
@@ -161,7 +151,8 @@ def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpe
             spec = _spec(entry)
             if spec.label in found:
                 raise InputError(
-                    f"label {spec.label!r} is used twice; expected a label of its own"
+                    f"label {shown(spec.label)} is used twice; expected a label of its "
+                    "own"
                 )
             resolve(spec, registry)
         found[spec.label] = spec
@@ -188,8 +179,8 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
     if label is None:
         return specs
     known = {spec.label: spec for spec in specs}
-    if label not in known:
-        raise unknown("null_arm", str(label), known)
+    if (label := checked.text("null_arm", label)) not in known:
+        raise unknown("null_arm", label, known)
     return (*specs, replace(known[label], label=f"{label}{NULL}", arm="null"))
 
 
@@ -198,19 +189,16 @@ def _between(key: str, value: Any) -> float | None:
     if value is None:
         return None
     if not checked.is_number(value) or not 0 < value < 1:
-        raise InputError(f"{key} = {value!r}; expected a number between 0 and 1")
+        raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
     return float(value)
 
 
 def _tolerances(value: object) -> tuple[float, ...]:
     numbers = checked.filled_list("tolerances", value)
-    for number in numbers:
-        if (
-            not checked.is_number(number)
-            or not 0 < number < 1
-            or numbers.count(number) > 1
-        ):
-            raise InputError(
-                f"tolerances = {value}; expected distinct numbers between 0 and 1"
-            )
+    if not all(checked.is_number(n) and 0 < n < 1 for n in numbers) or len(
+        set(numbers)
+    ) < len(numbers):
+        raise InputError(
+            f"tolerances = {shown(value)}; expected distinct numbers between 0 and 1"
+        )
     return tuple(map(float, numbers))

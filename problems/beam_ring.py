@@ -27,7 +27,7 @@ from problems.emit import FORMS, contact_case
 from problems.inverse import GeneralisedInverse
 from problems.linearise import METHODS, linearisation
 from problems.mesh import dofs_of, half_ring, join, rectangle
-from problems.ranges import at_least, doubled, one_of
+from problems.ranges import MOST_STEPS, at_least, at_most, doubled, fits, one_of
 from problems.results import quantities
 from problems.stepping import LoadPath
 
@@ -64,6 +64,7 @@ class BeamRing:
         """Raise InputError unless every key is in its range."""
         p: Any = params
         at_least(1, self.name, p, ("Nr", "Nh", "radial", "steps", "step", "relin"))
+        at_most(MOST_STEPS, self.name, p, ("steps", "relin"))
         nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
         if nodes > MOST_NODES:
@@ -71,6 +72,7 @@ class BeamRing:
                 f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
                 f"expected at most {MOST_NODES:.2g}"
             )
+        fits(self.name, 2 * nodes)
         if p["step"] > p["steps"]:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"

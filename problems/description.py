@@ -35,7 +35,6 @@ units, for the larger side of the box around the mesh and the sum of |load| over
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -45,12 +44,14 @@ from numpy.typing import NDArray
 
 from harness import InputError, Value, checked
 from harness.checked import located
-from harness.errors import unknown
+from harness.errors import shown, unknown
+from harness.reading import read_toml
 from problems.bodies import Bodies, ContactPair, assemble
 from problems.elasticity import Material
 from problems.linearise import METHODS
 from problems.mesh import Mesh, Nodes
 from problems.msh import NamedMesh, read_msh
+from problems.ranges import MOST_STEPS
 
 #: what a case name may set, too, with the value where the file says nothing
 SETTINGS: Mapping[str, Value] = {
@@ -69,12 +70,7 @@ def read_description(path: Path) -> dict[str, Any]:
         With the file and the key.
 
     """
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror}; expected a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: no TOML: {e}") from None
+    table = read_toml(path)
     with located(str(path)):
         checked.only_keys(table, _KEYS)
         for key in ("mesh", "bodies", "supports", "loads", "contacts"):
@@ -82,10 +78,11 @@ def read_description(path: Path) -> dict[str, Any]:
                 raise InputError(f"{key} is missing")
         checked.text("mesh", table["mesh"])
         for key in ("steps", "relin"):
-            checked.at_least_one(key, table.get(key, SETTINGS[key]))
+            checked.at_least_one(key, table.get(key, SETTINGS[key]), MOST_STEPS)
         for key, known in CHOICES.items():
-            if table.get(key, SETTINGS[key]) not in known:
-                raise unknown(f"value of {key}", str(table[key]), known)
+            value = checked.text(key, table.get(key, SETTINGS[key]))
+            if value not in known:
+                raise unknown(f"value of {key}", value, known)
     return table
 
 
@@ -137,9 +134,9 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
         name = _one_of(named.surfaces, "physical surface", entry, "name")
         if name in found:
             raise InputError(f"body {name!r} is described twice; expected once")
-        E, nu = checked.positive("E", entry["E"]), entry["nu"]
+        E, nu = checked.physical("E", checked.positive("E", entry["E"])), entry["nu"]
         if not checked.is_number(nu) or not -1 < nu < 0.5:
-            raise InputError(f"nu = {nu!r}; expected a number between -1 and 0.5")
+            raise InputError(f"nu = {shown(nu)}; expected a number between -1 and 0.5")
         found[name] = Material(E=E, nu=float(nu))
 
     _each({"bodies": entries}, "bodies", read)
@@ -154,7 +151,7 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
     fix = checked.filled_list("fix", entry["fix"])
     for component in fix:
         if component not in ("x", "y"):
-            raise unknown("component", str(component), ("x", "y"))
+            raise unknown("component", checked.text("fix", component), ("x", "y"))
     return np.concatenate([2 * nodes + "xy".index(c) for c in fix])
 
 
@@ -165,9 +162,8 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
         raise InputError("expected either force or traction, [x, y]")
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
     if len(vector) != 2 or not all(map(checked.is_number, vector)):
-        raise InputError(f"{kinds[0]} = {vector}; expected two numbers, [x, y]")
-    if not np.isfinite(vector).all():
-        raise InputError(f"{kinds[0]} = {vector}; expected finite numbers")
+        raise InputError(f"{kinds[0]} = {shown(vector)}; expected two numbers, [x, y]")
+    vector = [checked.physical(kinds[0], component) for component in vector]
     nodes, edges = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
     if edges.size:  # ∫N over the boundary, m
@@ -217,8 +213,12 @@ def _units(
             raise InputError("the loads sum up to nothing; expected a load")
         extent = float(np.ptp(named.points, axis=0).max())
         return (
-            checked.positive("length", units.get("length", extent)),
-            checked.positive("force", units.get("force", total)),
+            checked.physical(
+                "length", checked.positive("length", units.get("length", extent))
+            ),
+            checked.physical(
+                "force", checked.positive("force", units.get("force", total))
+            ),
         )
 
 

@@ -21,7 +21,7 @@ from problems.description import CHOICES, SETTINGS, described_bodies, read_descr
 from problems.emit import FORMS, contact_case
 from problems.inverse import GeneralisedInverse
 from problems.linearise import linearisation
-from problems.ranges import at_least, one_of
+from problems.ranges import MOST_STEPS, at_least, at_most, one_of
 from problems.results import quantities
 from problems.stepping import LoadPath, primal_qp
 
@@ -65,6 +65,7 @@ class GmshBodies:
         if not p["path"]:
             raise InputError(f"{self.name}: path is missing; expected bodies:PATH.toml")
         at_least(1, self.name, params, ("steps", "step", "relin"))
+        at_most(MOST_STEPS, self.name, params, ("steps", "relin"))
         if p["step"] > p["steps"]:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"

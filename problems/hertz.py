@@ -38,7 +38,7 @@ from problems.elasticity import Material, Plane
 from problems.emit import contact_case
 from problems.linearise import METHODS, linearisation
 from problems.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
-from problems.ranges import at_least, one_of, positive
+from problems.ranges import at_least, at_most, fits, one_of, positive
 from problems.results import contact_forces, quantities
 from problems.stepping import primal_qp
 
@@ -90,6 +90,8 @@ class HertzPlane:
         """Raise InputError unless every key is in its range."""
         at_least(1, self.name, params, ("n",))
         at_least(0, self.name, params, ("halvings",))
+        at_most(30, self.name, params, ("halvings",))
+        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         positive(self.name, params, ("load",))
         one_of(self.name, params, {"plane": ("strain", "stress")})
 
@@ -137,6 +139,8 @@ class HertzCylinder:
         """Raise InputError unless every key is in its range."""
         at_least(1, self.name, params, ("n", "m"))
         at_least(0, self.name, params, ("halvings",))
+        at_most(30, self.name, params, ("halvings",))
+        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         positive(self.name, params, ("load", "radius", "ratio"))
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),

@@ -41,7 +41,7 @@ from harness import (
 )
 from problems.dual import Transformed, dual_bounds
 from problems.inverse import GeneralisedInverse, regular_inverse
-from problems.ranges import at_least, doubled, one_of
+from problems.ranges import at_least, doubled, fits, one_of
 from problems.results import ACTIVE
 
 HALF = 1.5  #: half the width of Ω, m
@@ -62,6 +62,7 @@ class Obstacle:
         """Raise InputError unless every key is in its range."""
         one_of(self.name, params, {"dim": (1, 2)})
         at_least(2, self.name, params, ("n",))
+        fits(self.name, int(params["n"]) ** int(params["dim"]))
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved."""

@@ -27,7 +27,7 @@ from problems.elasticity import Material
 from problems.emit import contact_case
 from problems.linearise import METHODS, linearisation
 from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.ranges import at_least, doubled, one_of, positive
+from problems.ranges import at_least, doubled, fits, one_of, positive
 from problems.results import quantities
 from problems.stepping import primal_qp
 from problems.stress import gauss_stress
@@ -54,6 +54,7 @@ class ContactPatch:
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         at_least(1, self.name, params, ("lower", "upper"))
+        fits(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
         positive(self.name, params, ("ratio",))
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),

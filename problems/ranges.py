@@ -5,6 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from harness import InputError, Value
+from harness.checked import LEAST, MOST
+from harness.limits import CASE_VARIABLE, case_limit_mib
+
+MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
+COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
 
 
 def at_least(
@@ -16,11 +21,42 @@ def at_least(
             raise InputError(f"{family}: {key}={params[key]} must be at least {least}")
 
 
+def at_most(
+    most: int, family: str, params: Mapping[str, Value], keys: Iterable[str]
+) -> None:
+    """Raise InputError unless each of the integer `keys` is at most `most`."""
+    for key in keys:
+        if int(params[key]) > most:
+            raise InputError(f"{family}: {key}={params[key]} must be at most {most}")
+
+
 def positive(family: str, params: Mapping[str, Value], keys: Iterable[str]) -> None:
-    """Raise InputError unless each of the real `keys` is positive."""
+    """Raise InputError unless each of the real `keys` is positive and of a usual size.
+
+    Products of several values beyond that would be no numbers any more.
+    """
     for key in keys:
         if float(params[key]) <= 0:
             raise InputError(f"{family}: {key}={params[key]} must be positive")
+        if not LEAST <= float(params[key]) <= MOST:
+            raise InputError(
+                f"{family}: {key}={params[key]} must be between {LEAST:g} and {MOST:g}"
+            )
+
+
+def fits(family: str, components: int) -> None:
+    """Raise InputError for a case that cannot fit into memory, before it is built.
+
+    components : of the displacement, or fewer; each takes 1 KiB at the very least (the
+        stiffness matrix and its pattern), with a factor about 4 KiB
+    """
+    needed, limit = components * COMPONENT_MIB, case_limit_mib()
+    if needed > limit:
+        raise InputError(
+            f"{family}: {components:.2g} components of the displacement take "
+            f"{needed:.2g} MiB of memory at least; expected a mesh that fits into "
+            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to what there is"
+        )
 
 
 def one_of(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,11 +11,12 @@ from typing import Any
 from harness import InputError, Record, Verdict
 from harness.journal import read_journal
 from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
+from harness.reading import read_json, read_toml
 from reports.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
-_AS_WRITTEN = "expected the file that the run wrote; restore it"
+_AS_WRITTEN = "the file that the run wrote; restore it"
 
 #: Worst first: the verdict on several repeats is the worst of theirs.
 SEVERITY = (
@@ -224,22 +223,19 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         directory=directory,
         journal=tuple(records),
         records=arrange(_apart(_judged(r, factor)) for r in records),
-        environment=_read(directory / "environment.json", json.loads),
-        suite=_read(directory / "suite.toml", tomllib.loads),
+        environment=_read(directory / "environment.json", read_json),
+        suite=_read(directory / "suite.toml", read_toml),
         factor=factor,
     )
 
 
-def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+def _read(path: Path, read: Callable[[Path, str], Any]) -> dict[str, Any]:
     """Read a table that a run wrote beside its journal; empty without a file."""
     if not path.exists():
         return {}
-    try:
-        table = parse(path.read_text("utf-8"))
-    except ValueError as e:  # no UTF-8, too
-        raise InputError(f"{path}: malformed: {e}; {_AS_WRITTEN}") from None
+    table = read(path, _AS_WRITTEN)
     if not isinstance(table, dict):
-        raise InputError(f"{path}: no JSON object; {_AS_WRITTEN}")
+        raise InputError(f"{path}: no JSON object; expected {_AS_WRITTEN}")
     return table
 
 

@@ -54,7 +54,7 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _measurement(record: Record) -> dict[str, Any]:
-    row = dict(vars(record))
+    row = record.to_dict()
     for name, value in row.items():
         if isinstance(value, dict | list):
             row[name] = json.dumps(value, ensure_ascii=False)
