@@ -29,8 +29,9 @@ browser: setup .venv/.browser  ## chromium and its driver, for the tests of the 
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
-test: setup browser check  ## check, then run the tests
-	$(BIN)/pytest -q
+test: setup browser check  ## check, then run the tests on all CPUs
+	$(BIN)/pytest -q -n auto -m 'not slow and not alone'
+	$(BIN)/pytest -q -m 'alone and not slow'
 
 bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
