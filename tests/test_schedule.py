@@ -34,18 +34,24 @@ class Quiet:
         pass
 
 
-def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+def planned(**changes):
+    """Plan three repeats of one case by the solvers a and b, but for the changes."""
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
         cases=(CaseName(family="f", params={"n": 1}, form="p"),), text="",
     )  # fmt: skip
-    progress, rng = Quiet(), np.random.default_rng(seed)
-    schedule = Schedule(
-        suite=replace(suite, **changes), families={"f": Family()},
-        options={"a": {}, "b": {}}, environment="e", progress=progress,
+    suite = replace(suite, **changes)
+    return Schedule(
+        suite=suite, families={"f": Family()}, environment="e", progress=Quiet(),
+        options={s.label: {} for s in suite.solvers},
     )  # fmt: skip
+
+
+def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
+    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+    rng = np.random.default_rng(seed)
+    schedule = planned(**changes)
     made = []
     for block in schedule.blocks():
         for (record,) in block.turns:
@@ -54,8 +60,37 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
             record = record.but(status=verdict, total_seconds=seconds)
             schedule.note(record)
             made.append(record)
-    assert len(made) + progress.skipped == schedule.cells
+    assert len(made) + schedule.progress.skipped == schedule.cells
     return made
+
+
+def test_who_was_first_in_a_block_is_last_in_the_next():
+    """So no place in a block favours anybody; pairs of blocks differ by chance."""
+    solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
+    blocks = list(planned(solvers=solvers, repeats=6).blocks())
+    orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
+
+    assert [order[::-1] for order in orders[::2]] == orders[1::2]
+    assert {"".join(sorted(order)) for order in orders} == {"abcdef"}
+    assert len(set(orders)) == 6
+
+
+def test_of_a_sequence_the_whole_is_compared():
+    """Its steps are noisy, but what one takes longer the other takes less."""
+    rng = np.random.default_rng(161803)
+    steps = tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2))
+    schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
+    blocks = 0
+    for block in schedule.blocks():
+        blocks += 1
+        for turn in block.turns:
+            whole = {"a": 1.0, "b": 2.0}[turn[0].solver]
+            part = whole * rng.uniform(0.2, 0.8)
+            for record, seconds in zip(turn, (part, whole - part), strict=True):
+                timed = record.but(status=Verdict.VERIFIED, total_seconds=seconds)
+                schedule.note(timed)
+
+    assert blocks == 3
 
 
 def test_without_a_precision_there_are_the_repeats_of_the_suite():
