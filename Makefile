@@ -9,7 +9,7 @@ BIN := .venv/bin
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
-.PHONY: help setup browser demo test bench docs weaknesses size crowd check clean
+.PHONY: help setup browser demo test mutants bench docs weaknesses size crowd check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -29,8 +29,12 @@ browser: setup .venv/.browser  ## chromium and its driver, for the tests of the 
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
-test: setup browser check  ## check, then run the tests
-	$(BIN)/pytest -q
+test: setup browser check  ## check, then run the tests on all CPUs
+	$(BIN)/pytest -q -n auto -m 'not slow and not alone'
+	$(BIN)/pytest -q -m 'alone and not slow'
+
+mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
+	@$(BIN)/python tools/mutants.py
 
 bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \

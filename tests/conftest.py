@@ -1,11 +1,25 @@
-"""Shared generators of QPs whose solution is known by construction."""
+"""Shared by all tests: a CPU for each pytest worker, QPs of known solution."""
 
+import os
 from collections.abc import Callable
 
 import pytest
 
 from harness import QP, Solution
 from harness.planted import planted as drawn
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give each of pytest-xdist's workers CPUs of its own, where there are enough.
+
+    The harness binds what it measures to the last CPU that it may use; without this,
+    all workers would measure on the same one.
+    """
+    worker = getattr(config, "workerinput", None)
+    if worker is not None:
+        cpus = sorted(os.sched_getaffinity(0))
+        index = int(worker["workerid"].removeprefix("gw")) % len(cpus)
+        os.sched_setaffinity(0, cpus[index :: worker["workercount"]])
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -154,6 +154,7 @@ def wait_for(condition, seconds=60):
         time.sleep(0.02)
 
 
+@pytest.mark.alone  # each node takes a CPU
 def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cli, cluster, tmp_path
 ):

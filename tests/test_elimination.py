@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse import bsr_array, coo_array, dia_array
+from scipy.sparse import bsr_array, coo_array, csr_array, dia_array
 
 from harness import QP, Status, kkt_residuals, no_rows
 from solvers.elimination import eliminate_free
@@ -76,7 +76,9 @@ def test_the_factor_is_used_again_only_for_the_same_block(dual):
     assert other_q.block is first.block
 
 
-@pytest.mark.parametrize("why", ["no free", "all free", "singular", "rows", "operator"])
+@pytest.mark.parametrize(
+    "why", ["no free", "all free", "singular", "rows", "inequalities", "operator"]
+)
 def test_what_cannot_be_eliminated_is_left(dual, why):
     qp = dual(271828)
     inf = np.full(24, np.inf)
@@ -85,6 +87,7 @@ def test_what_cannot_be_eliminated_is_left(dual, why):
         "all free": dict(lb=-inf),
         "singular": dict(P=np.diag(np.r_[np.zeros(12), np.ones(12)])),
         "rows": dict(A=np.ones((2, 24)), b=np.array([1.0, 2.0])),
+        "inequalities": dict(G=csr_array(np.ones((1, 24))), h=np.ones(1)),
         "operator": dict(P=type("Operator", (), {"shape": (24, 24)})()),
     }
 

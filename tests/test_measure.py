@@ -1,6 +1,7 @@
 """The clock in this process; what kills a process is in test_run.py."""
 
 import gc
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,48 @@ def test_both_phases_are_timed_and_add_up(qp):
     assert m.prepare_seconds > 0
     assert m.solve_seconds > 0
     assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
+
+
+@pytest.mark.parametrize("sample_seconds", [0.0, 0.1])
+def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_seconds):
+    """By a clock that only the solver moves: 1 ms to prepare, 4 ms to solve."""
+    now = [0.0]
+    honest = PLUGIN.solvers["honest"]
+
+    class Moves(type(honest)):
+        def prepare(self, qp, tol):
+            solve = super().prepare(qp, tol)
+            now[0] += 0.001
+
+            def moving():
+                now[0] += 0.004
+                return solve()
+
+            return moving
+
+    clock = sys.modules["harness.measure"]
+    monkeypatch.setattr(clock, "perf_counter", lambda: now[0])
+    m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds)
+
+    assert (m.prepare_seconds, m.solve_seconds) == pytest.approx((0.001, 0.004))
+    assert m.total_seconds == pytest.approx(0.005)
+    assert m.inner == (20 if sample_seconds else 1)
+    assert now[0] == pytest.approx(0.105 if sample_seconds else 0.005)
+
+
+def test_each_phase_has_a_peak_of_its_own(qp):
+    """What preparing needed and gave back is not counted where it solves."""
+    honest = PLUGIN.solvers["honest"]
+
+    class Hungry(type(honest)):
+        def prepare(self, qp, tol):
+            np.ones(2**24)  # 128 MiB
+            return super().prepare(qp, tol)
+
+    m = measure(Hungry(), qp, 1e-6)
+
+    assert m.prepare_peak_mib > m.solve_peak_mib + 100
+    assert m.peak_mib == m.prepare_peak_mib
 
 
 def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):

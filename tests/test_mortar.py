@@ -277,9 +277,10 @@ def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
     assert least_gap(-0.5, "dual") > 0.0099
 
 
+@pytest.mark.parametrize("height", [0.25, -0.25], ids=["apart", "overlapping"])
 @pytest.mark.parametrize(("distance", "kept"), [(0.3, 8), (0.2, 0)])
-def test_segments_farther_than_the_reach_do_not_count(distance, kept):
-    B, c = rows(flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False),
+def test_segments_farther_than_the_reach_do_not_count(distance, kept, height):
+    B, c = rows(flat(7, height, rightwards=True), flat(5, 0.0, rightwards=False),
                 reach=Reach(distance=distance))  # fmt: skip
 
     assert B.shape == (kept, 28)

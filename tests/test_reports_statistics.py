@@ -412,6 +412,23 @@ def test_nothing_is_predicted_beyond_the_measured_sizes():
             found.at(outside)
 
 
+def test_a_prediction_is_that_of_the_textbook():
+    """Half width of log v at x: t σ̂ √(1 + xᵀ(XᵀX)⁻¹x); x and rows of X are (1, log n).
+
+    Draper and Smith, Applied Regression Analysis, §3.1 in matrices.
+    """
+    n, v = np.array([100, 200, 800, 1600.0]), np.array([3, 4, 4, 7.0])
+    X = np.column_stack([np.ones(4), np.log(n)])
+    (c, p), (rss,), _, _ = np.linalg.lstsq(X, np.log(v), rcond=None)
+    x = np.array([1, np.log(1000)])
+    half = 4.302652730 * np.sqrt(rss / 2 * (1 + x @ np.linalg.inv(X.T @ X) @ x))
+
+    found = growth_of(n, v).at(1000)
+
+    ends = np.log([found.low, found.value, found.high])
+    assert ends == pytest.approx(c + p * x[1] + half * np.array([-1, 0, 1]))
+
+
 def test_predictions_cover_a_further_measurement_at_their_rate():
     rng = np.random.default_rng(24)
     n = np.geomspace(100, 1e5, 5)

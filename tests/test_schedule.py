@@ -26,26 +26,33 @@ class Family:
 class Quiet:
     def __init__(self):
         self.skipped = 0
+        self.said = []
 
     def advance(self, record):
         self.skipped += 1
 
     def say(self, text):
-        pass
+        self.said.append(text)
 
 
-def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+def planned(**changes):
+    """Plan three repeats of one case by the solvers a and b, but for the changes."""
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
         cases=(CaseName(family="f", params={"n": 1}, form="p"),), text="",
     )  # fmt: skip
-    progress, rng = Quiet(), np.random.default_rng(seed)
-    schedule = Schedule(
-        suite=replace(suite, **changes), families={"f": Family()},
-        options={"a": {}, "b": {}}, environment="e", progress=progress,
+    suite = replace(suite, **changes)
+    return Schedule(
+        suite=suite, families={"f": Family()}, environment="e", progress=Quiet(),
+        options={s.label: {} for s in suite.solvers},
     )  # fmt: skip
+
+
+def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
+    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+    rng = np.random.default_rng(seed)
+    schedule = planned(**changes)
     made = []
     for block in schedule.blocks():
         for (record,) in block.turns:
@@ -54,8 +61,94 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
             record = record.but(status=verdict, total_seconds=seconds)
             schedule.note(record)
             made.append(record)
-    assert len(made) + progress.skipped == schedule.cells
+    assert len(made) + schedule.progress.skipped == schedule.cells
     return made
+
+
+def test_who_was_first_in_a_block_is_last_in_the_next():
+    """So no place in a block favours anybody; pairs of blocks differ by chance."""
+    solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
+    blocks = list(planned(solvers=solvers, repeats=6).blocks())
+    orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
+
+    assert [order[::-1] for order in orders[::2]] == orders[1::2]
+    assert {"".join(sorted(order)) for order in orders} == {"abcdef"}
+    assert len(set(orders)) == 6
+
+
+def test_of_a_sequence_the_whole_is_compared():
+    """Its steps are noisy, but what one takes longer the other takes less."""
+    rng = np.random.default_rng(161803)
+    steps = tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2))
+    schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
+    blocks = 0
+    for block in schedule.blocks():
+        blocks += 1
+        for turn in block.turns:
+            whole = {"a": 1.0, "b": 2.0}[turn[0].solver]
+            part = whole * rng.uniform(0.2, 0.8)
+            for record, seconds in zip(turn, (part, whole - part), strict=True):
+                timed = record.but(status=Verdict.VERIFIED, total_seconds=seconds)
+                schedule.note(timed)
+
+        assert block.is_sequence
+
+    assert blocks == 3
+
+
+def records_of(blocks):
+    return [record for block in blocks for turn in block.turns for record in turn]
+
+
+def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
+    """After every number of measurements; blocks keep their numbers apart."""
+    suite = dict(
+        tolerances=(1e-4, 1e-6), repeats=2,
+        cases=tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2)),
+    )  # fmt: skip
+    every = records_of(planned(**suite).blocks())
+    assert len({r.run_id for r in every}) == planned(**suite).cells == 2 * 2 * 2 * 2
+
+    for done in range(len(every) + 1):
+        resumed = planned(**suite)
+        for record in every[:done]:
+            resumed.note(record)
+        left = records_of(resumed.blocks())
+        assert {r.run_id for r in left} == {r.run_id for r in every[done:]}
+        assert len(left) + resumed.progress.skipped == resumed.cells
+        first = max((r.block for r in every[:done]), default=-1) + 1
+        numbers = sorted({r.block for r in left})
+        assert numbers == list(range(first, first + len(numbers)))
+
+
+def test_a_solver_that_declined_a_case_is_not_asked_again():
+    schedule = planned()
+    asked = []
+    for block in schedule.blocks():
+        for (record,) in block.turns:
+            asked.append(record.solver)
+            verdict = Verdict.DECLINED if record.solver == "a" else Verdict.VERIFIED
+            schedule.note(record.but(status=verdict, total_seconds=1.0))
+
+    assert (asked.count("a"), asked.count("b")) == (1, 3)
+
+
+def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
+    cases = tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2))
+    schedule = planned(cases=cases)
+    blocks = schedule.blocks()
+    failed = next(blocks)
+
+    assert schedule.give_up(failed)
+    assert not schedule.give_up(failed)  # known by now
+    assert [b.cases for b in blocks] == 3 * [cases[1:]]
+
+
+def test_each_block_says_what_it_is_before_it_starts():
+    schedule = planned(repeats=2)
+    list(schedule.blocks())
+
+    assert schedule.progress.said == ["f/p, tol 1e-06, 1", "f/p, tol 1e-06, 2"]
 
 
 def test_without_a_precision_there_are_the_repeats_of_the_suite():

@@ -543,3 +543,18 @@ def test_a_large_box_with_a_far_feasible_point_is_not_called_infeasible(name):
     qp = mixed(np.eye(2), [0, 0], 0.0, [0.5, 2e7], [[1, 1e-7]], [1])
 
     assert SOLVERS[name].prepare(qp, 1e-8)().status is not Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("seed", range(10))
+def test_a_box_whose_only_feasible_point_is_a_corner_is_not_called_infeasible(
+    rows, seed
+):
+    """Even where the search is cut short: what is left of Ax − b is then rounding."""
+    rng = np.random.default_rng(seed)
+    A, lb = rng.uniform(0.1, 1, (rows, 6)), rng.standard_normal(6)
+    W = rng.standard_normal((6, 6))
+    qp = bounded(W @ W.T, rng.standard_normal(6), A, A @ lb, lb, lb + 1)
+    claims = {SMALBE(max_steps=k).prepare(qp, 1e-8)().status for k in (1, 2, 3, 50)}
+
+    assert claims <= {Status.ITERATION_LIMIT, Status.SOLVED}
