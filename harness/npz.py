@@ -81,8 +81,8 @@ def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
         return {name: _array(memory, m) for name, m in members.items()}
 
 
-def read(path: Path, only: str = "") -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file whose names begin with `only`, never unpickling.
+def read(path: Path) -> dict[str, NDArray[Any]]:
+    """Read every array of a file, never unpickling.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def read(path: Path, only: str = "") -> dict[str, NDArray[Any]]:
 
     """
     with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
-        members = {k: m for k, m in _members(archive).items() if k.startswith(only)}
+        members = _members(archive)
         check_size(f"{path}: what it holds", sum(m.file_size for m in members.values()))
         return {name: _read_array(archive, m) for name, m in members.items()}
 

@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
@@ -56,12 +55,12 @@ def load_history(folder: Path, digest: str) -> History:
     Raises
     ------
     InputError
-        When it is missing or damaged.
+        When it is missing or damaged, or its content is not that of the digest.
 
     """
     with _restorable():
-        path = _path(folder, digest)
-        return _history(path, read_arrays(path, (), only=_HISTORY))
+        path, arrays = _as_stored(folder, digest, ())
+        return _history(path, arrays)
 
 
 def save_fields(folder: Path, fields: Fields) -> str:
@@ -86,10 +85,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
     """
     with _restorable():
-        path = _path(folder, digest)
-        arrays = read_arrays(path, _ALWAYS)
-        if digest_of(arrays) != digest:
-            raise InputError(f"{path}: its content is not what was stored")
+        _, arrays = _as_stored(folder, digest, _ALWAYS)
     nodal = _with_prefix(_NODAL, arrays)
     known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
     return Fields(nodal=nodal, **known)
@@ -114,12 +110,8 @@ def read_point(path: Path, status: Status) -> Solution:
     return Solution(status=status, x=x, y=y, z=z, z_box=z_box, history=history)
 
 
-def read_arrays(
-    path: Path, expected: tuple[str, ...], *, only: str = ""
-) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Read an npz file, never unpickling.
-
-    only : how the names begin of the arrays to read
 
     Raises
     ------
@@ -128,7 +120,7 @@ def read_arrays(
         allows, or lacks one of the `expected` arrays.
 
     """
-    return _expected(path, partial(npz.read, only=only), expected)
+    return _expected(path, npz.read, expected)
 
 
 def mapped_arrays(
@@ -204,6 +196,17 @@ def _restorable() -> Iterator[None]:
         yield
     except InputError as e:
         raise InputError(f"{e}; restore the file, or run with --fresh") from None
+
+
+def _as_stored(
+    folder: Path, digest: str, expected: tuple[str, ...]
+) -> tuple[Path, dict[str, NDArray[Any]]]:
+    """Read arrays whose content must be that of the digest."""
+    path = _path(folder, digest)
+    arrays = read_arrays(path, expected)
+    if digest_of(arrays) != digest:
+        raise InputError(f"{path}: its content is not what was stored")
+    return path, arrays
 
 
 def is_stored(folder: Path, digest: str) -> bool:

@@ -18,7 +18,7 @@ from harness.journal import read_journal
 from harness.measure import measure
 from harness.registry import load_plugin
 from harness.show import convergence
-from harness.store import load_history, load_solution, save_solution
+from harness.store import load_history, load_solution, save, save_solution
 from harness.workbench import Workbench
 
 DESCENTS = Path(__file__).with_name("descents.py")
@@ -151,12 +151,11 @@ def test_a_history_is_part_of_the_digest_but_its_absence_is_not(tmp_path, point)
 
 
 def test_points_stored_before_there_were_histories_have_none(tmp_path):
-    (tmp_path / "vectors").mkdir()
     two = np.ones(2)
-    np.savez(tmp_path / "vectors" / "0ld.npz", x=two, y=two, z=two, z_box=two)
+    old = save(tmp_path, dict(x=two, y=two, z=two, z_box=two))
 
-    assert load_solution(tmp_path, "0ld", Status.SOLVED).history == {}
-    assert load_history(tmp_path, "0ld") == {}
+    assert load_solution(tmp_path, old, Status.SOLVED).history == {}
+    assert load_history(tmp_path, old) == {}
 
 
 def test_a_damaged_stored_history_is_named(tmp_path, point):
