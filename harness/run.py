@@ -102,6 +102,7 @@ def run(
                     book.take(outcome)
                     if book.was_deleted:
                         describe(out, suite, environment)
+                        journal.restore()
                         raise InputError(
                             f"{out} was deleted while the run wrote to it; its journal "
                             "is there again, solutions stored before are lost; the "
