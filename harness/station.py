@@ -195,10 +195,10 @@ class Station:
                 break
         else:
             refuse_full_disk(self._scratch, reply.message)
+            if reply.fault:
+                raise FaultError(reply.message)
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
-        if "fault" in reply.answer:
-            raise FaultError(reply.answer["fault"])
         if "unbuilt" in reply.answer:
             refuse_full_disk(self._scratch, reply.answer["unbuilt"])
             raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])

@@ -6,8 +6,10 @@ import logging
 import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -764,6 +766,24 @@ def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
     assert tries == [0.5, 1.0, 0.5, 1.0, 1.5]
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
     assert (len(tally.records), tally.skipped) == (3, 0)
+
+
+def kill_worker(solver):
+    """Kill the processes that serve a solver: those with its name as an argument."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            words = path.read_bytes().split(b"\0")
+            if str(PLUGIN).encode() in words and solver.encode() in words:
+                os.kill(int(path.parent.name), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
+    measure, tmp_path
+):
+    measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
+
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+    assert [f.tried_again for f in read_faults(tmp_path)] == [True]
 
 
 def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
