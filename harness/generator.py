@@ -8,8 +8,7 @@ It answers the requests of `harness.serving` with these of its own:
   point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
   with bounds of its error, and the deformed state in ``fields`` where there is one
 
-or to both ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``, or, where a file
-between it and the parent failed, ``{"event": "done", "fault": REASON}``; where NAME is
+or to both ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME is
 ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to stay
 in memory. What leads back from a point to the bodies is code, which no file can hold: a
 case that is on file is built again when a point of it comes.
@@ -24,7 +23,6 @@ from time import perf_counter
 from typing import Any
 
 from harness.build import build, unbuilt
-from harness.errors import InputError
 from harness.judge import certified, note_of, plain, quantities_of
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference
@@ -52,12 +50,9 @@ class Generator:
         except (Exception, SystemExit) as e:  # the family's code
             text = unbuilt(canonical(name, self._families[name.family]), e)
             return {"unbuilt": text, "trace": traceback.format_exc()}
-        try:
-            if "build" in request:
-                return self._written(case, name, Path(request["qp"]))
-            return _described(case, request)
-        except (OSError, InputError) as e:  # of the files between us and the parent
-            return {"fault": " ".join(str(e).split())}
+        if "build" in request:
+            return self._written(case, name, Path(request["qp"]))
+        return _described(case, request)
 
     def _case(self, name: CaseName, keep: int) -> Case:
         family = self._families[name.family]

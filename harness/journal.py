@@ -58,9 +58,20 @@ class Journal:
             When the disk is full, say.
 
         """
-        for file in self._others:
-            file.restore()
+        self.restore()
         self._own.append(record.to_json())
+
+    def restore(self) -> None:
+        """Write files again that were deleted since they were opened.
+
+        Raises
+        ------
+        InputError
+            When another program writes to the journal.
+
+        """
+        for file in (self._own, *self._others):
+            file.restore()
 
     def __enter__(self) -> Self:
         return self

@@ -110,8 +110,6 @@ class Node(WorkerPlugin):
         try:
             with self._busy:
                 return self._carried_out(key, block, tell)
-        except InputError as e:
-            raise InputError(f"{platform.node()}: {e}") from None
         finally:
             if self._ended:
                 self.teardown()
@@ -143,14 +141,17 @@ class Node(WorkerPlugin):
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
         self._key, self._outcomes = key, []
         is_fetched = True
-        for outcome in opened.station.carry_out(replace(block, turns=turns)):
-            self._fetched.clear()
-            self._outcomes.append(outcome)
-            tell()
-            if is_fetched:  # else nobody is there any longer
-                is_fetched = self._fetched.wait(COLLECT_SECONDS)
-            if self._ended:
-                break
+        try:
+            for outcome in opened.station.carry_out(replace(block, turns=turns)):
+                self._fetched.clear()
+                self._outcomes.append(outcome)
+                tell()
+                if is_fetched:  # else nobody is there any longer
+                    is_fetched = self._fetched.wait(COLLECT_SECONDS)
+                if self._ended:
+                    break
+        except InputError as e:  # its disk is full
+            raise InputError(f"{platform.node()}: {e}") from None
         delivery = self.collect(key)
         assert delivery is not None
         return delivery
@@ -159,7 +160,7 @@ class Node(WorkerPlugin):
         for path in self._plugins:
             if not path.is_file():
                 raise InputError(
-                    f"no plug-in {path}; "
+                    f"{platform.node()}: no plug-in {path}; "
                     "expected the same files under the same paths on every node"
                 )
         environment = capture_in(ONE_THREAD, self._plugins)
@@ -254,8 +255,8 @@ def own_cpu(stack: ExitStack) -> int:
             stack.callback(os.close, fd)
             return cpu
     raise InputError(
-        f"it has {len(usable)} usable CPUs, and as many Dask workers measure there "
-        "already; start fewer"
+        f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
+        "measure there already; start fewer"
     )
 
 

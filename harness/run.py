@@ -7,10 +7,13 @@ carries out the blocks. So a run is the same on one machine and on many.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import current_thread, main_thread
 from typing import Any
 
 from harness.block import Commands, Opens, Outcome, Result, Unbuilt, Unmade
@@ -72,7 +75,7 @@ def run(
     """
     refuse_foreign(out)
     environment = {"digest": digest, **environment}
-    with full_disk_told(out), locked(out) as held:
+    with _ended_by_sigterm(progress), full_disk_told(out), locked(out) as held:
         claim(out, suite, environment, fresh=fresh)
         with (
             scratch_in(out) as scratch,
@@ -102,6 +105,7 @@ def run(
                     book.take(outcome)
                     if book.was_deleted:
                         describe(out, suite, environment)
+                        journal.restore()
                         raise InputError(
                             f"{out} was deleted while the run wrote to it; its journal "
                             "is there again, solutions stored before are lost; the "
@@ -193,6 +197,26 @@ class _Book:
         if record.run_id not in self._counted:
             self._counted.add(record.run_id)
             self.progress.advance(measured)
+
+
+@contextmanager
+def _ended_by_sigterm(progress: Progress) -> Iterator[None]:
+    """Have SIGTERM end a run as Ctrl-C does: its processes, then itself, by 143."""
+
+    def end(*_: object) -> None:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    if current_thread() is not main_thread():  # which alone can be told
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    except SystemExit:
+        progress.warn("terminated; the same command continues")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _check_same(

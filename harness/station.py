@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from math import inf
 from pathlib import Path
 from types import TracebackType
@@ -195,10 +195,10 @@ class Station:
                 break
         else:
             refuse_full_disk(self._scratch, reply.message)
+            if reply.fault:
+                raise FaultError(reply.message)
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
-        if "fault" in reply.answer:
-            raise FaultError(reply.answer["fault"])
         if "unbuilt" in reply.answer:
             refuse_full_disk(self._scratch, reply.answer["unbuilt"])
             raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
@@ -213,7 +213,8 @@ class Station:
     def _start_anew(self, label: str) -> None:
         """Have files that may be lost made again, and a worker started."""
         self._entries = ()
-        self._scratch.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):  # the whole result folder has gone
+            self._scratch.mkdir(exist_ok=True)
         self._worker(label).close()
 
     def _qp(self, at: Entry) -> QP:

@@ -67,6 +67,7 @@ class _Bench:
         self._solver = solver
         self._operators = operators
         self._chain: Prepare | None = None
+        self._at = -1  # the step of the sequence that came last
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
         self._ballast = np.empty(0)
 
@@ -150,6 +151,9 @@ class _Bench:
         step = request.get("step")
         if step is None or not hasattr(self._solver, "chain"):
             return None
+        if step and self._at != step - 1:
+            raise LookupError("the process that drove the sequence so far has gone")
+        self._at = step
         if step == 0:
             self._chain = None
             chain, tol = self._solver.chain, request["tol"]

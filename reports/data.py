@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import InputError, Record, Verdict
+from harness.faults import Fault, left, read_faults
 from harness.journal import read_journal
 from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
 from harness.reading import read_json, read_toml
@@ -169,6 +170,9 @@ class Evidence:
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
     factor: float = VERIFIED_FACTOR  #: at which the records are judged
+    faults: tuple[
+        Fault, ...
+    ] = ()  #: why measurements are missing, by no solver's fault
 
     @property
     def name(self) -> str:
@@ -226,6 +230,7 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         environment=_read(directory / "environment.json", read_json),
         suite=_read(directory / "suite.toml", read_toml),
         factor=factor,
+        faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
     )
 
 

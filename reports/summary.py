@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from harness import Verdict
+from harness.faults import in_words
 from harness.kkt import VERIFIED_FACTOR
 from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell, sources
@@ -54,7 +55,8 @@ def summary(evidence: Evidence) -> Section:
             f"environments ({listing(digests)}); their times are not comparable."
         )
     notes = (
-        _judged(evidence), _at_factor(evidence), _busy(evidence), _unequal(evidence),
+        _unmade(evidence), _judged(evidence), _at_factor(evidence), _busy(evidence),
+        _unequal(evidence),
     )  # fmt: skip
     prose += [text for text in notes if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
@@ -90,6 +92,12 @@ def _made(evidence: Evidence) -> str:
         text += f", {declined * repeats} not made because a solver declined"
     missing = total - made - declined * repeats
     return f"{text}, {missing} not made yet" if missing else text
+
+
+def _unmade(evidence: Evidence) -> str:
+    """Say which measurements faults of ours or of the machine prevented."""
+    text = in_words(evidence.faults)
+    return f"{clean(text, 400)}. The same command tries them again." if text else ""
 
 
 def _cells(evidence: Evidence) -> int:

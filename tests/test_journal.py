@@ -1,5 +1,7 @@
 import json
 import os
+import resource
+import shutil
 
 import pytest
 
@@ -142,3 +144,38 @@ def test_what_is_no_folder_is_said_to_be_missing_or_a_file(tmp_path):
         with pytest.raises(InputError) as e:
             read_journal(tmp_path / name)
         assert str(e.value) == f"{tmp_path / name}: {wrong}; expected a result folder"
+
+
+def test_a_journal_that_is_deleted_while_it_is_written_loses_nothing(tmp_path):
+    with Journal(tmp_path, "other") as other:
+        other.append(record("x"))
+    told = []
+    with Journal(tmp_path, "here", told.append) as journal:
+        journal.append(record("a"))
+        shutil.rmtree(tmp_path / "journal")
+        journal.append(record("b"))
+        assert ids(tmp_path) == ["a", "b", "x"]
+        journal.append(record("c"))
+
+    assert ids(tmp_path) == ["a", "b", "c", "x"]
+    assert len(told) == 2
+
+
+def test_a_record_that_the_disk_takes_in_part_only_is_not_in_the_journal(tmp_path):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    file = tmp_path / "journal" / "here.jsonl"
+    with Journal(tmp_path, "here") as journal:
+        journal.append(record("a"))
+        limit = (
+            file.stat().st_size + 50
+        )  # bytes of the next line that there is room for
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        try:
+            with pytest.raises(OSError, match="File too large"):
+                journal.append(record("b"))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert file.stat().st_size == limit - 50
+        journal.append(record("c"))
+
+    assert ids(tmp_path) == ["a", "c"]

@@ -1,17 +1,24 @@
 """Whole runs: of solvers that misbehave, interrupted, resumed, on shared folders."""
 
+import errno
 import json
 import logging
 import os
+import resource
+import shutil
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from harness import InputError, Status, Verdict
+from harness import InputError, Status, Verdict, remote
 from harness.block import Commands
+from harness.errors import FaultError
+from harness.faults import left, read_faults
 from harness.journal import read_journal
 from harness.names import CaseName
 from harness.registry import SolverSpec, load_plugin, resolve
@@ -29,15 +36,16 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Tally:
-    """A progress that remembers what it was told."""
+    """A progress that remembers what it was told, and may act after some records."""
 
-    def __init__(self, interrupt_after=None):
+    def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None
         self.records = []
         self.warnings = []
         self.skipped = 0
         self.unbuilt = None
         self._left = interrupt_after
+        self._after, self._act = after, act
 
     def start(self, total):
         self.total = total
@@ -53,6 +61,8 @@ class Tally:
             self.skipped += 1
             return
         self.records.append(record)
+        if len(self.records) == self._after:
+            self._act()
         if self._left is not None and len(self.records) == self._left:
             raise KeyboardInterrupt
 
@@ -83,12 +93,14 @@ def measure(tmp_path):
         suite,
         *,
         interrupt_after=None,
+        after=None,
+        act=None,
         digest="here",
         fresh=False,
         out=tmp_path,
         environment=None,
     ):
-        tally = Tally(interrupt_after)
+        tally = Tally(interrupt_after, after, act)
         missing = run(
             suite,
             families=FAMILIES,
@@ -592,3 +604,214 @@ def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
 
     with pytest.raises(InputError, match="expected a folder that can be written"):
         measure(suite("honest"))
+
+
+def once_each(folder, count):
+    """The records of a journal, of which no measurement is there twice."""
+    records = read_journal(folder)
+    assert len({r.run_id for r in records}) == len(records) == count
+    return records
+
+
+@pytest.mark.parametrize("lost", ["journal", "vectors", "cases", ".scratch", ".lock"])
+def test_what_is_deleted_during_a_run_costs_no_measurement(measure, tmp_path, lost):
+    def delete():
+        path = tmp_path / lost
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+
+    tally = measure(suite("honest", "zero", repeats=2), after=1, act=delete)
+
+    records = once_each(tmp_path, 4)
+    assert (len(tally.records), tally.skipped, tally.total) == (4, 0, 4)
+    assert {r.solver: r.status for r in records} == {
+        "honest": Verdict.VERIFIED, "zero": Verdict.WRONG,
+    }  # fmt: skip
+    assert tally.faults == []
+    assert load_solution(tmp_path, records[-1].vectors, Status.SOLVED).x.size == 2
+
+
+def test_a_run_whose_folder_is_moved_ends_and_continues_there(measure, tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    whole = suite("honest", repeats=3)
+    with pytest.raises(InputError, match=f"was moved to {there} .* continues"):
+        measure(whole, out=here, after=1, act=lambda: here.rename(there))
+
+    assert not here.exists()
+    once_each(there, 1)
+    measure(whole, out=there)
+    once_each(there, 3)
+
+
+def test_a_run_whose_folder_is_deleted_keeps_its_journal_and_continues(
+    measure, tmp_path
+):
+    out = tmp_path / "out"
+    whole = suite("honest", repeats=3)
+    with pytest.raises(InputError, match=r"was deleted .* same command continues"):
+        measure(whole, out=out, after=1, act=lambda: shutil.rmtree(out))
+
+    assert 0 in {r.repeat for r in once_each(out, len(read_journal(out)))}
+    measure(whole, out=out)
+    once_each(out, 3)
+
+
+def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
+    measure, tmp_path, monkeypatch
+):
+    whole = suite("honest", "zero")
+    real, said = os.fsync, set()
+    for writes in range(100):
+        left = [writes]
+
+        def fsync(fd, left=left):
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            real(fd)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        try:
+            measure(whole)
+            break
+        except InputError as e:
+            said.add(str(e).partition("; ")[2])
+        assert not [*tmp_path.rglob("*.tmp")]
+
+    assert said == {"free some space, and the same command continues"}
+    records = once_each(tmp_path, 2)
+    assert {r.status for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
+    assert writes > 6  # suite and environment alone are four
+
+
+@pytest.mark.parametrize("size", [600, 4000])
+def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, size):
+    """A point takes more than 600 bytes, a case more than 4000; the rest less."""
+    whole = suite("honest", "prints")
+    if size == 600:
+        measure(suite("zero"))
+        shutil.rmtree(tmp_path / "journal")
+        shutil.rmtree(tmp_path / "vectors")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(InputError, match=r"File too large .* command continues"):
+            measure(whole)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert read_journal(tmp_path) == []
+
+    measure(whole)
+    assert {r.status for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
+
+
+@pytest.fixture
+def faults(monkeypatch):
+    """Have the measurements of which `prevented` is true end by a fault of ours."""
+
+    def faults(prevented):
+        def measured(worker, qp, record, request, **limits):
+            if prevented(record):
+                raise FaultError("the worker was killed before its solve")
+            return remote.measured(worker, qp, record, request, **limits)
+
+        monkeypatch.setattr("harness.station.measured", measured)
+
+    return faults
+
+
+def test_a_measurement_that_a_fault_prevents_is_made_again_at_once(
+    measure, tmp_path, faults
+):
+    tries = []
+    faults(lambda record: tries.append(record.run_id) or len(tries) == 2)
+    tally = measure(suite("honest", "zero"))
+
+    once_each(tmp_path, 2)
+    assert len(tries) == 3
+    (fault,) = read_faults(tmp_path)
+    assert (fault.tried_again, fault.run_id) == (True, tries[1])
+    assert tries[1] == tries[2] != tries[0]
+    assert tally.faults == []
+    assert len(tally.records) == 2
+
+
+def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
+    measure, tmp_path, faults
+):
+    whole = suite("honest", "zero", repeats=2)
+    faults(lambda record: (record.solver, record.repeat) == ("zero", 0))
+    tally = measure(whole)
+
+    once_each(tmp_path, 3)
+    (fault,) = tally.faults
+    assert (fault.solver, fault.case) == ("zero", "tiny/plain")
+    assert [f.tried_again for f in read_faults(tmp_path)] == [True, False]
+    assert (len(tally.records), tally.skipped, tally.total) == (3, 1, 4)
+
+    faults(lambda record: False)
+    again = measure(whole)
+    assert again.faults == []
+    assert len(again.records) == 1
+    once_each(tmp_path, 4)
+    assert left(read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]) == []
+
+
+def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
+    measure, tmp_path, faults
+):
+    tries = []
+    faults(lambda r: tries.append(r.params["h"]) or tries == [0.5, 1.0])
+    tally = measure(three_steps("chains"))
+
+    assert tries == [0.5, 1.0, 0.5, 1.0, 1.5]
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+    assert (len(tally.records), tally.skipped) == (3, 0)
+
+
+def kill_worker(solver):
+    """Kill the processes that serve a solver: those with its name as an argument."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            words = path.read_bytes().split(b"\0")
+            if str(PLUGIN).encode() in words and solver.encode() in words:
+                os.kill(int(path.parent.name), signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
+    measure, tmp_path
+):
+    measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
+
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+    assert [f.tried_again for f in read_faults(tmp_path)] == [True]
+
+
+def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
+    measure, tmp_path, faults
+):
+    faults(lambda record: record.params["h"] == 1.0)
+    tally = measure(three_steps("chains"))
+    assert [f.case for f in tally.faults] == ["tiny/plain", "tiny/h=1.5/plain"]
+    assert (len(tally.records), tally.skipped, tally.total) == (1, 2, 3)
+
+    faults(lambda record: False)
+    measure(three_steps("chains"))
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+
+
+def test_what_a_killed_run_left_unfinished_goes_when_the_next_begins(measure, tmp_path):
+    measure(suite("honest"))
+    stale = [
+        tmp_path / name
+        for name in (
+            ".mortarbench-0.tmp", "suite.tmp", "vectors/tmp0.tmp", "cases/0.new",
+            "report/.mortarbench-0.tmp",
+        )
+    ]  # fmt: skip
+    (tmp_path / "report").mkdir()
+    for path in (*stale, tmp_path / "my.tmp"):
+        path.touch()
+    measure(suite("honest"))
+
+    assert not any(path.exists() for path in stale)
+    assert (tmp_path / "my.tmp").exists()

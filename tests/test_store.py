@@ -1,4 +1,5 @@
 import os
+import shutil
 import time
 from dataclasses import replace
 
@@ -107,3 +108,11 @@ def test_a_missing_or_damaged_file_is_named(tmp_path, solution):
         load_solution(tmp_path, digest, Status.SOLVED)
     with pytest.raises(InputError, match="0000"):
         load_solution(tmp_path, "0000", Status.SOLVED)
+
+
+def test_a_point_is_stored_where_its_folder_was_deleted(tmp_path, solution):
+    save_solution(tmp_path, solution)
+    shutil.rmtree(tmp_path / "vectors")
+    digest = save_solution(tmp_path, solution)
+
+    assert load_solution(tmp_path, digest, Status.SOLVED).z_box[0] == np.inf
