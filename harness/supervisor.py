@@ -116,7 +116,7 @@ class WorkerProcess:
         self._mark = ""
         self._cpu = -1
         self._requests = self._replies = -1  # our ends of the two pipes
-        self._unread = b""
+        self._unread = bytearray()
         self._looked = 0.0  # when nothing had come yet, by our clock
         self._warms_up = True
         self._is_stopped = self._was_busy = False
@@ -274,7 +274,7 @@ class WorkerProcess:
         usable = os.sched_getaffinity(0)
         self._cpu, self._mark = max(usable), secrets.token_hex(16)
         self._footprint = Footprint()
-        self._unread = b""
+        self._unread = bytearray()
         their_requests, self._requests = os.pipe()
         self._replies, their_replies = os.pipe()
         try:
@@ -351,20 +351,24 @@ class WorkerProcess:
         """
         if b"\n" in self._unread:  # two replies came at once
             return True
-        if not select([self._replies], [], [], timeout)[0]:
-            return False
-        chunk = os.read(self._replies, 2**16)
-        self._unread += chunk
-        if not chunk:  # closed: the worker is dying, or its solver closed all it found
-            time.sleep(timeout)
-        return bool(chunk)
+        has_more = False
+        while select([self._replies], [], [], 0 if has_more else timeout)[0]:
+            chunk = os.read(self._replies, 2**16)
+            if not chunk:  # closed: the worker is dying, or its solver closed all
+                time.sleep(timeout)
+                break
+            self._unread += chunk
+            has_more = True
+            if b"\n" in chunk or len(self._unread) > LONGEST_REPLY:
+                break
+        return has_more
 
     def _next_line(self) -> bytes | None:
         line, newline, rest = self._unread.partition(b"\n")
         if not newline:
             return None
         self._unread = rest
-        return line
+        return bytes(line)
 
     def _check_memory(self, event: str, limit: float) -> None:
         held = self._footprint.mib(self._tree(), limit)
