@@ -357,6 +357,16 @@ def spin(seconds):
         pass
 
 
+class Computes(Honest):
+    """Takes some milliseconds of arithmetic, as an honest solver does."""
+
+    def act(self, qp):
+        matrix, vector = np.ones((200, 200)), np.ones(200)
+        for _ in range(1000):
+            matrix @ vector
+        return at_the_row(qp)
+
+
 class PatchesTheClock(Honest):
     """2 ms of work, and a clock that goes backwards."""
 
@@ -413,6 +423,25 @@ class KillsItsReaper(Honest):
 class StopsItself(Honest):
     def act(self, qp):
         os.kill(os.getpid(), signal.SIGSTOP)
+
+
+class KillsItself(Honest):
+    """As if somebody else did, when one has had a look at its memory."""
+
+    def act(self, qp):
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class KilledOnceWarmingUp(Honest):
+    """By what looks like somebody else; knows by $KILLED that it has been."""
+
+    def prepare(self, qp, tol):
+        killed = Path(os.environ["KILLED"])
+        if not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().prepare(qp, tol)
 
 
 class ClosesAll(Honest):

@@ -1,5 +1,6 @@
 """Solvers that attack the run: what it makes of them, and that neighbours are safe."""
 
+import itertools
 import os
 import re
 import secrets
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from harness import Verdict
+from harness import Verdict, supervisor
 from harness.block import Commands
 from harness.errors import FaultError
 from harness.journal import read_journal
@@ -73,6 +74,7 @@ OUTCOMES = {
     "sleepsbehindtheclock": (Verdict.VERIFIED, OURS),
     "killsitsreaper": (Verdict.CRASHED, "^SIGKILL$"),
     "stopsitself": (Verdict.TIME_LIMIT, "killed after 3 s"),
+    "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
     "blockssignals": (Verdict.TIME_LIMIT, "killed after 3 s"),
 }
@@ -338,6 +340,31 @@ def test_a_worker_that_is_killed_before_its_solve_is_a_fault(bench):
 
     with pytest.raises(FaultError, match="before solving: SIGKILL"):
         bench("honest", command=command)
+
+
+def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
+    bench, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("KILLED", str(tmp_path / "killed"))
+    record = bench("killedoncewarmingup")
+
+    assert (tmp_path / "killed").exists()
+    assert record.status is Verdict.VERIFIED
+    assert record.threads is not None  # told by the warm-up
+
+
+@pytest.mark.parametrize(("limit", "is_fault"), [(float("inf"), True), (1.0, False)])
+def test_a_kill_for_want_of_memory_is_the_solvers_where_it_held_the_memory(
+    bench, monkeypatch, limit, is_fault
+):
+    counts = itertools.count()
+    monkeypatch.setattr(supervisor, "_oom_kills", lambda: next(counts))
+    monkeypatch.setattr(supervisor.limits, "memory_limit_mib", lambda: limit)
+    if is_fault:
+        with pytest.raises(FaultError, match="SIGKILL: the machine ran out of memory"):
+            bench("killsitself")
+    else:
+        assert bench("killsitself").status is Verdict.MEMORY_LIMIT
 
 
 def test_a_command_that_does_not_exist_is_a_fault(bench):
