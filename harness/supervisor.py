@@ -279,9 +279,8 @@ class WorkerProcess:
         self._replies, their_replies = os.pipe()
         try:
             self._log.write_bytes(b"")
-            with self._log.open(
-                "ab"
-            ) as log:  # appending: it survives our truncating it
+            # appending: it survives our truncating it
+            with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
                     [
                         sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
@@ -300,7 +299,10 @@ class WorkerProcess:
             os.close(their_requests)
             os.close(their_replies)
         self._await("ready", START_SECONDS, memory_limit)
-        self._worker = next(iter(self._tree()), 0)  # the first child of its parent
+        tree = self._tree()
+        if not tree:
+            raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
+        self._worker = tree[0]  # what comes later is listed later
 
     def _send(self, request: Mapping[str, Any]) -> None:
         with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
@@ -444,13 +446,14 @@ class WorkerProcess:
     def _stays_busy(self) -> bool:
         """Whether threads of the worker run on although it has answered.
 
-        Threads of pools spin for a while before they sleep.
+        Threads of pools spin for a while before they sleep. One that only waits for a
+        CPU, on a machine that is not ours alone, uses none.
         """
         deadline = time.monotonic() + SETTLE_SECONDS
-        pause = POLL_SECONDS / 100
+        pause, used = POLL_SECONDS / 100, self._cpu_seconds()
         while self._runs():
             if time.monotonic() > deadline:
-                return True
+                return self._cpu_seconds() - used > LEAST_BUSY_SECONDS
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         return False

@@ -338,15 +338,18 @@ class HoardsInADaemon(Honest):
     """600 MiB in a process that has left the session."""
 
     def act(self, qp):
+        hoarded, tells = os.pipe()
         if os.fork() == 0:
             os.setsid()
             if os.fork() == 0:
                 hoard = mmap.mmap(-1, 600 * 2**20)
                 for _ in range(600):
                     hoard.write(bytes(2**20))
+                os.write(tells, b"all")
                 time.sleep(3600)
             os._exit(0)
         os.wait()
+        os.read(hoarded, 3)
         time.sleep(1)
         return at_the_row(qp)
 
@@ -379,12 +382,16 @@ class PatchesTheClock(Honest):
 
 
 class SleepsBehindTheClock(Honest):
-    """0.3 s in which another process could have worked."""
+    """0.3 s in which another process could have worked; its clock says 3 ms."""
 
-    def act(self, qp):
+    def prepare(self, qp, tol):
         import harness.measure
 
-        harness.measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
+        if harness.measure.perf_counter is time.perf_counter:  # in the warm-up
+            harness.measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
+        return super().prepare(qp, tol)
+
+    def act(self, qp):
         time.sleep(0.3)
         return at_the_row(qp)
 
