@@ -3,6 +3,7 @@
     .venv/bin/python benchmarks/runner.py overhead [N]   ms per tiny measurement
     .venv/bin/python benchmarks/runner.py growth [N]     memory, descriptors over N
     .venv/bin/python benchmarks/runner.py null [TRIALS]  A/A: intervals of a ratio of 1
+    .venv/bin/python benchmarks/runner.py attacks [N]    neighbours of attackers: times
 
 Overhead is the time from one record to the next, less what the worker spent in the
 solver and what the disk took to sync.
@@ -26,6 +27,7 @@ from harness.run import run
 from harness.suite import NULL, Suite
 
 PLUGIN = Path(__file__).parents[1] / "tests" / "adversaries.py"
+ATTACKERS = PLUGIN.with_name("attackers.py")
 
 
 class Watch:
@@ -67,9 +69,10 @@ class Watch:
         return found
 
 
-def measure(out, *solvers, repeats):
-    """Run solvers of the plug-in on its tiny QP; returns who watched."""
-    plugin = load_plugin(PLUGIN)
+def measure(out, *solvers, repeats, plugin=PLUGIN):
+    """Run solvers of a plug-in on its tiny QP; returns who watched."""
+    start = [sys.executable, "-P", str(plugin)]
+    plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
     specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", arm="null")]
     tiny = plugin.problems["tiny"]
@@ -78,7 +81,6 @@ def measure(out, *solvers, repeats):
         memory_limit=4096.0, solvers=tuple(specs), text="",
         cases=(CaseName(family="tiny", params=dict(tiny.defaults), form="plain"),),
     )  # fmt: skip
-    start = [sys.executable, "-P", str(PLUGIN)]
     watch = Watch()
     run(
         suite, families=plugin.problems, out=out, environment={}, digest="here",
@@ -130,6 +132,33 @@ def null(trials=40, blocks=10):
     )
 
 
+def attacks(n=20):
+    """Print a solver's times after honest neighbours and after attackers, in turns."""
+    calm, attackers = ("honest",), ("daemon", "executeddaemon", "burns", "pools")
+    os.environ["ATTACKED"] = "benchmark"
+    times = {calm: [], attackers: []}
+    for turn in range(n):
+        for neighbours in (calm, attackers) if turn % 2 else (attackers, calm):
+            with tempfile.TemporaryDirectory() as out:
+                watch = measure(
+                    Path(out), "computes", *neighbours, repeats=5, plugin=ATTACKERS
+                )
+            found = [t for solver, _, t in watch.records if solver == "computes"]
+            times[neighbours].append(median(found))
+    for neighbours, found in times.items():
+        low, middle, high = quantiles(found, n=4)
+        print(
+            f"beside {', '.join(neighbours)}: {1e3 * middle:.3f} ms "
+            f"[{1e3 * low:.3f}, {1e3 * high:.3f}]"
+        )
+    ratios = [a / b for a, b in zip(times[attackers], times[calm], strict=True)]
+    low, middle, high = quantiles(ratios, n=4)
+    print(f"ratio within turns: {middle:.3f} [{low:.3f}, {high:.3f}]")
+
+
 if __name__ == "__main__":
     what, *numbers = sys.argv[1:] or ["overhead"]
-    {"overhead": overhead, "growth": growth, "null": null}[what](*map(int, numbers))
+    what_it_does = {
+        "overhead": overhead, "growth": growth, "null": null, "attacks": attacks,
+    }  # fmt: skip
+    what_it_does[what](*map(int, numbers))

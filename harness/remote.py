@@ -223,7 +223,8 @@ def _believed(reply: Reply, solution: Solution) -> tuple[Measurement, *tuple[str
     phases = told["prepare_seconds"] + told["solve_seconds"]
     least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
     adds_up = abs(phases - told["total_seconds"]) <= 1e-6 * phases + 1e-9
-    if adds_up and least <= reported <= clock.most:
+    possible = adds_up and min(told["prepare_seconds"], told["solve_seconds"]) >= 0
+    if possible and least <= reported <= clock.most:
         return (Measurement(solution=solution, **told),)
     ours = dict.fromkeys(("prepare_seconds", "solve_seconds", "first_seconds"))
     told |= {**ours, "total_seconds": clock.seen / times}

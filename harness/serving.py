@@ -27,7 +27,7 @@ from typing import Any, TextIO
 from harness.record import finite
 from harness.solution import Status
 
-LONGEST_REPLY = 2**24  #: bytes
+LONGEST_REPLY = 2**22  #: bytes
 MOST_ECHOED = 200  #: characters of what came, in a message
 LONGEST_TEXT = 2000  #: characters that a solver's message may have
 MOST_NAMED = 1000  #: values that a solver may name
@@ -150,6 +150,11 @@ def _is_size(value: Any) -> bool:
     return value is None or (_is_number(value) and 0 <= value < 1e12)
 
 
+def _is_time(value: Any) -> bool:
+    """Any number: what the worker's clock says is held against ours."""
+    return value is None or _is_number(value)
+
+
 def _maybe(accepts: Accepts) -> Accepts:
     return lambda value: value is None or accepts(value)
 
@@ -178,10 +183,10 @@ _MEASURED: Mapping[str, Accepts] = {
     "iterations": _maybe(_is_count),
     "counts": _named(_is_count),
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
-    "prepare_seconds": _is_size,
-    "solve_seconds": _is_size,
-    "total_seconds": _is_size,
-    "first_seconds": _is_size,
+    "prepare_seconds": _is_time,
+    "solve_seconds": _is_time,
+    "total_seconds": _is_time,
+    "first_seconds": _is_time,
     "peak_mib": _is_size,
     "prepare_peak_mib": _is_size,
     "solve_peak_mib": _is_size,

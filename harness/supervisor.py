@@ -116,7 +116,7 @@ class WorkerProcess:
         self._mark = ""
         self._cpu = -1
         self._requests = self._replies = -1  # our ends of the two pipes
-        self._unread = b""
+        self._unread = bytearray()
         self._looked = 0.0  # when nothing had come yet, by our clock
         self._warms_up = True
         self._is_stopped = self._was_busy = False
@@ -274,14 +274,13 @@ class WorkerProcess:
         usable = os.sched_getaffinity(0)
         self._cpu, self._mark = max(usable), secrets.token_hex(16)
         self._footprint = Footprint()
-        self._unread = b""
+        self._unread = bytearray()
         their_requests, self._requests = os.pipe()
         self._replies, their_replies = os.pipe()
         try:
             self._log.write_bytes(b"")
-            with self._log.open(
-                "ab"
-            ) as log:  # appending: it survives our truncating it
+            # appending: it survives our truncating it
+            with self._log.open("ab") as log:
                 self._process = subprocess.Popen(
                     [
                         sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
@@ -300,7 +299,10 @@ class WorkerProcess:
             os.close(their_requests)
             os.close(their_replies)
         self._await("ready", START_SECONDS, memory_limit)
-        self._worker = next(iter(self._tree()), 0)  # the first child of its parent
+        tree = self._tree()
+        if not tree:
+            raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
+        self._worker = tree[0]  # what comes later is listed later
 
     def _send(self, request: Mapping[str, Any]) -> None:
         with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
@@ -351,20 +353,24 @@ class WorkerProcess:
         """
         if b"\n" in self._unread:  # two replies came at once
             return True
-        if not select([self._replies], [], [], timeout)[0]:
-            return False
-        chunk = os.read(self._replies, 2**16)
-        self._unread += chunk
-        if not chunk:  # closed: the worker is dying, or its solver closed all it found
-            time.sleep(timeout)
-        return bool(chunk)
+        has_more = False
+        while select([self._replies], [], [], 0 if has_more else timeout)[0]:
+            chunk = os.read(self._replies, 2**16)
+            if not chunk:  # closed: the worker is dying, or its solver closed all
+                time.sleep(timeout)
+                break
+            self._unread += chunk
+            has_more = True
+            if b"\n" in chunk or len(self._unread) > LONGEST_REPLY:
+                break
+        return has_more
 
     def _next_line(self) -> bytes | None:
         line, newline, rest = self._unread.partition(b"\n")
         if not newline:
             return None
         self._unread = rest
-        return line
+        return bytes(line)
 
     def _check_memory(self, event: str, limit: float) -> None:
         held = self._footprint.mib(self._tree(), limit)
@@ -440,13 +446,14 @@ class WorkerProcess:
     def _stays_busy(self) -> bool:
         """Whether threads of the worker run on although it has answered.
 
-        Threads of pools spin for a while before they sleep.
+        Threads of pools spin for a while before they sleep. One that only waits for a
+        CPU, on a machine that is not ours alone, uses none.
         """
         deadline = time.monotonic() + SETTLE_SECONDS
-        pause = POLL_SECONDS / 100
+        pause, used = POLL_SECONDS / 100, self._cpu_seconds()
         while self._runs():
             if time.monotonic() > deadline:
-                return True
+                return self._cpu_seconds() - used > LEAST_BUSY_SECONDS
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         return False

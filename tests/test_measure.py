@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import harness.measure
 from harness import Status
 from harness.measure import measure
 from harness.registry import load_plugin
@@ -126,3 +127,38 @@ def test_garbage_is_not_collected_while_the_clock_runs(qp):
 
     assert measure(Looks(), qp, 1e-6).solution.message == "ValueError: gc is False"
     assert gc.isenabled()
+
+
+def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
+    monkeypatch.setattr(harness.measure, "_inner", lambda *_: 3)
+    seen = []
+
+    class Sees(type(PLUGIN.solvers["honest"])):
+        def prepare(self, qp, tol):
+            seen.append(qp)
+            return super().prepare(qp, tol)
+
+    measure(Sees(), qp, 1e-6, sample_seconds=1.0)
+
+    for part in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
+        assert len({id(getattr(qp, part)) for qp in seen}) == 4, part
+    assert len({id(qp.P.data) for qp in seen}) == 4
+    for other in seen:
+        assert (other.P - qp.P).nnz == (other.G - qp.G).nnz == 0
+        assert np.array_equal(other.q, qp.q)
+        assert not other.q.flags.writeable
+
+
+def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
+    asked = []
+    clock = iter(range(100))
+
+    class Asks(type(PLUGIN.solvers["honest"])):
+        def declines(self, qp):
+            asked.append(next(clock))
+
+    monkeypatch.setattr(harness.measure, "perf_counter", lambda: next(clock))
+    m = measure(Asks(), qp, 1e-6)
+
+    assert asked == [1]  # the clock had been read once
+    assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked

@@ -1,0 +1,481 @@
+"""A plug-in: solvers that attack the run, and an honest one that looks around.
+
+They solve `tiny` of adversaries.py, rightly, but for what they do besides. `witness`
+fails where a process of another solver runs while it solves.
+
+Run as a program with the name of a solver and two file descriptors, it is a worker.
+"""
+
+import ctypes
+import json
+import mmap
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from adversaries import PROBLEMS, Honest, at_the_row
+
+from harness import generator
+from harness.reaper import MARK, state
+from harness.worker import serve
+
+
+def trees(of_run):
+    """The processes that a run has started, directly or not: the marks of their trees.
+
+    of_run : value of the variable ATTACKED in their environment
+    """
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (entry / "environ").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if f"ATTACKED={of_run}".encode() in environment:
+            marks = [line for line in environment if line.startswith(MARK.encode())]
+            found |= {int(entry.name): mark for mark in marks}
+    return found
+
+
+class Witness(Honest):
+    """Fails where a foreign process could run: not stopped, and no sub-reaper."""
+
+    def act(self, qp):
+        found = trees(os.environ["ATTACKED"])
+        mine = found[os.getpid()]
+        awake = [
+            process
+            for process, mark in found.items()
+            if mark != mine
+            and state(process) not in ("T", "t", "Z", "X", "")
+            and "reaper.py" not in Path(f"/proc/{process}/cmdline").read_text()
+        ]
+        if awake:
+            raise RuntimeError(f"disturbed by {awake}")
+        return at_the_row(qp)
+
+
+def reply_pipe():
+    """Find where this worker replies: the pipes that it may write to."""
+    for name in os.listdir("/proc/self/fd"):
+        fd = int(name)
+        try:
+            flags = int(Path(f"/proc/self/fdinfo/{fd}").read_text().split()[3], 8)
+            if fd > 2 and stat.S_ISFIFO(os.fstat(fd).st_mode) and flags & os.O_WRONLY:
+                yield fd
+        except OSError:
+            pass
+
+
+class Writes(Honest):
+    """Writes something to where the worker replies."""
+
+    text = b""
+
+    def act(self, qp):
+        for fd in reply_pipe():
+            os.write(fd, self.text)
+        return at_the_row(qp)
+
+
+class WritesNoise(Writes):
+    text = b"\xff\x00 no JSON \xfe\n"
+
+
+class WritesHalfALine(Writes):
+    text = b'{"event": "ti'
+
+
+class WritesDone(Writes):
+    text = b'{"event": "done", "claimed": "solved", "total_seconds": 1e-9}\n'
+
+
+class WritesATimed(Writes):
+    text = b'{"event": "timed", "nonce": ""}\n'
+
+
+class WritesNesting(Writes):
+    text = b"[" * 60_000 + b"\n"
+
+
+class WritesAHugeNumber(Writes):
+    text = b'{"event": ' + b"9" * 10_000 + b"}\n"
+
+
+class WritesEndlessly(Honest):
+    """Megabytes without an end of line."""
+
+    def act(self, qp):
+        (fd,) = reply_pipe()
+        while True:
+            os.write(fd, bytes(2**16))
+
+
+def of_this_request(name):
+    """Find a variable of the worker's code by its name: we share a process."""
+    frame = sys._getframe()
+    while name not in frame.f_locals:
+        frame = frame.f_back
+    return frame.f_locals[name]
+
+
+class Forges(Honest):
+    """Replies by itself, with the nonce that it finds in the memory of its process."""
+
+    answer: ClassVar[dict] = dict(
+        claimed="solved", message="", iterations=1, counts={}, reported={},
+        prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6,
+        first_seconds=None, peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=1.0,
+        inner=1, canary_seconds=1e-6,
+    )  # fmt: skip
+
+    def act(self, qp):
+        found = of_this_request("nonce")
+        (fd,) = reply_pipe()
+        for event in (
+            {"event": "timed"},
+            {"event": "done"} | self.answer,
+        ):
+            os.write(fd, (json.dumps(event | {"nonce": found}) + "\n").encode())
+        time.sleep(3600)
+
+
+class NegativeCounts(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), iterations=-5)
+
+
+class HugeCounts(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), counts={"products": 10**5000})
+
+
+class Text(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.array(["1", "0"]))
+
+
+class Complex(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.array([1.0 + 1j, 0.0]))
+
+
+class Objects(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=np.array([qp.h[0], 0.0], dtype=object))
+
+
+class Bomb:
+    """Something whose reading fails in its own way."""
+
+    @property
+    def shape(self):
+        raise UnspeakableError("boom")
+
+    def __array__(self, *_, **__):
+        raise UnspeakableError("boom")
+
+
+class UnspeakableError(Exception):
+    def __str__(self):
+        raise RuntimeError("cannot be shown")
+
+
+class Bombs(Honest):
+    def act(self, qp):
+        return replace(at_the_row(qp), x=Bomb())
+
+
+class Leaves(Honest):
+    """Leaves something where the worker will write its point."""
+
+    def act(self, qp):
+        self.leave(of_this_request("out"))
+        return at_the_row(qp)
+
+
+class LeavesAFifo(Leaves):
+    def leave(self, out):
+        if not out.exists():
+            os.mkfifo(out)
+
+
+class LeavesALink(Leaves):
+    def leave(self, out):
+        if not out.is_symlink():
+            out.symlink_to("/dev/zero")
+
+
+class LeavesAFolder(Leaves):
+    def leave(self, out):
+        (out / "full").mkdir(parents=True, exist_ok=True)
+
+
+class LeavesGigabytes(Leaves):
+    def leave(self, out):
+        if not out.exists():
+            with out.open("wb") as file:
+                file.truncate(2**33)
+
+
+class LeavesAnotherPoint(Leaves):
+    def leave(self, out):
+        with out.open("wb") as file:
+            np.savez(file, x=np.ones(3), y=np.ones(0), z=np.ones(1), z_box=np.ones(2))
+
+
+class LeavesText(Leaves):
+    def leave(self, out):
+        with out.open("wb") as file:
+            np.savez(file, x=np.array(["1", "0"]), y=[], z=[1.0], z_box=[0.0, 0.0])
+
+
+class Faults(Honest):
+    """Shares the process of the worker, whose code it breaks."""
+
+    def act(self, qp):
+        import harness.worker
+
+        harness.worker._write_new = None
+        return at_the_row(qp)
+
+
+class Daemon(Honest):
+    """Leaves a process behind that burns CPU time, in a session of its own."""
+
+    def act(self, qp):
+        if os.fork() == 0:
+            os.setsid()
+            if os.fork() == 0:
+                while True:
+                    pass
+            os._exit(0)
+        os.wait()
+        return at_the_row(qp)
+
+
+class ExecutedDaemon(Honest):
+    """Another program, that has closed all it inherited."""
+
+    def act(self, qp):
+        code = "import os\nif os.fork() == 0:\n  os.setsid()\n  while True: pass"
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return at_the_row(qp)
+
+
+class ForkBomb(Honest):
+    """Processes that replace each other faster than one can kill them one by one."""
+
+    def act(self, qp):
+        if os.fork() == 0:
+            os.setsid()
+            while True:
+                if os.fork():
+                    os._exit(0)
+        return at_the_row(qp)
+
+
+class HangsWithADaemon(Daemon):
+    def act(self, qp):
+        super().act(qp)
+        time.sleep(3600)
+
+
+class Burns(Honest):
+    """Leaves a thread behind that burns CPU time."""
+
+    def act(self, qp):
+        threading.Thread(target=self.burn, daemon=True).start()
+        return at_the_row(qp)
+
+    def burn(self):
+        while True:
+            pass
+
+
+class Pools(Honest):
+    """Leaves a thread behind that sleeps."""
+
+    def act(self, qp):
+        threading.Thread(target=time.sleep, args=[3600], daemon=True).start()
+        return replace(at_the_row(qp), counts={"process": os.getpid()})
+
+
+class HoardsInMemfd(Honest):
+    """600 MiB in a file in memory that it has not mapped."""
+
+    def act(self, qp):
+        fd = os.memfd_create("hoard")
+        for _ in range(600):
+            os.write(fd, bytes(2**20))
+        time.sleep(1)
+        return at_the_row(qp)
+
+
+class HoardsInShm(Honest):
+    """600 MiB in /dev/shm, left there."""
+
+    def act(self, qp):
+        with open(f"/dev/shm/{os.environ['ATTACKED']}-{os.getpid()}", "wb") as file:
+            for _ in range(600):
+                file.write(bytes(2**20))
+            time.sleep(1)
+        return at_the_row(qp)
+
+
+class HoardsInADaemon(Honest):
+    """600 MiB in a process that has left the session."""
+
+    def act(self, qp):
+        hoarded, tells = os.pipe()
+        if os.fork() == 0:
+            os.setsid()
+            if os.fork() == 0:
+                hoard = mmap.mmap(-1, 600 * 2**20)
+                for _ in range(600):
+                    hoard.write(bytes(2**20))
+                os.write(tells, b"all")
+                time.sleep(3600)
+            os._exit(0)
+        os.wait()
+        os.read(hoarded, 3)
+        time.sleep(1)
+        return at_the_row(qp)
+
+
+def spin(seconds):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        pass
+
+
+class Computes(Honest):
+    """Takes some milliseconds of arithmetic, as an honest solver does."""
+
+    def act(self, qp):
+        matrix, vector = np.ones((200, 200)), np.ones(200)
+        for _ in range(1000):
+            matrix @ vector
+        return at_the_row(qp)
+
+
+class PatchesTheClock(Honest):
+    """2 ms of work, and a clock that goes backwards."""
+
+    def act(self, qp):
+        import harness.measure
+
+        harness.measure.perf_counter = iter(np.arange(1e6) * -1e-9).__next__
+        spin(0.002)
+        return at_the_row(qp)
+
+
+class SleepsBehindTheClock(Honest):
+    """0.3 s in which another process could have worked; its clock says 3 ms."""
+
+    def prepare(self, qp, tol):
+        import harness.measure
+
+        if harness.measure.perf_counter is time.perf_counter:  # in the warm-up
+            harness.measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
+        return super().prepare(qp, tol)
+
+    def act(self, qp):
+        time.sleep(0.3)
+        return at_the_row(qp)
+
+
+class Remembers(Honest):
+    """16 ms at first; then it knows the answer, in this and other measurements."""
+
+    known: ClassVar[dict] = {}
+
+    def act(self, qp):
+        key = qp.q.tobytes()
+        if key not in self.known:
+            spin(0.016)
+            self.known[key] = at_the_row(qp)
+        return self.known[key]
+
+
+class WorksInDeclines(Honest):
+    """20 ms where it is only asked whether it would."""
+
+    def declines(self, qp):
+        if qp.q[0] == -4.0:
+            spin(0.02)
+
+
+class KillsItsReaper(Honest):
+    def act(self, qp):
+        if os.fork() == 0:
+            os.setsid()
+            while True:
+                pass
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(3600)
+
+
+class StopsItself(Honest):
+    def act(self, qp):
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+
+class KillsItself(Honest):
+    """As if somebody else did, when one has had a look at its memory."""
+
+    def act(self, qp):
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class KilledOnceWarmingUp(Honest):
+    """By what looks like somebody else; knows by $KILLED that it has been."""
+
+    def prepare(self, qp, tol):
+        killed = Path(os.environ["KILLED"])
+        if not killed.exists():
+            killed.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().prepare(qp, tol)
+
+
+class ClosesAll(Honest):
+    def act(self, qp):
+        os.closerange(3, 256)
+        return at_the_row(qp)
+
+
+class BlocksSignals(Honest):
+    """Survives the death of its parent, if it can."""
+
+    def act(self, qp):
+        ctypes.CDLL(None).prctl(1, 0)
+        time.sleep(3600)
+
+
+SOLVERS = {
+    name.lower(): kind()
+    for name, kind in list(globals().items())
+    if isinstance(kind, type)
+    and issubclass(kind, Honest)
+    and kind.__module__ == __name__
+} | {"honest": Honest()}
+
+if __name__ == "__main__":
+    what, *pipes = sys.argv[1:]
+    if what == "generator":
+        generator.serve(generator.Generator(PROBLEMS, None), *map(int, pipes))
+    else:
+        serve(SOLVERS[what], *map(int, pipes))
