@@ -158,16 +158,12 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Code a column if that shortens it."""
-    keys = [_key(v) for v in values]
+    """Code a column if that shortens it; 1 and 1.0 and True are different."""
+    tables = {id(v): v for v in values if type(v) in (dict, list)}  # many share one
+    known = {place: json.dumps(v) for place, v in tables.items()}
+    keys = [known.get(id(v)) or (type(v), v) for v in values]
     first = dict(zip(reversed(keys), reversed(values), strict=True))
     if 2 * len(first) > len(values):
         return list(values)
     different = {key: i for i, key in enumerate(first)}
     return {"values": [*first.values()], "at": [different[key] for key in keys]}
-
-
-def _key(value: Any) -> Any:
-    """Stand for a value in a dictionary; 1 and 1.0 and True are different."""
-    kind = type(value)  # by isinstance, two million of them take a second
-    return json.dumps(value) if kind is dict or kind is list else (kind, value)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness import Record
@@ -25,23 +26,33 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     (params, options, counts, quantities, …) differs between families and solvers, and
     is JSON text.
     """
-    columns = {f.name: _kind(str(f.type)) for f in fields(Record)}
     table = pa.table({
-        name: pa.array([_entry(getattr(r, name)) for r in records], kind)
-        for name, kind in columns.items()
+        f.name: _column([getattr(r, f.name) for r in records], str(f.type))
+        for f in fields(Record)
     })  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path, compression="zstd")
     return path
 
 
-def _entry(value: Any) -> Any:
+def _column(values: Sequence[Any], annotation: str) -> Any:
     """Store as in the journal: what is not finite is null, what is nested is text."""
-    value = finite(value)
-    if isinstance(value, Mapping):
-        return json.dumps(value, ensure_ascii=False)
-    return str(value) if isinstance(value, str) else value  # a verdict, plainly
+    kind = _TYPES.get(annotation.removesuffix(" | None"), pa.string())
+    if kind is _TYPES["float"]:
+        array = pa.array(values, kind)
+        return pc.if_else(pc.is_finite(array), array, pa.scalar(None, kind))
+    return pa.array(values if kind is _TYPES["int"] else texts(values), kind)
 
 
-def _kind(annotation: str) -> Any:
-    return _TYPES.get(annotation.removesuffix(" | None"), pa.string())
+def texts(values: Iterable[Any]) -> list[str | None]:
+    """Write every value as text, what is nested as JSON; equal objects once."""
+    known: dict[int, str] = {}  # by identity: a journal's records share their tables
+
+    def text(value: Any) -> str | None:
+        if not isinstance(value, Mapping | list):
+            return None if value is None else str(value)  # a verdict, plainly
+        if id(value) not in known:
+            known[id(value)] = json.dumps(finite(value), ensure_ascii=False)
+        return known[id(value)]
+
+    return list(map(text, values))

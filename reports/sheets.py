@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import pandas as pd
 
-from harness import Record
+from harness import Record, Verdict
 from reports.contest_sheets import contest_sheets
 from reports.data import RESIDUALS, Evidence, Outcome
 from reports.intervals import PowerLaw
+from reports.parquet import texts
 from reports.physics import spreads
 from reports.scaling import Ladder, ladders
 
@@ -25,7 +27,7 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
     report. contests, means: see `reports.contest_sheets`.
     """
     found = {
-        "measurements": pd.DataFrame(map(_measurement, evidence.records)),
+        "measurements": _measurements(evidence.records),
         "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
         "energies": pd.DataFrame(
             {
@@ -53,12 +55,13 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.astype(dict.fromkeys(counts, "Int64"))
 
 
-def _measurement(record: Record) -> dict[str, Any]:
-    row = record.to_dict()
-    for name, value in row.items():
-        if isinstance(value, dict | list):
-            row[name] = json.dumps(value, ensure_ascii=False)
-    return row | {"status": record.status.value}
+def _measurements(records: Sequence[Record]) -> pd.DataFrame:
+    """Give every field of every record a column; what is nested is JSON text."""
+    columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(Record)}
+    for name, values in columns.items():
+        if isinstance(values[0], Mapping | Verdict):
+            columns[name] = list(texts(values))
+    return pd.DataFrame(columns)
 
 
 def _outcome(o: Outcome) -> dict[str, Any]:
