@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness.qp import QP, Matrix, Vector
@@ -121,7 +122,8 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         forces_size=_abs(qp.A).T @ np.abs(s.y) + _abs(qp.G).T @ np.abs(s.z)
         + np.abs(s.z_box),
         residual=Px + qp.q + rows + borne,
-        energies=np.array([s.x @ Px, qp.q @ s.x, held]), energies_size=sum(sizes),
+        energies=np.array([s.x @ Px, qp.q @ s.x, held]),
+        energies_size=float(np.sum(sizes)),
     )  # fmt: skip
 
 
@@ -239,12 +241,14 @@ def _alone(
     lengths = _lengths(qp) if by_length else np.full(q.size, np.inf)
     if by_length and not np.isfinite(lengths).any():
         lengths = np.ones(q.size)
-    gain = np.where(np.isfinite(gain), gain, np.where(np.isfinite(lengths), q * lengths, 0))
+    gain = np.where(
+        np.isfinite(gain), gain, np.where(np.isfinite(lengths), q * lengths, 0)
+    )
     gain = gain[gain > NOISE * gain.max(initial=0)]
-    bend = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
+    bend: Vector = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
     if bend.size and gain.max(initial=0) <= NOISE * bend.min():
         return bend
-    return gain
+    return np.asarray(gain)
 
 
 def _lengths(qp: QP) -> Vector:
@@ -275,7 +279,7 @@ def widths(qp: QP) -> Vector:
             up, down = known & (c > 0), known & (c < 0)
             np.minimum.at(ub, j[up], room[up])
             np.maximum.at(lb, j[down], room[down])
-    return np.maximum(ub - lb, 0)
+    return np.asarray(np.maximum(ub - lb, 0))
 
 
 def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
@@ -307,7 +311,7 @@ def scales_at(qp: QP, x: Vector, E: float, d: Vector | None = None) -> Scales:
     return Scales(E, X)
 
 
-def _told_by_rows(qp: QP, x: Vector, X: Vector, felt: Vector) -> Vector:
+def _told_by_rows(qp: QP, x: Vector, X: Vector, felt: NDArray[np.bool_]) -> Vector:
     """Fill in the sizes of variables that no energy feels, row by active row."""
     size, known = np.abs(x), felt.copy()
     rows = [
@@ -389,7 +393,7 @@ def _curvature(qp: QP) -> Vector:
     """Give Pᵢᵢ; of an operator nothing is known."""
     if not qp.is_explicit:
         return np.zeros(qp.q.size)
-    return np.maximum(np.asarray(qp.P.diagonal(), dtype=float), 0)
+    return np.asarray(np.maximum(qp.P.diagonal(), 0), dtype=float)
 
 
 def _sup(v: Vector) -> float:
