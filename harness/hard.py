@@ -124,8 +124,8 @@ def _free_direction(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 def _redundant(d: _Draft, rng: np.random.Generator) -> _Draft:
     """Add rows that do not bind, with entries from 1e-12 to 1e12."""
-    size = np.ldexp(1.0, rng.integers(-40, 41, 2))
-    rows = rng.integers(-3, 4, (2, d.x.size)) * size[:, None]
+    size = 2.0 ** rng.integers(-40, 41, 2)
+    rows = np.asarray(rng.integers(-3, 4, (2, d.x.size)) * size[:, None], dtype=float)
     return d.inequalities(rows, np.zeros(2), np.abs(rows @ d.x) + np.maximum(1.0, size))
 
 
@@ -138,7 +138,7 @@ def _no_cost(d: _Draft, rng: np.random.Generator) -> _Draft:
 def _cancelled(d: _Draft, rng: np.random.Generator) -> _Draft:
     """Shift f* to 0, 2^-20 or 2^-36 by a fixed variable with a cost."""
     aim = float(rng.choice([0.0, 2.0**-20, 2.0**-36]))
-    shift = aim - (d.x @ d.P @ d.x / 2 + d.q @ d.x)
+    shift = aim - float(d.x @ d.P @ d.x / 2 + d.q @ d.x)
     return d.widened(1, np.ones(1)).at(-1, lb=1.0, ub=1.0, z_box=-shift)
 
 

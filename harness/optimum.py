@@ -120,7 +120,7 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     doubt = float(r @ np.minimum(widths(qp), FAR * X))
     size = _size(qp, s)
     told = max(abs(float(value)), doubt / EXCUSED)  # of f*, where it is not zero
-    if abs(value) > ROUNDING * size + doubt:
+    if abs(value) > ROUNDING * terms + doubt:
         known = min(terms, CANCELLED / SPARED * told)
         rounding = min(ROUNDING * size, EXCUSED * min(known, told))
     else:

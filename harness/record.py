@@ -42,7 +42,7 @@ _not_negative = attrgetter(*_NOT_NEGATIVE)
 class Verdict(StrEnum):
     """Our judgement of a measurement, whatever the solver claimed."""
 
-    VERIFIED = "verified"  #: every residual ≤ 10·tol
+    VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` where known
     INACCURATE = "inaccurate"  #: claimed solved; at least half the digits are there
     WRONG = "wrong"  #: claimed solved, refuted
     INFEASIBLE_CLAIM = "infeasible_claim"

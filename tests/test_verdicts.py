@@ -107,7 +107,10 @@ def test_without_cost_a_point_far_from_zero_is_still_wrong():
 
 
 def test_rows_tighten_the_widths_of_variables():
-    """x₁ + x₂ = 1, x ≥ 0: each in [0, 1]. 2x₁ − x₃ ≤ 4, x₁ ≥ −1, x₃ ≤ 6: x₁ ≤ 5, x₃ ≥ −6."""
+    """x₁ + x₂ = 1, x ≥ 0: each at most 1.
+
+    2x₁ − x₃ ≤ 4, x₁ ≥ −1, x₃ ≤ 6: x₁ ≤ 5, x₃ ≥ −6.
+    """
     simplex = qp_of([1, 1], [0, 0], A=[[1, 1]], b=[1], lb=0)
     open_ended = qp_of(
         [1, 1, 1], [0] * 3, G=[[2, 0, -1]], h=[4], lb=[-1, 0, -INF], ub=[INF, INF, 6]
@@ -248,10 +251,14 @@ class Attack:
         return float(x @ (self.qp.P @ x) / 2 + self.qp.q @ x)
 
     def error(self, s):
-        """|f − f*|/|f*|; where f* = 0, relative to the terms of f at the solution."""
+        """|f − f*|/|f*|; relative to the terms of f at the solution where f* is zero.
+
+        As zero counts what is below 1e-12 of them: rounding the solution moves f by it.
+        """
         x = self.s.x
         terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q @ x)) or 1.0
-        return abs(self.objective(s.x) - self.value) / (abs(self.value) or terms)
+        size = abs(self.value) if abs(self.value) > 1e-12 * terms else terms
+        return abs(self.objective(s.x) - self.value) / size
 
     def violation(self, x):
         """The worst row or bound, relative to its terms, of those with b ≠ 0."""
@@ -362,7 +369,7 @@ class Attack:
 
 
 def search(seed, tries, each=40):
-    """Attack QPs of up to three kinds each; give what was wrongly judged, and counts."""
+    """Attack QPs of up to three kinds each; give what was wrongly judged."""
     rng = np.random.default_rng(seed)
     wrong, refuted, verified = [], [], 0
     with np.errstate(all="ignore"):
