@@ -4,8 +4,8 @@ import os
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.judge import blank
 from harness.journal import Journal, read_journal
+from harness.judge import blank
 from harness.names import CaseName
 from harness.registry import SolverSpec
 
