@@ -11,11 +11,11 @@ It answers the requests of `harness.serving` with these of its own:
   for verdicts that residuals cannot give; it writes a point to the second, and says
   ``{"event": "done", "found": true}``, or false where it finds none
 
-or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``, or, where a file
-between it and the parent failed, ``{"event": "done", "fault": REASON}``; where NAME is
-``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to stay
-in memory. What leads back from a point to the bodies is code, which no file can hold: a
-case that is on file is built again when a point of it comes.
+or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``, or, where a
+file between it and the parent failed, ``{"event": "done", "fault": REASON}``; where
+NAME is ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are
+to stay in memory. What leads back from a point to the bodies is code, which no file can
+hold: a case that is on file is built again when a point of it comes.
 """
 
 from __future__ import annotations

@@ -40,6 +40,7 @@ from harness.solution import Solution
 LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
 CLOSE = 1e-9  #: KKT residual of a point that may be an optimum
 FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
+EPS = float(np.finfo(float).eps)
 SPARED = 10.0  #: the objective adds up what residuals say of single rows
 
 
@@ -119,13 +120,13 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     X = scales_at(qp, s.x.astype(float), terms).x
     doubt = float(r @ np.minimum(widths(qp), FAR * X))
     size = _size(qp, s)
-    told = max(abs(float(value)), doubt / EXCUSED)  # of f*, where it is not zero
+    # f* cannot be told more accurately than rounding x moves f
+    told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
     if abs(value) > ROUNDING * terms + doubt:
         known = min(terms, CANCELLED / SPARED * told)
-        rounding = min(ROUNDING * size, EXCUSED * min(known, told))
     else:
-        known = terms
-        rounding = min(ROUNDING * size, EXCUSED * known)
+        known = told = terms
+    rounding = min(ROUNDING * size, EXCUSED * told)
     if not doubt <= EXCUSED * known:
         return None
     return Optimum(

@@ -253,11 +253,11 @@ class Attack:
     def error(self, s):
         """|f − f*|/|f*|; relative to the terms of f at the solution where f* is zero.
 
-        As zero counts what is below 1e-12 of them: rounding the solution moves f by it.
+        As zero counts what is below 1e-11 of them: rounding x moves f by 1e-5 of that.
         """
         x = self.s.x
         terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q @ x)) or 1.0
-        size = abs(self.value) if abs(self.value) > 1e-12 * terms else terms
+        size = abs(self.value) if abs(self.value) > 1e-11 * terms else terms
         return abs(self.objective(s.x) - self.value) / size
 
     def violation(self, x):
