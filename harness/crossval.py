@@ -22,6 +22,7 @@ from harness.assessment import Assessment, Deviation, distances, energy_allowed
 from harness.errors import some
 from harness.judge import note_of
 from harness.kkt import allowed, verdict
+from harness.optimum import decided, remembered
 from harness.plugin import Reference
 from harness.record import Verdict
 from harness.solution import Status
@@ -45,6 +46,7 @@ class Answer:
     stored: Verdict  #: as the run judged it
     verdict: Verdict  #: as the stored point is judged now, at 10·tol
     residuals: Mapping[str, float]  #: the four of `harness.kkt`
+    optimum_error: float | None  #: decides instead of them, see `harness.optimum`
     allowed: float  #: largest residual of a verified answer
     energy_allowed: float  #: largest error in the energy norm of one
     energy_bound: float | None  #: the certificate of the run
@@ -96,9 +98,10 @@ def compared(
     solve : the reference solve
     references : folder that keeps reference points
     """
+    solve = remembered(solve)
     truth = truth_of(given, solve, references)
     if isinstance(truth, str):
-        alone = tuple(_answer(g, None, None) for g in given)
+        alone = tuple(_answer(g, None, None, solve) for g in given)
         return Problem(
             name=name, truth="", doubt=None, closed=None, answers=alone, pairs=(),
             unresolved=(), note=truth,
@@ -109,10 +112,10 @@ def compared(
             assessment, deviation = truth.assess(g)
         except Exception as e:  # the family's code, of the way back
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
-            answers.append(_answer(g, None, None))
+            answers.append(_answer(g, None, None, solve))
             continue
         deviations.append((len(answers), deviation))
-        answers.append(_answer(g, assessment, truth.doubt))
+        answers.append(_answer(g, assessment, truth.doubt, solve))
     pairs = _pairs(answers, deviations, truth)
     unresolved = [
         p
@@ -127,14 +130,17 @@ def compared(
     )  # fmt: skip
 
 
-def _answer(g: Given, found: Assessment | None, doubt: float | None) -> Answer:
+def _answer(
+    g: Given, found: Assessment | None, doubt: float | None, solve: Reference
+) -> Answer:
     """Put together what is known of an answer, and whether its claim stands."""
     r, residuals = g.record, residuals_of(g)
+    error = decided(g.case.qp, g.solution, residuals, r.tol, solve)
     answer = Answer(
         run_id=r.run_id, repeats=g.repeats, solver=g.label, case=r.case, form=r.form,
         tol=r.tol, claimed=r.claimed or "", stored=r.status,
-        verdict=verdict(g.solution.status, residuals, r.tol),
-        residuals=residuals._asdict(), allowed=allowed(r.tol),
+        verdict=verdict(g.solution.status, residuals, r.tol, error=error),
+        residuals=residuals._asdict(), optimum_error=error, allowed=allowed(r.tol),
         energy_allowed=energy_allowed(r.tol), energy_bound=r.energy_bound,
         doubt=doubt, assessment=found, remarks=g.remarks,
     )  # fmt: skip
@@ -167,7 +173,10 @@ def _refutations(a: Answer) -> Iterable[str]:
     """Say why a claim of success is false; nothing where it stands or was not made."""
     if a.claimed != Status.SOLVED:
         return
-    if a.verdict is not Verdict.VERIFIED:
+    if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
+        most = brief(a.allowed)
+        yield f"off the proven optimum by {brief(a.optimum_error)} > {most}"
+    elif a.verdict is not Verdict.VERIFIED:
         name = max(a.residuals, key=lambda n: nan_last(a.residuals[n]))
         yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
     if a.assessment is None or a.doubt is None:

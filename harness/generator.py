@@ -7,11 +7,14 @@ It answers the requests of `harness.serving` with these of its own:
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
   point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
   with bounds of its error, and the deformed state in ``fields`` where there is one
+* ``{"solve": PATH, "point": PATH}``: the reference solve of the QP in the first file,
+  for verdicts that residuals cannot give; it writes a point to the second, and says
+  ``{"event": "done", "found": true}``, or false where it finds none
 
-or to both ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME is
-``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to stay
-in memory. What leads back from a point to the bodies is code, which no file can hold: a
-case that is on file is built again when a point of it comes.
+or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME
+is ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to
+stay in memory. What leads back from a point to the bodies is code, which no file can
+hold: a case that is on file is built again when a point of it comes.
 """
 
 from __future__ import annotations
@@ -22,15 +25,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from harness.build import build, unbuilt
 from harness.judge import certified, note_of, plain, quantities_of
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference
-from harness.qpfile import save_qp
+from harness.qpfile import load_qp, save_qp
 from harness.record import finite
 from harness.serving import Events, answer_requests
 from harness.solution import Status
-from harness.store import field_arrays, read_point, write_arrays
+from harness.store import field_arrays, read_point, write_arrays, write_point
 
 
 class Generator:
@@ -44,6 +49,8 @@ class Generator:
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request, whatever the family's code does."""
+        if "solve" in request:
+            return self._solved(Path(request["solve"]), Path(request["point"]))
         name = CaseName(**(request.get("build") or request["describe"]))
         try:
             case = self._case(name, request["keep"])
@@ -53,6 +60,13 @@ class Generator:
         if "build" in request:
             return self._written(case, name, Path(request["qp"]))
         return _described(case, request)
+
+    def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
+        try:
+            write_point(point, self._reference(load_qp(qp)[0]))
+        except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+            return {"found": False}
+        return {"found": True}
 
     def _case(self, name: CaseName, keep: int) -> Case:
         family = self._families[name.family]

@@ -15,11 +15,15 @@ from harness.certificate import UncertifiableError, certify
 from harness.kkt import kkt_residuals, verdict
 from harness.measure import Measurement
 from harness.names import CaseName
-from harness.plugin import Case
+from harness.optimum import decided
+from harness.plugin import Case, Reference
 from harness.qp import QP
-from harness.record import SCHEMA, Record, Verdict
+from harness.record import Record, Verdict
 from harness.registry import SolverSpec
 from harness.solution import Solution, Status
+
+#: first part of what a run_id digests; it names a measurement, whatever is stored of it
+IDENTITY = 1
 
 
 def blank(
@@ -43,7 +47,7 @@ def blank(
     mode, accuracy : see `Record`
     """
     options = plain(options)
-    identity = [SCHEMA, case, spec.label, spec.name, options, tol, repeat]
+    identity = [IDENTITY, case, spec.label, spec.name, options, tol, repeat]
     if (mode, accuracy) != ("cold", None):
         identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
@@ -68,8 +72,13 @@ def blank(
     )
 
 
-def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
-    """Fill in what `measurement` is worth on `qp`, by our own evaluation."""
+def judged(
+    record: Record, qp: QP, measurement: Measurement, reference: Reference | None = None
+) -> Record:
+    """Fill in what `measurement` is worth on `qp`, by our own evaluation.
+
+    reference : solves `qp` where residuals cannot decide, see `harness.optimum`
+    """
     s = measurement.solution
     record = record.but(
         sizes=qp.sizes,
@@ -91,9 +100,14 @@ def judged(record: Record, qp: QP, measurement: Measurement) -> Record:
     with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
         residuals = kkt_residuals(qp, s)
         objective = qp.objective(s.x)
+    tol, error = record.accuracy or record.tol, None
+    if reference is not None:
+        error = decided(qp, s, residuals, tol, reference)
     return record.but(
-        status=verdict(s.status, residuals, record.accuracy or record.tol),
+        status=verdict(s.status, residuals, tol, error=error),
         objective=objective,
+        decided_by="residuals" if error is None else "reference",
+        optimum_error=error,
         **residuals._asdict(),
     )
 

@@ -59,7 +59,7 @@ def solve(workbench: Workbench, options: Namespace) -> int:
 
     command = workbench.worker_command(spec, options.plugin)
     with redirect_stdout(sys.stderr):  # whatever the family prints
-        record, solution = measured_once(command, case, record)
+        record, solution = measured_once(command, case, record, workbench.reference)
     _show(record, solution.history if solution else {}, options.json)
     if drawn and case.fields is not None:
         if solution is not None and has_point(solution):
@@ -89,7 +89,7 @@ def _draw(
         record = blank(
             earlier, "", spec, options={}, tol=options.tol, repeat=0, environment=""
         )
-        _, solution = measured_once(command, case, record)
+        _, solution = measured_once(command, case, record, workbench.reference)
         if solution is None or not has_point(solution) or case.fields is None:
             raise InputError(f"{options.vtu}: no point at step {step}; write a .vtu")
         states.append((float(step), case.fields(solution)))

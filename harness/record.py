@@ -17,8 +17,10 @@ from harness.errors import shown
 if TYPE_CHECKING:
     from msgspec.json import Decoder
 
-SCHEMA = 1  #: version of the journal line; raised whenever a field changes its meaning
-READABLE = (1,)  #: the versions that `Record.from_json` takes
+#: version of the journal line; raised whenever a field changes its meaning.
+#: 2: the four residuals have other scales (docs/mathematics.md)
+SCHEMA = 2
+READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
 LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
 MOST_LEVELS = 20  #: of what is nested in a field
 
@@ -31,7 +33,7 @@ _NOT_NEGATIVE = (
     "repeat", "block", "prepare_seconds", "solve_seconds", "total_seconds", "peak_mib",
     "prepare_peak_mib", "solve_peak_mib", "inner", "build_seconds", "dualise_seconds",
     "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
-    "dual", "complementarity", "gap", "energy_bound",
+    "dual", "complementarity", "gap", "energy_bound", "optimum_error",
 )  # fmt: skip
 _texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
 _not_negative = attrgetter(*_NOT_NEGATIVE)
@@ -40,7 +42,7 @@ _not_negative = attrgetter(*_NOT_NEGATIVE)
 class Verdict(StrEnum):
     """Our judgement of a measurement, whatever the solver claimed."""
 
-    VERIFIED = "verified"  #: every residual ≤ 10·tol
+    VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` where known
     INACCURATE = "inaccurate"  #: claimed solved; at least half the digits are there
     WRONG = "wrong"  #: claimed solved, refuted
     INFEASIBLE_CLAIM = "infeasible_claim"
@@ -102,6 +104,9 @@ class Record:
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
+    #: "reference" where `optimum_error` decided the status, and not the residuals
+    decided_by: str = "residuals"
+    optimum_error: float | None = None  #: against the proven optimum, harness.optimum
     energy_bound: float | None = None  #: certified relative error, energy norm
     #: what it is made of, as relative; see `harness.judge.certified`
     certificate: Mapping[str, float] = field(default_factory=dict)

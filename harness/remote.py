@@ -10,6 +10,7 @@ from collections.abc import Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from io import BytesIO
 from math import inf, isinf
 from pathlib import Path
@@ -25,7 +26,7 @@ from harness.errors import FaultError
 from harness.history import checked
 from harness.judge import certified, has_point, judged, noted, quantities_of
 from harness.measure import Measurement, one_line
-from harness.plugin import Case
+from harness.plugin import Case, Reference
 from harness.qp import QP
 from harness.qpfile import save_qp
 from harness.record import Record, Verdict
@@ -65,12 +66,14 @@ def measured(
     *,
     time_limit: float,
     memory_limit: float,
+    reference: Reference,
 ) -> tuple[Record, Solution | None]:
     """Fill in `record` by one measurement; no solution where the worker ended.
 
     request : to the worker, see `harness.worker`; less what stands in the record.
         The point is in the file ``out`` afterwards, as we have read it
     time_limit, memory_limit : s and MiB
+    reference : solves the QP where residuals cannot decide, see `harness.optimum`
 
     Raises
     ------
@@ -112,7 +115,7 @@ def measured(
     measurement, *notes = _believed(reply, solution)
     if not notes:
         notes = _cached(measurement, worker.first_seconds, (record.qp, record.tol))
-    record = noted(judged(record, qp, measurement), reply.message, *notes)
+    record = noted(judged(record, qp, measurement, reference), reply.message, *notes)
     return _within(memory_limit, record).but(
         canary_seconds=reply.answer["canary_seconds"]
     ), solution
@@ -272,11 +275,12 @@ def _within(limit: float, record: Record) -> Record:
 
 
 def measured_once(
-    command: list[str], case: Case, record: Record
+    command: list[str], case: Case, record: Record, reference: Reference
 ) -> tuple[Record, Solution | None]:
     """Do as `measured`, with a worker for this one measurement and without limits.
 
     command : starts the worker; two file descriptors are appended to it
+    reference : as of `measured`
 
     Raises
     ------
@@ -296,11 +300,14 @@ def measured_once(
             "digest": content_digest(qp_file),
             "out": str(scratch / "point.npz"),
         }
-        no_limits = {"time_limit": inf, "memory_limit": inf}
+        once = partial(
+            measured, worker, case.qp, record, request,
+            time_limit=inf, memory_limit=inf, reference=reference,
+        )  # fmt: skip
         try:
-            record, solution = measured(worker, case.qp, record, request, **no_limits)
+            record, solution = once()
         except FaultError:
-            record, solution = measured(worker, case.qp, record, request, **no_limits)
+            record, solution = once()
     if solution is None or record.status is Verdict.DECLINED:
         return record, solution
     quantities, note = quantities_of(case, solution)

@@ -125,6 +125,9 @@ def _numbers(c: Comparison) -> Iterable[list[str]]:
         )
         if (a, b) != (None, None):
             yield [name, _text(a), _text(b), _same(a == b)]
+    if c.then.schema != c.now.schema:
+        yield ["residuals", f"schema {c.then.schema}", f"schema {c.now.schema}",
+               "defined differently"]  # fmt: skip
     for name in (*_RESIDUALS, "objective"):
         a, b = getattr(c.then, name), getattr(c.now, name)
         if (a, b) != (None, None):

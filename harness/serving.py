@@ -204,12 +204,14 @@ _DESCRIBED: Mapping[str, Accepts] = {
     "notes": lambda value: isinstance(value, list) and all(map(_is_any_text, value)),
     "seconds": _is_size,
 }
+_SOLVED: Mapping[str, Accepts] = {"found": lambda value: isinstance(value, bool)}
 #: what may come, by what the request asks for
 _ANSWERS: Mapping[str, tuple[Mapping[str, Accepts], ...]] = {
     "qp": (_MEASURED,),
     "check": (_CHECKED,),
     "build": (_BUILT, _UNBUILT),
     "describe": (_DESCRIBED, _UNBUILT),
+    "solve": (_SOLVED,),
 }
 
 
@@ -220,7 +222,7 @@ def measures(request: Mapping[str, Any]) -> bool:
 
 def kind_of(request: Mapping[str, Any]) -> str:
     """Tell what a request asks for; "" where it is none of ours."""
-    kinds = [kind for kind in ("build", "describe", "check", "qp") if kind in request]
+    kinds = [kind for kind in ("build", "describe", "solve", "check", "qp") if kind in request]
     return kinds[0] if kinds else ""
 
 

@@ -123,6 +123,7 @@ def outcome(r: Record) -> str:
             (f"{name} residual", _text(_known(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
+        ("off optimum", _text(_known(r.optimum_error), digits=2)),
         ("energy error", _bound(r)),
         ("objective", _text(_known(r.objective))),
         *(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from math import inf
 from pathlib import Path
 from types import TracebackType
@@ -21,9 +22,11 @@ from harness.qpfile import load_qp
 from harness.recipe import NO_MAKERS, Maker
 from harness.record import Record, Verdict
 from harness.remote import measured
-from harness.solution import Solution
-from harness.store import point_arrays, read_arrays
+from harness.solution import Solution, Status
+from harness.store import point_arrays, read_arrays, read_point
 from harness.supervisor import WorkerProcess
+
+_MOST_SOLVED = 1000  #: small QPs whose reference solutions are kept
 
 
 class Station:
@@ -49,6 +52,7 @@ class Station:
         self._workers: dict[str, WorkerProcess] = {}
         self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
         self._loaded: dict[str, QP] = {}  # theirs, by digest
+        self._solved: dict[str, Solution | None] = {}  # small QPs, by digest
 
     def __enter__(self) -> Self:
         return self
@@ -135,6 +139,7 @@ class Station:
                 request,
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
+                reference=partial(self._reference, at),
             )
             if record.status in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self._scratch, "")  # whatever it died of
@@ -203,6 +208,34 @@ class Station:
             refuse_full_disk(self._scratch, reply.answer["unbuilt"])
             raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
         return reply.answer
+
+    def _reference(self, at: Entry, qp: QP) -> Solution:
+        """Have the generator solve the QP of an entry by the reference, once.
+
+        Raises
+        ------
+        ArithmeticError
+            When it found no solution.
+        FaultError
+            When it died, or a file between us failed.
+
+        """
+        if at.digest not in self._solved:
+            point = self._scratch / "reference.npz"
+            request = {"solve": str(at.qp), "point": str(point)}
+            reply = self._generator.ask(request, time_limit=inf, memory_limit=inf)
+            if reply.answer is None:
+                raise FaultError(f"the reference solve failed: {reply.message}")
+            while len(self._solved) >= _MOST_SOLVED:
+                del self._solved[next(iter(self._solved))]
+            found = reply.answer["found"]
+            self._solved[at.digest] = (
+                read_point(point, Status.SOLVED) if found else None
+            )
+        solution = self._solved[at.digest]
+        if solution is None:
+            raise ArithmeticError("the reference solve found no solution")
+        return solution
 
     def _worker(self, label: str) -> WorkerProcess:
         if label not in self._workers:

@@ -27,7 +27,8 @@ def verdict_lines(c: Comparison) -> list[str]:
     """Say in a few lines of plain text how the comparison ended."""
     if not c.pairs:
         return [_nothing(c)]
-    lines = [*filter(None, (_same(c), _environments(c), _busy(c))), _counted_times(c)]
+    first = (_same(c), _environments(c), _residuals(c), _busy(c))
+    lines = [*filter(None, first), _counted_times(c)]
     means = [(s, mean_ratio(c.of(s))) for s in c.solvers]
     lines += [
         f"  {s}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
@@ -57,6 +58,7 @@ def sentences(c: Comparison) -> tuple[str, ...]:
     said = (
         _same(c),
         _environments(c),
+        _residuals(c),
         _busy(c),
         _counted_times(c),
         _shared(c),
@@ -149,6 +151,18 @@ def _shared(c: Comparison) -> str:
     return (
         f"All solvers changed alike, together {ratio_text(everything)}: rather the "
         "machine than a solver."
+    )
+
+
+def _residuals(c: Comparison) -> str:
+    """Say so where the two folders hold residuals of different definitions."""
+    then, now = ({r.schema for r in e.records} for e in (c.before, c.after))
+    if then == now and len(now) == 1:
+        return ""
+    before, after = (" and ".join(map(str, sorted(s))) for s in (then, now))
+    return (
+        f"Residuals are defined differently: journal schema {before} before, {after} "
+        "after. A verdict may have changed with the definition, not with the answer."
     )
 
 

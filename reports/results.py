@@ -60,11 +60,15 @@ def _refutation(outcome: Outcome) -> tuple[Cell, ...]:
     values = {name: outcome.largest(name) for name in RESIDUALS}
     known = {name: v for name, v in values.items() if v is not None}
     name = max(known, key=lambda n: known[n], default=None)
-    evidence = (
-        "no point"
-        if name is None
-        else f"{name} {power(known[name])} > {power(outcome.allowed)}"
-    )
+    error = outcome.largest("optimum_error")
+    if error is not None:
+        evidence = (
+            f"off the proven optimum by {power(error)} > {power(outcome.allowed)}"
+        )
+    elif name is None:
+        evidence = "no point"
+    else:
+        evidence = f"{name} {power(known[name])} > {power(outcome.allowed)}"
     case, tol = case_cells(outcome)
     return (
         case,

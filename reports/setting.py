@@ -82,22 +82,26 @@ def definitions(factor: float) -> Section:
             "lb ≤ x ≤ ub, with multipliers such that  Px + q + Aᵀy + Gᵀz + z_box = 0, "
             "z ≥ 0, z_box ≤ 0 at an active lower and ≥ 0 at an active upper bound. "
             "Four residuals vanish exactly at a solution. None changes when the "
-            "objective, a row or the unit of x is scaled. X is the size of x, the "
-            "largest that a row ((|aᵢ|·|x| + |bᵢ|)/‖aᵢ‖₁), a bound or the curvature of "
-            "a variable knows of; S is the largest of ‖Px‖, ‖q‖ and ‖Aᵀy + Gᵀz + "
-            "z_box‖ in the maximum norm; E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + "
-            "hᵀz + the bounds' term|. X and E are at least a hundredth of the median "
-            "of |qᵢ|/Pᵢᵢ and of qᵢ²/Pᵢᵢ.",
+            "objective, a row or the unit of a variable is scaled. E is the largest of "
+            "|xᵀPx|, |qᵀx| and |bᵀy + hᵀz + the bounds' term|, at most 10⁴ times the "
+            "objective and at least a hundredth of what the least variable alone can "
+            "gain; Xⱼ is the larger of |xⱼ| and the length over which the energy "
+            "changes by E; S is the largest of ‖Px‖, ‖q‖ and ‖Aᵀy + Gᵀz + z_box‖ in "
+            "the maximum norm. What rounding explains is taken off first. (Records of "
+            "schema 1 have other scales.)",
         ),
         points=(
-            "Primal: the worst violation of a row or bound, relative to the larger of "
-            "|aᵢ|·|x| + |bᵢ| and ‖aᵢ‖₁X.",
-            "Dual: ‖Px + q + Aᵀy + Gᵀz + z_box‖∞ / S, and likewise every multiplier of "
-            "the wrong sign; one on an absent bound has the wrong sign.",
+            "Primal: the worst violation of a row or bound, relative to |bᵢ| + "
+            "Σ|aᵢⱼ|Xⱼ.",
+            "Dual: ‖Px + q + Aᵀy + Gᵀz + z_box‖∞ / S, each component relative to its "
+            "own terms, unless the energy at stake is small against E; and every "
+            "multiplier of the wrong sign; one on an absent bound has the wrong sign.",
             "Complementarity: the largest |multiplier × slack| / E.",
             "Gap: |primal objective − dual objective| / E.",
             f"Verified: every residual ≤ {factor:g} × tol (and ≤ 0.1), whatever was "
             "claimed. "
+            "Where a QP is small enough to be solved once more, the difference to its "
+            "proven optimum decides instead (decided_by is then reference). "
             "Inaccurate: success was claimed and refuted, but at least half of the "
             f"digits are there (worst residual ≤ √({factor:g} × tol)). Wrong: refuted "
             "beyond that.",

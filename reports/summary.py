@@ -9,6 +9,7 @@ from typing import Any
 from harness import Verdict
 from harness.faults import in_words
 from harness.kkt import VERIFIED_FACTOR
+from harness.record import SCHEMA
 from reports.data import Evidence, Outcome
 from reports.layout import Cell, Section, Table, name_cell, sources
 from reports.wording import VERDICTS, clean, listing, plural, power, tolerance
@@ -55,8 +56,8 @@ def summary(evidence: Evidence) -> Section:
             f"environments ({listing(digests)}); their times are not comparable."
         )
     notes = (
-        _unmade(evidence), _judged(evidence), _at_factor(evidence), _busy(evidence),
-        _unequal(evidence),
+        _unmade(evidence), _judged(evidence), _at_factor(evidence), _schemas(evidence),
+        _busy(evidence), _unequal(evidence),
     )  # fmt: skip
     prose += [text for text in notes if text]
     points = [s for solver in evidence.solvers for s in sentences(evidence, solver)]
@@ -138,6 +139,18 @@ def _at_factor(evidence: Evidence) -> str:
         f"Verdicts here are those at {evidence.factor:g} × tolerance, recomputed from "
         f"the stored claims and residuals; the journal holds those at "
         f"{VERIFIED_FACTOR:g} × tolerance."
+    )
+
+
+def _schemas(evidence: Evidence) -> str:
+    """Say so where residuals were measured as an older version defined them."""
+    old = {r.schema for r in evidence.records} - {SCHEMA}
+    if not old:
+        return ""
+    return (
+        "Some or all residuals are those of an older definition (journal schema "
+        f"{listing([str(s) for s in sorted(old)])}, now {SCHEMA}); their verdicts are "
+        "read as they were meant then."
     )
 
 

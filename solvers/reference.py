@@ -20,6 +20,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 
@@ -30,6 +31,7 @@ from solvers.polish import polished
 
 ENOUGH = 1e-14  #: KKT residual that is not refined any more
 ACCEPTED = 1e-9  #: KKT residual of what is called a solution
+FAR = 1e4  #: times the median datum of a scaled QP: what is larger is left out at first
 
 
 def reference_solution(qp: QP) -> Solution:
@@ -54,16 +56,17 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices, got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    for point in _candidates(qp):
-        worst = _residual(qp, point)
-        if worst <= least:
-            best, least = point, worst
-    if not least <= ACCEPTED:
-        raise ArithmeticError(
-            "the reference solve found no optimal point, the least KKT residual is "
-            f"{least:.1e}: the QP may be infeasible or unbounded"
-        )
-    return best
+    for candidates in (_candidates(qp), _tamed_candidates(qp)):
+        for point in candidates:
+            worst = _residual(qp, point)
+            if worst <= least:
+                best, least = point, worst
+        if least <= ACCEPTED:
+            return best
+    raise ArithmeticError(
+        "the reference solve found no optimal point, the least KKT residual is "
+        f"{least:.1e}: the QP may be infeasible or unbounded"
+    )
 
 
 def _residual(qp: QP, s: Solution) -> float:
@@ -83,6 +86,41 @@ def _candidates(qp: QP) -> Iterator[Solution]:
     start = interior_point(scaled.qp)
     yield scaled.recover(start)
     yield from map(scaled.recover, polished(scaled.qp, start))
+
+
+def _tamed_candidates(qp: QP) -> Iterator[Solution]:
+    """Do so once more, where the interior-point method may have begun too far off."""
+    scaled = equilibrated(qp)
+    near = scaled.qp.h < _most(scaled.qp)
+    tame = equilibrated(_tamed(scaled.qp, near))
+    start = tame.recover(interior_point(tame.qp))
+    z = np.zeros(near.size)
+    z[near] = start.z
+    start = replace(start, z=z)
+    yield scaled.recover(start)
+    yield from map(scaled.recover, polished(scaled.qp, start))
+
+
+def _most(qp: QP) -> float:
+    data = np.concatenate([qp.q, qp.b, qp.h, qp.lb, qp.ub])
+    told = np.abs(data[np.isfinite(data) & (data != 0)])
+    return FAR * float(np.median(told)) if told.size else np.inf
+
+
+def _tamed(qp: QP, near: NDArray[np.bool_]) -> QP:
+    """Leave out what dwarfs all other data of a scaled QP: where to look first.
+
+    Bounds and rows so far away do not bind, and a cost so large holds its variable at a
+    bound already when it is smaller. Whether that is true, the QP as given will tell.
+
+    near : (p,) rows to keep
+    """
+    most = _most(qp)
+    return replace(
+        qp, q=np.clip(qp.q, -most, most), G=qp.G[near], h=qp.h[near],
+        lb=np.where(qp.lb < -most, -np.inf, qp.lb),
+        ub=np.where(qp.ub > most, np.inf, qp.ub),
+    )  # fmt: skip
 
 
 def _is_nonnegative(qp: QP) -> bool:

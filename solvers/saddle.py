@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg import lu_solve
+from scipy.linalg.lapack import dgetrf
 from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -75,8 +76,10 @@ def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
     if not K.shape[0]:
         return np.copy
     if isinstance(K, np.ndarray):
-        factor = lu_factor(K, check_finite=False)
-        return lambda v: np.asarray(lu_solve(factor, v, check_finite=False))
+        factor, pivots, info = dgetrf(K)
+        if info:
+            raise ArithmeticError("the saddle-point matrix is singular")
+        return lambda v: np.asarray(lu_solve((factor, pivots), v, check_finite=False))
     for order in (LEAST_FILL, PIVOTED):
         try:
             lu = splu(K, **order)

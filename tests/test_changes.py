@@ -68,6 +68,20 @@ def only(c):
     return pair
 
 
+# definitions
+
+
+def test_residuals_of_different_definitions_are_said_to_be_so(changed):
+    old = [replace(r, schema=1) for r in suite(1, cases=1)]
+    said = "Residuals are defined differently: journal schema 1 before, 2 after."
+
+    for c in (changed(old, suite(2, cases=1)),):
+        assert any(line.startswith(said) for line in verdict_lines(c))
+        assert said in " ".join(compose(c).sections[0].prose)
+    for same in (changed(old, old), changed(suite(1, cases=1), suite(2, cases=1))):
+        assert not any("defined differently" in line for line in verdict_lines(same))
+
+
 # times
 
 

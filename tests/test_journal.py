@@ -7,6 +7,9 @@ import pytest
 
 from harness import InputError, Record, Verdict
 from harness.journal import Journal, read_journal
+from harness.judge import blank
+from harness.names import CaseName
+from harness.registry import SolverSpec
 
 
 def record(run_id, **changes):
@@ -131,6 +134,33 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
     with pytest.raises(InputError) as e:
         read_journal(tmp_path)
     assert str(e.value) == (f"{file}, line 2: {field} = {value!r}; expected {expected}")
+
+
+def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
+    """Its residuals have other scales: they are kept, and so is what they decided."""
+    row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
+    for name in ("decided_by", "optimum_error"):
+        del row[name]
+    file = tmp_path / "journal" / "here.jsonl"
+    file.parent.mkdir()
+    file.write_text(json.dumps(row | {"schema": 1}) + "\n" + json.dumps(row) + "\n")
+
+    old, new = read_journal(tmp_path)
+
+    assert (old.schema, new.schema) == (1, 2)
+    assert (old.primal, old.status) == (new.primal, new.status)
+    assert json.loads(old.to_json())["schema"] == 1
+
+
+def test_a_measurement_has_the_name_that_older_folders_give_it():
+    """Or a folder that goes on would measure everything once more."""
+    made = blank(
+        CaseName(family="box", params={"n": 3}, form="dual"), "box/n=3/dual",
+        SolverSpec(name="osqp", label="osqp"), options={"max_iter": 100}, tol=1e-6,
+        repeat=2, environment="e",
+    )  # fmt: skip
+
+    assert made.run_id == "37b0acf5a279"
 
 
 def test_a_folder_without_journal_is_named(tmp_path):

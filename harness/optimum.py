@@ -1,0 +1,166 @@
+"""The proven optimum of a small QP, which decides where residuals cannot.
+
+Residuals bound the error of the objective only through quantities that they do not
+know: how far the solution is, and how large the true multipliers are. A reference solve
+that is none of the solvers under test gives a point x̂ with multipliers λ̂ ≥ 0; it is
+believed no more than they are. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian
+L, convexity gives for the solution x*
+
+    f(x*) ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
+
+evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for the
+point x̃ that meets the active rows exactly, off x̂ by rounding; L(x̃, λ̂) − L(x̂, λ̂) is
+r̂ᵀ(x̃ − x̂) and a square of rounding. So L(x̂, λ̂) is f* up to the sum above. What is
+taken on trust: the bound of |x*ᵢ − x̂ᵢ| (`FAR`), and that x̃ is as near as that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from harness.kkt import (
+    CANCELLED,
+    EXCUSED,
+    ROUNDING,
+    Residuals,
+    allowed,
+    energy_at,
+    kkt_residuals,
+    scales_at,
+    violation,
+    widths,
+)
+from harness.plugin import Reference
+from harness.qp import QP, Vector
+from harness.solution import Solution
+
+LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
+CLOSE = 1e-9  #: KKT residual of a point that may be an optimum
+FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
+EPS = float(np.finfo(float).eps)
+SPARED = 10.0  #: the objective adds up what residuals say of single rows
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Optimum:
+    """The optimal value of a QP, and what errors against it are compared with."""
+
+    value: float  #: f*
+    doubt: float  #: by how much f* may be off, with the rounding of a right answer
+    energy: float  #: scale of errors of the objective
+    x: Vector  #: (n,) sizes of the variables
+
+
+def decided(
+    qp: QP,
+    s: Solution,
+    residuals: Residuals,
+    tol: float,
+    solve: Reference,
+) -> float | None:
+    """Measure a point against the proven optimum; None where residuals decide.
+
+    They do where they exceed 10·tol even against the most generous scales, where the QP
+    is large or its P an operator, or where nothing could be proven.
+
+    Returns
+    -------
+    the larger of |f(x) − f*| and of the violation, relative to the scales of the
+    optimum; the first to 10 times the smaller of its terms and 1e3·|f*|
+
+    """
+    if not is_small(qp):
+        return None
+    most = allowed(tol)
+    if not min(residuals.worst, kkt_residuals(qp, s, generous=True).worst) <= most:
+        return None
+    found = proven_optimum(qp, solve)
+    return None if found is None else error_at(qp, s, found)
+
+
+def is_small(qp: QP) -> bool:
+    """Whether a QP is cheap to solve once more."""
+    return qp.is_explicit and qp.q.size + qp.b.size + qp.h.size <= LARGEST
+
+
+@np.errstate(all="ignore")
+def error_at(qp: QP, s: Solution, optimum: Optimum) -> float:
+    """Compare a point with the optimum; see `decided`."""
+    x = s.x.astype(np.longdouble)
+    off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
+    return max(max(off, 0.0) / optimum.energy, violation(qp, s.x, optimum.x))
+
+
+@np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
+def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
+    """Solve a QP by the reference, and prove its optimal value; None if that fails."""
+    try:
+        found = solve(qp)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return None
+    s = replace(
+        found,
+        x=found.x.astype(np.longdouble), y=found.y.astype(np.longdouble),
+        z=np.maximum(found.z, 0).astype(np.longdouble),
+        z_box=np.where(found.z_box < 0, np.where(np.isfinite(qp.lb), found.z_box, 0),
+                       np.where(np.isfinite(qp.ub), found.z_box, 0)
+                       ).astype(np.longdouble),
+    )  # fmt: skip
+    if not kkt_residuals(qp, s, generous=True).worst <= CLOSE:
+        return None
+    f = _objective(qp, s.x)
+    bound = np.where(s.z_box < 0, qp.lb, qp.ub)
+    pulls = s.z_box[s.z_box != 0] * (s.x - bound)[s.z_box != 0]
+    value = f + s.y @ (qp.A @ s.x - qp.b) + s.z @ (qp.G @ s.x - qp.h) + pulls.sum()
+    r = np.abs(qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box)
+    terms = energy_at(qp, s, generous=True)
+    X = scales_at(qp, s.x.astype(float), terms).x
+    doubt = float(r @ np.minimum(widths(qp), FAR * X))
+    size = _size(qp, s)
+    # f* cannot be told more accurately than rounding x moves f
+    told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
+    if abs(value) > ROUNDING * terms + doubt:
+        known = min(terms, CANCELLED / SPARED * told)
+    else:
+        known = told = terms
+    rounding = min(ROUNDING * size, EXCUSED * told)
+    if not doubt <= EXCUSED * known:
+        return None
+    return Optimum(
+        value=float(value), doubt=doubt + rounding, energy=SPARED * known,
+        x=scales_at(qp, s.x.astype(float), known).x,
+    )  # fmt: skip
+
+
+def remembered(solve: Reference) -> Reference:
+    """Solve every QP, told by identity, only once; what was raised is raised again."""
+    known: dict[int, tuple[QP, Solution | Exception]] = {}
+
+    def once(qp: QP) -> Solution:
+        if id(qp) not in known:  # the QP is kept, or another could get its id
+            try:
+                known[id(qp)] = qp, solve(qp)
+            except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:
+                known[id(qp)] = qp, e
+        found = known[id(qp)][1]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    return once
+
+
+def _objective(qp: QP, x: Any) -> np.longdouble:
+    return np.longdouble(x @ (qp.P @ x) / 2 + qp.q @ x)
+
+
+def _size(qp: QP, s: Solution) -> float:
+    """Add up what rounding of x to double precision moves: f itself, and λᵀ(Bx − c)."""
+    x = np.abs(s.x)
+    rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
+    held = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)
+    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + held + 2 * np.abs(s.z_box) @ x
+    return float(total)

@@ -1,0 +1,408 @@
+"""No wrong answer is verified, no right one refuted: by hand, then by search."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdict
+from harness.hard import KINDS, hard
+from harness.judge import judged
+from harness.kkt import Residuals, rejudged, widths
+from harness.measure import Measurement
+from harness.optimum import decided, proven_optimum, remembered
+from harness.record import Record
+from solvers.reference import reference_solution
+
+TOL = 1e-8
+INF = np.inf
+
+
+def qp_of(P, q, *, A=None, b=(), G=None, h=(), lb=-INF, ub=INF):
+    """Make a QP of nested lists; a list of numbers is a diagonal P."""
+    n, P = len(q), np.array(P, dtype=float)
+    rows = [no_rows(n) if M is None else np.array(M, dtype=float) for M in (A, G)]
+    lb, ub = (np.array(np.broadcast_to(v, n), dtype=float) for v in (lb, ub))
+    q, b, h = (np.array(v, dtype=float) for v in (q, b, h))
+    P = np.diag(P) if P.ndim == 1 else P
+    return QP(P=P, q=q, A=rows[0], b=b, G=rows[1], h=h, lb=lb, ub=ub)
+
+
+def at(x, y=(), z=(), z_box=None):
+    x, y, z = (np.array(v, dtype=float) for v in (x, y, z))
+    z_box = np.zeros(x.size) if z_box is None else np.array(z_box, dtype=float)
+    return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+
+
+def judge(qp, s, tol=TOL):
+    return verdict(Status.SOLVED, kkt_residuals(qp, s), tol)
+
+
+FAR = qp_of([1, 1], [-1, -1], A=[[1, 1]], b=[1], ub=1e7)  # x* = (½, ½), f* = −¾
+FLAT = qp_of([1e-9] * 5, [1, 2, 3, 4, 5], A=[[1] * 5], b=[1], lb=0)  # x* = e₁, f* = 1
+HIDDEN = qp_of([1, 1], [0, 0], G=[[0, 1e-12]], h=[1], lb=[1, -INF])  # (1, 0), ½
+AS_ROW = qp_of([1, 1], [0, 0], G=[[-1, 0], [0, 1e-12]], h=[-1, 1])  # the same
+COSTLY = qp_of([1, 1], [1e9, -1], lb=[0, -INF], ub=[1, INF])  # (0, 1), −½
+LONG = qp_of([1, 0, 0], [0, 0, 0], A=[[1, 1, -1], [0, 1, -1]], b=[1, 0])  # x₁ = 1, ½
+PAID = replace(LONG, q=np.array([0.0, 1, -1]))  # the same, since x₂ = x₃
+UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
+
+
+@pytest.mark.parametrize(
+    ("qp", "s"),
+    [
+        (FAR, at([1, 1], [0])),  # −1 for −¾: the row is violated by 1
+        (FAR, at([0, 0], [1])),  # 0 for −¾, and stationary
+        (FLAT, at([0] * 5, [0])),  # 0 for 1
+        (FLAT, at([0] * 5, [-1], z_box=[0, -1, -2, -3, -4])),
+        (FLAT, at([0, 0, 0, 0, 1], [-1], z_box=[0, -1, -2, -3, -4])),  # 5 for 1
+        (FLAT, at([0, 0, 0, 0, 1], [-5], z_box=[4, 3, 2, 1, 0])),
+        (FLAT, at([0, 0, 0, 0, 1], [-3], z_box=[0, 0, 0, 0, 0])),
+        (HIDDEN, at([0, 0], z=[0])),  # 0 for ½
+        (HIDDEN, at([0, 1e12], z=[0])),
+        (AS_ROW, at([0, 0], z=[0, 0])),
+        (AS_ROW, at([0, 0], z=[1, 0])),
+        (COSTLY, at([0, 0], z_box=[-1e9, 0])),  # 0 for −½
+        (COSTLY, at([1e-9, 1], z_box=[-1e9, 0])),  # ½ for −½
+        (LONG, at([0, 1e12, 1e12], [0, 0])),  # 0 for ½
+        (LONG, at([0, 1e12, 1e12], [-1, 1])),
+        (PAID, at([0, 1e12, 1e12], [0, -1])),
+        (PAID, at([0.5, 1e12, 1e12], [-0.5, -0.5])),
+        (UNITS, at([1, 0])),  # below its bound by all that there is of it
+    ],
+)
+def test_a_wrong_point_is_refuted_by_its_residuals(qp, s):
+    assert judge(qp, s) is Verdict.WRONG
+    assert judge(qp, s, 1e-3) is not Verdict.VERIFIED
+
+
+TINY = 6e-13  #: ½x² + ½x² = 4e-25
+
+
+@pytest.mark.parametrize(
+    ("qp", "s"),
+    [
+        (FAR, at([0.5, 0.5], [0.5])),
+        (FLAT, at([1, 0, 0, 0, 0], [-1 - 1e-9], z_box=[0, -1, -2, -3, -4])),
+        (COSTLY, at([0, 1], z_box=[-1e9, 0])),
+        (LONG, at([1, 1e12, 1e12], [-1, 1])),
+        (PAID, at([1, 1e12, 1e12], [-1, 0])),
+        (LONG, at([1, 0, 0], [-1, 1])),
+        (qp_of([1, 1], [0, 0], ub=1), at([TINY, TINY])),
+        (qp_of([1, 1], [0, 0], lb=0), at([TINY, TINY])),
+        (qp_of([1, 1], [0, 0]), at([TINY, TINY])),
+        (qp_of([1, 1], [0, 0], A=[[1, -1]], b=[0]), at([TINY, TINY], [0])),
+        (qp_of([1, 1], [0, 0], G=[[1, 1]], h=[5]), at([TINY, TINY], z=[0])),
+        (qp_of([1, 1], [1e-17, -3e-17], lb=0, ub=3), at([TINY, TINY])),
+        # a gradient of 1e-9 with a noise of 1e-10, beside one of 1
+        (qp_of([1, 1], [-1, -1e-9]), at([1, 9e-10])),
+    ],
+)
+def test_a_right_point_is_verified_by_its_residuals(qp, s):
+    assert judge(qp, s) is Verdict.VERIFIED
+
+
+def test_without_cost_a_point_far_from_zero_is_still_wrong():
+    assert judge(qp_of([1, 1], [0, 0], ub=1), at([1e-2, 1e-2])) is Verdict.WRONG
+
+
+def test_rows_tighten_the_widths_of_variables():
+    """x₁ + x₂ = 1, x ≥ 0: each at most 1.
+
+    2x₁ − x₃ ≤ 4, x₁ ≥ −1, x₃ ≤ 6: x₁ ≤ 5, x₃ ≥ −6.
+    """
+    simplex = qp_of([1, 1], [0, 0], A=[[1, 1]], b=[1], lb=0)
+    open_ended = qp_of(
+        [1, 1, 1], [0] * 3, G=[[2, 0, -1]], h=[4], lb=[-1, 0, -INF], ub=[INF, INF, 6]
+    )
+
+    assert widths(simplex) == pytest.approx([1, 1])
+    assert widths(open_ended) == pytest.approx([6, INF, 12])
+
+
+#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 1.5δ hold x at (1.5, 0): f* = −0.375
+DELTA = 2.0**-34
+NEARLY = qp_of([1, 1], [-1, 0], G=[[0, 1], [-DELTA, -1]], h=[0, -1.5 * DELTA])
+BETWEEN = at([1, DELTA / 4], z=[0, 0])  # violates both by δ/4; f = −0.5
+
+
+def test_residuals_cannot_refute_a_point_between_nearly_parallel_rows():
+    assert kkt_residuals(NEARLY, BETWEEN).worst <= 1e-9
+
+
+def test_the_reference_refutes_it_and_the_record_says_so():
+    measured = judged(
+        blank(), NEARLY, Measurement(solution=BETWEEN), reference_solution
+    )
+
+    assert measured.status is Verdict.WRONG
+    assert measured.decided_by == "reference"
+    assert measured.optimum_error > 1e-3
+    again = Record.from_json(measured.to_json())
+    assert rejudged(again, 10) is Verdict.WRONG
+    assert rejudged(again, 1e9) is Verdict.VERIFIED  # at 0.1, what it is off by
+
+
+def blank(**changes):
+    return Record(
+        run_id="r", case="c/f", family="c", params={}, form="f", sizes={}, solver="s",
+        options={}, tol=TOL, repeat=0, block=0, status=Verdict.FAILED, **changes,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("accuracy", "expected"), [(1e-2, True), (1e-8, False)])
+def test_an_answer_is_judged_at_the_accuracy_that_is_not_its_tolerance(
+    accuracy, expected
+):
+    """min ½x² − x at x = 1.001: a residual of 1e-3."""
+    s = at([1.001])
+    measured = judged(
+        blank(accuracy=accuracy), qp_of([1], [-1]), Measurement(solution=s)
+    )
+
+    assert (measured.status is Verdict.VERIFIED) is expected
+    assert measured.decided_by == "residuals"
+
+
+@pytest.mark.parametrize("name", ["x", "y", "z", "z_box"])
+def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
+    qp = qp_of([1, 1], [-1, 0], A=[[0, 1]], b=[0], G=[[1, 1]], h=[5], lb=0)
+    s = at([1, 0], [0], z=[0])
+    broken = replace(s, **{name: np.full_like(getattr(s, name), np.nan)})
+    assert judge(qp, s) is Verdict.VERIFIED
+
+    measured = judged(blank(), qp, Measurement(solution=broken), reference_solution)
+
+    assert measured.status is Verdict.WRONG
+
+
+def test_where_the_reference_fails_residuals_stand():
+    def fails(_):
+        raise ArithmeticError
+
+    residuals = kkt_residuals(NEARLY, BETWEEN)
+
+    assert decided(NEARLY, BETWEEN, residuals, TOL, fails) is None
+
+
+def test_a_false_reference_proves_nothing():
+    assert proven_optimum(FAR, lambda _: at([1, 1], [0])) is None
+    assert proven_optimum(COSTLY, lambda _: at([0, 0], z_box=[-1e9, 0])) is None
+
+
+def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
+    """min ½x², x = 1, and a fixed variable of cost −½: f* = 0, terms ½."""
+    qp = qp_of([1, 0], [0, -0.5], A=[[1, 0]], b=[1], lb=[-INF, 1], ub=[INF, 1])
+    s = at([1 + 1e-9, 1], [-1 - 1e-9], z_box=[0, 0.5])
+
+    error = decided(qp, s, kkt_residuals(qp, s), TOL, reference_solution)
+
+    assert error == pytest.approx(1e-9, rel=3)
+    assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
+
+
+def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
+    stored = blank(decided_by="reference", optimum_error=5e-8).but(
+        claimed="solved", primal=1e-6, dual=0.0, complementarity=0.0, gap=0.0,
+        status=verdict(Status.SOLVED, Residuals(1e-6, 0, 0, 0), TOL, error=5e-8),
+    )  # fmt: skip
+
+    assert stored.status is Verdict.VERIFIED
+    assert rejudged(stored, 10) is Verdict.VERIFIED
+    assert rejudged(stored, 1) is Verdict.INACCURATE
+
+
+@pytest.mark.parametrize("kind", ["plain", *KINDS])
+def test_planted_points_are_solutions_to_the_last_digit(kind):
+    for seed in range(5):
+        planted = hard(frozenset({kind} & set(KINDS)), seed)
+        qp, s = planted.qp, planted.solution
+
+        force = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box
+        assert not force.any()
+        assert (qp.A @ s.x == qp.b).all()
+        assert (qp.G @ s.x <= qp.h).all()
+        assert (s.z * (qp.h - qp.G @ s.x) == 0).all()
+        assert (s.z >= 0).all()
+        assert ((qp.lb <= s.x) & (s.x <= qp.ub)).all()
+        assert ((s.z_box >= 0) | (s.x == qp.lb)).all()
+        assert ((s.z_box <= 0) | (s.x == qp.ub)).all()
+
+
+# --- the search: points near and far from planted solutions ---------------------------
+
+
+class Attack:
+    """Points of one planted QP that somebody may want to pass off as its solution."""
+
+    def __init__(self, planted, rng):
+        self.qp, self.s, self.value = planted.qp, planted.solution, planted.value
+        self.rng = rng
+        self.reference = remembered(reference_solution)
+
+    def verified(self, s):
+        residuals = kkt_residuals(self.qp, s)
+        error = decided(self.qp, s, residuals, TOL, self.reference)
+        found = verdict(Status.SOLVED, residuals, TOL, error=error)
+        return found is Verdict.VERIFIED
+
+    def objective(self, x):
+        x = x.astype(np.longdouble)
+        return float(x @ (self.qp.P @ x) / 2 + self.qp.q @ x)
+
+    def error(self, s):
+        """|f − f*|/|f*|; relative to the terms of f at the solution where f* is zero.
+
+        As zero counts what is below 1e-11 of them: rounding x moves f by 1e-5 of that.
+        """
+        x = self.s.x
+        terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q @ x)) or 1.0
+        size = abs(self.value) if abs(self.value) > 1e-11 * terms else terms
+        return abs(self.objective(s.x) - self.value) / size
+
+    def violation(self, x):
+        """The worst row or bound, relative to its terms, of those with b ≠ 0."""
+        qp, worst = self.qp, 0.0
+        for off, b, terms in (
+            (abs(qp.A @ x - qp.b), qp.b, abs(qp.A) @ abs(x)),
+            (qp.G @ x - qp.h, qp.h, abs(qp.G) @ abs(x)),
+            (qp.lb - x, qp.lb, abs(x)),
+            (x - qp.ub, qp.ub, abs(x)),
+        ):
+            told = np.isfinite(b) & (b != 0)
+            size = (abs(b) + terms)[told]
+            worst = max(worst, (off[told] / size).max(initial=0.0))
+        return worst
+
+    def rounded(self):
+        """The solution, its numbers off by one or two units in the last place."""
+
+        def off(v):
+            return v * (1 + 2.0**-52 * self.rng.integers(-2, 3, v.size))
+
+        s, qp = self.s, self.qp
+        return replace(
+            s, x=np.clip(off(s.x), qp.lb, qp.ub), y=off(s.y), z=off(s.z),
+            z_box=off(s.z_box),
+        )  # fmt: skip
+
+    def points(self, count):
+        """Moves of all sizes, then steps uphill from those that passed as solutions."""
+        best, worst = self.s, 0.0
+        for k in range(count):
+            start = best if k % 3 == 2 else self.s
+            point = self.moved(start)
+            yield point
+            error = self.error(point)
+            if error > worst and kkt_residuals(self.qp, point).worst <= 1e-7:
+                best, worst = point, error
+
+    def moved(self, s):
+        rng, qp = self.rng, self.qp
+        exponent = rng.uniform(0, 12) if rng.random() < 0.2 else rng.uniform(-12, 1)
+        size = 10.0**exponent
+        x, unit = s.x, self.unit(s.x)
+        match rng.integers(0, 7):
+            case 0:  # one variable
+                x = x + size * unit * rng.standard_normal() * self.one(x.size)
+            case 1:  # all of them
+                x = x + size * unit * rng.standard_normal(x.size)
+            case 2 | 3:  # along the rows that are active, also along free directions
+                x = x + size * self.along_rows(x, unit)
+            case 4:  # another vertex
+                x = np.where(rng.random(x.size) < 0.5, 0, x)
+            case 5:  # down the objective, through the rows
+                slope = (qp.P @ x + qp.q) * unit
+                x = x - size * unit * slope / (np.linalg.norm(slope) or 1)
+            case _:  # multipliers alone
+                return self.with_noise(s, size, 1 / 3)
+        if rng.random() < 0.5:
+            x = np.clip(x, qp.lb, qp.ub)
+        s = replace(s, x=x)
+        if rng.random() < 0.7:
+            s = self.fitted(s)
+        return self.with_noise(s, 10 ** rng.uniform(-12, -5), 0.15)
+
+    def along_rows(self, x, unit):
+        qp, rng = self.qp, self.rng
+        tight = qp.h - qp.G @ x <= 1e-9 * (abs(qp.h) + abs(qp.G) @ abs(x))
+        rows = np.vstack([qp.A, qp.G[tight & (rng.random(tight.size) < 0.7)]])
+        free = (x != qp.lb) & (x != qp.ub)
+        B = rows * np.where(free, unit, 0)
+        B = B / np.maximum(np.linalg.norm(B, axis=1, keepdims=True), 1e-300)
+        step = np.where(free, rng.standard_normal(x.size), 0)
+        if B.size:
+            step -= np.linalg.pinv(B, rcond=1e-11) @ (B @ step)
+        return unit * step
+
+    def fitted(self, s):
+        """Give the multipliers that balance the gradient best, on what is active."""
+        qp, x = self.qp, s.x
+        g = qp.P @ x + qp.q
+        tight = qp.h - qp.G @ x <= 1e-9 * (abs(qp.h) + abs(qp.G) @ abs(x))
+        low, high = x <= qp.lb, x >= qp.ub
+        B = np.vstack([qp.A, qp.G * tight[:, None], np.diag((low | high) * 1.0)]).T
+        length = np.maximum(abs(B).max(axis=0), 1e-300)
+        weight = 1 / np.maximum(np.maximum(abs(g), abs(B).max(axis=1)), 1e-300)
+        scaled = B / length * weight[:, None]
+        found = np.linalg.lstsq(scaled, -g * weight, rcond=None)[0] / length
+        y, z, z_box = np.split(found, [qp.b.size, qp.b.size + qp.h.size])
+        z_box = np.where(low & ~high, np.minimum(z_box, 0), z_box)
+        z_box = np.where(high & ~low, np.maximum(z_box, 0), z_box)
+        return replace(s, y=y, z=np.maximum(z, 0), z_box=z_box)
+
+    def with_noise(self, s, size, probability):
+        rng = self.rng
+        changes = {
+            name: v + size * self.unit(v) * rng.standard_normal(v.size)
+            for name in ("y", "z", "z_box")
+            if (v := getattr(s, name)).size and rng.random() < probability
+        }
+        return replace(s, **changes)
+
+    def one(self, n):
+        return np.arange(n) == self.rng.integers(n)
+
+    @staticmethod
+    def unit(v):
+        return np.where(v != 0, abs(v), abs(v).max(initial=0.0) or 1.0)
+
+
+def search(seed, tries, each=40):
+    """Attack QPs of up to three kinds each; give what was wrongly judged."""
+    rng = np.random.default_rng(seed)
+    wrong, refuted, verified = [], [], 0
+    with np.errstate(all="ignore"):
+        for _ in range(tries // each):
+            kinds = frozenset(
+                map(str, rng.choice([*KINDS], rng.integers(0, 4), replace=False))
+            )
+            number = int(rng.integers(2**30))
+            attack = Attack(hard(kinds, number), rng)
+            for _ in range(3):
+                s = attack.rounded()
+                if attack.error(s) < 1e-9 and not attack.verified(s):
+                    refuted.append((sorted(kinds), number))
+            for s in attack.points(each - 3):
+                if not attack.verified(s):
+                    continue
+                verified += 1
+                off = attack.error(s), attack.violation(s.x)
+                if max(off) > 1e-3:
+                    wrong.append((sorted(kinds), number, off))
+    return wrong, refuted, verified
+
+
+def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted():
+    wrong, refuted, verified = search(271828, 1000)
+
+    assert (wrong, refuted) == ([], [])
+    assert verified > 50
+
+
+@pytest.mark.slow
+def test_a_search_of_a_hundred_thousand_points_finds_none_either():
+    wrong, refuted, verified = search(314159, 100_000)
+
+    assert (wrong, refuted) == ([], [])
+    assert verified > 10_000
