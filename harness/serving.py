@@ -222,7 +222,11 @@ def measures(request: Mapping[str, Any]) -> bool:
 
 def kind_of(request: Mapping[str, Any]) -> str:
     """Tell what a request asks for; "" where it is none of ours."""
-    kinds = [kind for kind in ("build", "describe", "solve", "check", "qp") if kind in request]
+    kinds = [
+        kind
+        for kind in ("build", "describe", "solve", "check", "qp")
+        if kind in request
+    ]
     return kinds[0] if kinds else ""
 
 
