@@ -11,13 +11,13 @@ from __future__ import annotations
 import json
 import os
 import resource
-import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from harness import reading
 from harness.errors import InputError, shortened
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
@@ -78,25 +78,9 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
         When it cannot be opened, or is none of these.
 
     """
-    try:
-        regular = stat.S_ISREG(path.stat().st_mode)  # to open a device may act on it
-        flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK  # a pipe took its place
-        fd = os.open(path, flags) if regular else -1
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror or e}; expected {expected}") from None
-    except ValueError:  # NUL, or what the file system cannot encode
-        raise InputError(
-            f"{shortened(str(path))!r} is no name of a file; expected {expected}"
-        ) from None
-    if fd < 0:
-        kind = "a folder" if path.is_dir() else "a device, pipe or socket"
-        raise InputError(f"{path} is {kind}; expected {expected}")
-    with os.fdopen(fd, "rb") as file:
-        found = os.fstat(file.fileno())
-        if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"{path} changed while it was opened; expected {expected}")
+    with reading.opened(path, expected) as file:
         if limited:
-            check_size(f"{path}: the file", found.st_size)
+            check_size(f"{path}: the file", os.fstat(file.fileno()).st_size)
         yield file
 
 

@@ -22,12 +22,14 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+CPU_SECONDS = 60  #: after which the kernel ends this process
 ROOM = 2**29  #: bytes of address space beside four times what the file declares
 
 
 def main(most: int, key: str, wanted: list[str]) -> None:
     """Read standard input, write standard output."""
     # a thread of arrow's may abort Python when it ends
+    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     told = file.metadata
     size = _declared(told)

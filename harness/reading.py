@@ -40,12 +40,15 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
     expected : what to say instead of "a file"
     """
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        regular = stat.S_ISREG(path.stat().st_mode)  # to open a device may act on it
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe took its place
+        fd = os.open(path, flags) if regular else -1
     except (OSError, ValueError) as e:  # a NUL in the name
         why = e.strerror if isinstance(e, OSError) else "no name of a file"
         raise InputError(f"{path}: {why}; expected {expected}") from None
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        os.close(fd)
+    if not regular or not stat.S_ISREG(os.fstat(fd).st_mode):
+        if fd >= 0:
+            os.close(fd)
         wrong = "a folder" if path.is_dir() else "a device or a pipe"
         raise InputError(f"{path}: {wrong}; expected {expected}")
     with os.fdopen(fd, "rb") as file:

@@ -140,7 +140,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, kind, suffix):
             path = "/dev/zero"
     read = read_msh if suffix == ".msh" and kind != "zero" else build
 
-    with pytest.raises(InputError, match=r"is a (device|folder).*expected"):
+    with pytest.raises(InputError, match=r": a (device|folder).*expected"):
         read(path)
 
 
@@ -539,12 +539,12 @@ KINDS = ("npz", "mat", "qps", "msh", "parquet")
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
-    fuzz(kind, 4 if kind == "parquet" else 150, 11, tmp_path, seconds=30)
+    fuzz(kind, 4 if kind == "parquet" else 150, 11, tmp_path, seconds=120)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_of_a_thousand_damaged_files_none_raises_or_hangs(tmp_path, kind):
-    survived = fuzz(kind, 1000, 12, tmp_path, seconds=30)
+    survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
 
     assert 0 < survived < 500  # or the damage is none, or all there is
