@@ -97,9 +97,12 @@ def _read(path: Path) -> Any:
         points = np.asarray(mesh.points, dtype=float)
         cells = [np.asarray(block.data) for block in mesh.cells]
         tags = mesh.cell_data.get("gmsh:physical", [])
+        numbers = _numbers(path.read_bytes())
         tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
     if points.ndim != 2 or points.shape[1] < 2 or not (abs(points) < FAR).all():
         raise InputError(f"{path}: coordinates beyond {FAR:g}, or none; expected some")
+    if numbers is not None and (numbers < 1).any():  # which meshio counts from the end
+        raise InputError(f"{path}: cells of nodes below 1; expected their numbers")
     for block, nodes in zip(mesh.cells, cells, strict=True):
         corners = CORNERS.get(block.type, nodes.shape[-1])
         if nodes.ndim != 2 or nodes.shape[1] != corners:
@@ -110,6 +113,28 @@ def _read(path: Path) -> Any:
     if tags and not tagged:
         raise InputError(f"{path}: not every cell has a tag; expected one for each")
     return mesh
+
+
+def _numbers(data: bytes) -> NDArray[np.int64] | None:
+    """List the numbers of nodes that the cells of a text name; None if it is binary."""
+    head, _, rest = data.partition(b"$Elements")
+    version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
+    if kind != b"0":
+        return None
+    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]  # less their number
+    found: list[int] = []
+    left = 0  # cells of the block, in format 4
+    for fields in (list(map(int, line.split())) for line in lines):
+        if not fields:
+            continue
+        if version.startswith(b"2"):
+            found += fields[3 + fields[2] :]
+        elif left == 0:
+            left = fields[3]
+        else:
+            found += fields[1:]
+            left -= 1
+    return np.array(found, dtype=np.int64)
 
 
 def _named(path: Path, mesh: Any, kind: str) -> dict[str, Nodes]:
