@@ -259,7 +259,10 @@ def _apart(record: Record) -> Record:
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Order by case, tolerance and repeat; of equal run_ids the last one counts."""
+    """Order by case, tolerance and repeat; of equal run_ids the last one counts.
+
+    Those of a journal are distinct, those of several folders may not be.
+    """
     latest = {r.run_id: r for r in records}
     return tuple(sorted(latest.values(), key=_position))
 
