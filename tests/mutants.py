@@ -3,6 +3,7 @@
 import json
 import signal
 from contextlib import contextmanager
+from copy import deepcopy
 
 WORDS = (
     "nan", "inf", "-inf", "-0", "1e400", "1" + "0" * 400, "9" * 5000, "1_0", "0x10",
@@ -52,7 +53,7 @@ def distorted(data, random):
             if isinstance(at[key], dict | list) and at[key] and random.random() < 0.7:
                 at = at[key]
                 continue
-            at[key] = random.choice(VALUES)
+            at[key] = deepcopy(random.choice(VALUES))
             break
     return data
 
