@@ -15,10 +15,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from harness.datafile import opened
 from harness.durable import Lines
 from harness.errors import InputError, shown, some
 from harness.folder import refuse_links
-from harness.reading import opened
 from harness.record import Record
 
 LONGEST_LINE = 2**24  #: bytes that are read of one
@@ -162,7 +162,7 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
 
 def _lines(path: Path) -> Iterator[bytes]:
     """Read the whole lines of a file one by one; a partial one at the end is none."""
-    with opened(path) as file:
+    with opened(path, "a journal", limited=False) as file:
         for number in count(1):
             line = file.readline(LONGEST_LINE)
             if line.endswith(b"\n"):

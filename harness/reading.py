@@ -10,14 +10,12 @@ from __future__ import annotations
 import json
 import os
 import re
-import stat
 import sys
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
+from harness.datafile import opened
 from harness.errors import InputError
 
 VARIABLE = "MORTARBENCH_TEXT_MIB"  #: the largest text file that is read
@@ -33,25 +31,6 @@ _LONG_KEY = re.compile(
 )
 
 
-@contextmanager
-def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
-    """Open a regular file to be read; pipes and devices could give without end.
-
-    expected : what to say instead of "a file"
-    """
-    try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except (OSError, ValueError) as e:  # a NUL in the name
-        why = e.strerror if isinstance(e, OSError) else "no name of a file"
-        raise InputError(f"{path}: {why}; expected {expected}") from None
-    if not stat.S_ISREG(os.fstat(fd).st_mode):
-        os.close(fd)
-        wrong = "a folder" if path.is_dir() else "a device or a pipe"
-        raise InputError(f"{path}: {wrong}; expected {expected}")
-    with os.fdopen(fd, "rb") as file:
-        yield file
-
-
 def read_text(
     path: Path, expected: str = "a text file", most: float = MOST_JSON
 ) -> str:
@@ -61,7 +40,7 @@ def read_text(
     most : MiB, unless the user set another limit
     """
     limit = _limit(most)
-    with opened(path, expected) as file:
+    with opened(path, expected, limited=False) as file:
         data = file.read(int(limit * 2**20) + 1)
     if len(data) > limit * 2**20:
         raise InputError(
