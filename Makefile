@@ -49,7 +49,7 @@ weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py
 
-crowd: setup  ## time, memory and size of reports up to 50 000 measurements
+crowd: setup  ## time and memory of journals and reports up to 100 000 records
 	$(BIN)/python benchmarks/crowd.py
 
 check: setup  ## format, lint, types, import contracts

@@ -1,4 +1,4 @@
-"""Time, peak memory and size of a report against the number of measurements.
+"""Time and peak memory of reading a journal and of its report, by their sizes.
 
     make crowd        or   .venv/bin/python benchmarks/crowd.py [CASES ...]
 
@@ -17,12 +17,22 @@ from tempfile import TemporaryDirectory
 from time import process_time
 
 SOLVERS, REPEATS = 20, 5
-CASES = (10, 100, 500)
-FORMATS = ("html", "md", "tex", "csv")
+CASES = (10, 100, 1000)
+FORMATS = ("html", "md", "tex", "csv", "parquet")
 TIMES = """() => new Promise((done) =>
   requestAnimationFrame(() => setTimeout(() => done([
     performance.getEntriesByName("first-contentful-paint")[0]?.startTime,
     performance.getEntriesByType("navigation")[0].loadEventEnd]))))"""
+
+
+def read(folder):
+    """Read the journal of a folder in this process."""
+    from harness.journal import read_journal
+
+    start = process_time()
+    records = read_journal(Path(folder))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{len(records):9} {process_time() - start:9.1f} {peak:9.0f}", end="")
 
 
 def measure(folder):
@@ -57,25 +67,27 @@ def paint(folder):
 
 def main(cases):
     tests = Path(__file__).parents[1] / "tests"
-    print("  records     CPU s  peak MiB   page MB  first paint s  loaded s")
+    print("             journal:            report:")
+    print(
+        "  records     CPU s  peak MiB     CPU s  peak MiB   page MB"
+        "  first paint s  loaded s"
+    )
     for count in cases:
         with TemporaryDirectory() as folder:
             make = [tests / "crowd.py", folder, SOLVERS, count, REPEATS]
             subprocess.run([sys.executable, *map(str, make)], check=True)
-            print(f"{SOLVERS * count * REPEATS:9}", end="", flush=True)
-            again = [sys.executable, __file__, "--measure", folder]
-            print(
-                subprocess.run(
-                    again, check=True, capture_output=True, text=True
-                ).stdout,
-                end="",
-            )
+            for part in ("--read", "--measure"):
+                again = [sys.executable, __file__, part, folder]
+                done = subprocess.run(again, check=True, capture_output=True, text=True)
+                print(done.stdout, end="", flush=True)
             times = paint(Path(folder))
             print("" if times is None else "".join(f"{t / 1e3:12.2f}" for t in times))
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--measure"]:
+    if sys.argv[1:2] == ["--read"]:
+        read(sys.argv[2])
+    elif sys.argv[1:2] == ["--measure"]:
         measure(sys.argv[2])
     else:
         main([int(a) for a in sys.argv[1:]] or CASES)

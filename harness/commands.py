@@ -121,7 +121,7 @@ def run(workbench: Workbench, options: Namespace) -> int:
             if options.dask is not None
             else partial(one_by_one, operators=workbench.operators),
         )
-    records = read_journal(out)
+    records = read_journal(out, say)
     print(show.summary(records, [s.label for s in suite.solvers]))
     if count := len(missing.unbuilt):
         cases = "case" if count == 1 else "cases"

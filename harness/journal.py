@@ -162,7 +162,7 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
 
 def _lines(path: Path) -> Iterator[bytes]:
     """Read the whole lines of a file one by one; a partial one at the end is none."""
-    with opened(path) as file:
+    with opened(path, "a journal") as file:
         for number in count(1):
             line = file.readline(LONGEST_LINE)
             if line.endswith(b"\n"):

@@ -136,7 +136,7 @@ def _refuse_deep(data: object) -> None:
         ]
         if not level:
             return
-    raise _too_deep()
+    raise RecursionError
 
 
 def _too_deep() -> InputError:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 from harness.errors import shown
 
@@ -77,7 +77,7 @@ class Record:
     claimed: str | None = None  #: the solver's own status
     message: str = ""  #: its words, the reason it declined, or how it died
     iterations: int | None = None
-    counts: Mapping[str, int] = field(default_factory=dict)
+    counts: Mapping[str, Any] = field(default_factory=dict)
     reported: Mapping[str, Any] = field(
         default_factory=dict
     )  #: its linear solver, its own times in seconds
@@ -109,7 +109,7 @@ class Record:
     optimum_error: float | None = None  #: against the proven optimum, harness.optimum
     energy_bound: float | None = None  #: certified relative error, energy norm
     #: what it is made of, as relative; see `harness.judge.certified`
-    certificate: Mapping[str, float] = field(default_factory=dict)
+    certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
     qp: str | None = None  #: digest of the emitted QP; None in old journals
@@ -156,16 +156,27 @@ class Record:
         try:
             try:
                 record = _decoder().decode(line)
-            except msgspec.ValidationError:
-                raise
+            except msgspec.ValidationError as e:
+                raise ValueError(_explained(e, _parsed(line))) from None
             except msgspec.DecodeError:  # no JSON, or a lone surrogate
-                record = msgspec.convert(_spelt(json.loads(line)), Record)
+                row = _spelt(_parsed(line))
+                try:
+                    record = msgspec.convert(row, Record)
+                except msgspec.ValidationError as e:
+                    raise ValueError(_explained(e, row)) from None
             _check(record)
             return _share(record, {} if shared is None else shared)
-        except msgspec.ValidationError as e:
-            raise ValueError(_explained(e, json.loads(line))) from None
         except RecursionError:
             raise ValueError(f"nested deeper than {MOST_LEVELS} levels") from None
+
+
+def _parsed(line: str | bytes) -> Any:
+    """Parse JSON without the constants that only Python knows."""
+
+    def refuse(text: str) -> NoReturn:
+        raise ValueError(f"{text} is no number in JSON; expected null or a number")
+
+    return json.loads(line, parse_constant=refuse)
 
 
 @cache

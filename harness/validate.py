@@ -65,7 +65,7 @@ def validate(workbench: Workbench, options: Namespace) -> int:
 def _meshes(workbench: Workbench, folder: Path, budget: float) -> list[Discretisation]:
     """Solve the folder's cases on finer meshes, where families say what these are."""
     refinable = {k: f for k, f in workbench.families.items() if hasattr(f, "refined")}
-    records = {r.case: r for r in read_journal(folder) if r.family in refinable}
+    records = {r.case: r for r in read_journal(folder, say) if r.family in refinable}
     names = []
     for r in records.values():
         with suppress(InputError):  # of another version: listed as not validated

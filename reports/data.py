@@ -13,6 +13,7 @@ from harness.faults import Fault, left, read_faults
 from harness.journal import read_journal
 from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
 from harness.reading import read_json, read_toml
+from harness.show import say
 from reports.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
@@ -220,7 +221,7 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         When the folder or its measurements are missing, or a file is malformed.
 
     """
-    records = read_journal(directory)
+    records = read_journal(directory, say)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
     return Evidence(
@@ -258,7 +259,10 @@ def _apart(record: Record) -> Record:
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Order by case, tolerance and repeat; of equal run_ids the last one counts."""
+    """Order by case, tolerance and repeat; of equal run_ids the last one counts.
+
+    Those of a journal are distinct, those of several folders may not be.
+    """
     latest = {r.run_id: r for r in records}
     return tuple(sorted(latest.values(), key=_position))
 

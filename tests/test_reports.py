@@ -308,7 +308,8 @@ def hostile(measured):
         return measured(
             text, size, case=f"{text}/dual", family=text, message=text, claimed=text,
             params={text[:50]: text}, options={text[:50]: text}, counts={text[:50]: 3},
-            run_id=text, started=text, quantities={"dofs": size, text[:50]: text},
+            run_id=f"{text}{size}", started=text,
+            quantities={"dofs": size, text[:50]: text},
         )  # fmt: skip
 
     return [record(t, size) for t in HOSTILE for size in (10, 20, 40)] + [

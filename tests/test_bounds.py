@@ -1,0 +1,333 @@
+"""What a user gives has bounds: beyond them one line says what would be right."""
+
+import json
+import os
+
+import pytest
+
+from harness import InputError
+from harness.__main__ import _workbench
+from harness.cli import main
+from harness.errors import one_line, shown
+from harness.journal import read_journal
+from harness.limits import CASE_VARIABLE
+from harness.names import canonical, parse
+from harness.reading import VARIABLE, read_json, read_toml, toml
+from harness.record import Record, Verdict
+from harness.suite import load_suite
+from problems import PROBLEMS
+from solvers import SOLVERS
+
+SUITE = 'name = "s"\nsolvers = ["osqp"]\n[[problems]]\nfamily = "beam-ring"\n'
+
+
+def record(run_id="a", **changes):
+    blank = Record(
+        run_id=run_id, case="tiny/plain", family="tiny", params={"h": 1.0},
+        form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
+        status=Verdict.VERIFIED,
+    )  # fmt: skip
+    return blank.but(**changes)
+
+
+@pytest.fixture
+def journal(tmp_path):
+    """Write lines, records or changed fields of one, into a journal; its folder."""
+
+    def journal(*entries):
+        (tmp_path / "journal").mkdir(exist_ok=True)
+        lines = []
+        for entry in entries:
+            if isinstance(entry, dict):
+                entry = json.dumps(json.loads(record().to_json()) | entry)
+            lines.append(entry if isinstance(entry, str) else entry.to_json())
+        file = tmp_path / "journal" / "here.jsonl"
+        file.write_bytes("".join(f"{line}\n" for line in lines).encode())
+        return tmp_path
+
+    return journal
+
+
+@pytest.fixture
+def refused(capsys, monkeypatch, tmp_path):
+    """Run a command that must end with exit code 2; returns its one line."""
+    monkeypatch.chdir(tmp_path)
+    workbench = _workbench()
+
+    def refused(*argv):
+        assert main(workbench, [str(word) for word in argv]) == 2
+        message = capsys.readouterr().err
+        assert message.count("\n") == 1
+        return message
+
+    return refused
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"tol": 0}, "tol = 0.0; expected a number above 0, at most 1"),
+        ({"tol": -1e-6}, "expected a number above 0"),
+        ({"tol": 10**30}, "expected a number above 0, at most 1"),
+        ({"accuracy": 0.0}, "accuracy = 0.0; expected"),
+        ({"solve_seconds": -2e-6}, "solve_seconds = -2e-06; expected no negative"),
+        ({"gap": -1.0}, "gap = -1.0; expected no negative number"),
+        ({"repeat": 10**30}, "expected an integer of at most 64 bits"),
+        ({"iterations": -(10**30)}, "expected an integer of at most 64 bits"),
+        ({"counts": {"steps": 10**400}}, "counts.steps = 1000"),
+        ({"quantities": {"a": [[2**63]]}}, "expected an integer of at most 64 bits"),
+        ({"status": "fine"}, "status = 'fine'; expected one of verified, inaccurate"),
+        ({"run_id": ""}, "run_id is empty; expected a text"),
+        ({"options": {"x": [[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]}}, "deeper"),
+        ({"message": 10**5000 // 7 % 10**300}, "expected str"),
+    ],
+)
+def test_a_journal_line_with_an_impossible_value_is_named(journal, changed, expected):
+    folder = journal(record("b"), changed)
+
+    with pytest.raises(InputError) as e:
+        read_journal(folder)
+    assert expected in str(e.value)
+    assert str(e.value).startswith(f"{folder}/journal/here.jsonl, line 2: ")
+    assert len(str(e.value)) < len(str(folder)) + 400
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "1e400", "9" * 5000, "[" * 9000])
+def test_what_is_no_number_to_json_or_no_reader_can_hold_is_refused(journal, value):
+    line = record().to_json().replace('"gap": null', f'"gap": {value}')
+
+    with pytest.raises(InputError, match="line 1: "):
+        read_journal(journal(line))
+
+
+def test_numbers_that_no_reader_can_hold_are_not_written():
+    row = json.loads(record(counts={"n": 2**63}, gap=float("inf")).to_json())
+
+    assert row["counts"] == {"n": None}
+    assert row["gap"] is None
+
+
+def test_extreme_values_that_are_possible_are_read_as_they_are(journal):
+    odd = {
+        "objective": -1e308, "gap": 1e308, "iterations": -1, "message": "\x00\u202e",
+        "counts": {"": None, "n": 2**63 - 1}, "tol": 1, "unknown": [[[]]],
+    }  # fmt: skip
+    [r] = read_journal(journal(odd))
+
+    assert (r.objective, r.gap, r.iterations, r.tol) == (-1e308, 1e308, -1, 1.0)
+    assert r.counts == {"": None, "n": 2**63 - 1}
+
+
+def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
+    folder, told = journal(record("a"), record("b"), record("a"), record("a")), []
+
+    assert [r.run_id for r in read_journal(folder, told.append)] == ["a", "b"]
+    [line] = told
+    assert line.startswith("2 journal lines are there before, word for word")
+    assert "here.jsonl, line 3" in line
+
+
+def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(journal):
+    folder = journal(record("b"), record("a"), record("a", status=Verdict.WRONG))
+
+    with pytest.raises(InputError) as e:
+        read_journal(folder)
+    assert "line 3: tells of run_id 'a' another thing than " in str(e.value)
+    assert "here.jsonl, line 2; expected one line for each" in str(e.value)
+
+
+def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
+    journal, refused, capsys
+):
+    folder = journal(record("a"), record("a"))
+    assert main(_workbench(), ["report", str(folder), "--format", "csv"]) == 0
+    assert "1 journal line is there before" in capsys.readouterr().err
+
+    folder = journal(record("a"), record("a", tol=1e-3))
+    for command in ("report", "validate"):
+        assert "another thing than" in refused(command, folder)
+    assert "another thing than" in refused("replay", folder, "a")
+
+
+def test_equal_tables_of_a_journal_are_one_in_memory_but_1_is_not_true(journal):
+    a, b, c = read_journal(
+        journal(
+            record("a", options={"n": 1}),
+            record("b", options={"n": 1}, message="{'n': 1}", claimed="{'n': 1}"),
+            record("c", options={"n": True}),
+        )
+    )
+
+    assert a.options is b.options
+    assert b.claimed == "{'n': 1}"
+    assert c.options["n"] is True
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a = " + "[" * 5000, "nested too deeply; expected at most"),
+        ("a = " + "[" * 200 + "]" * 200, "nested too deeply"),
+        ("a = " + "{a=" * 3000, "nested too deeply"),
+        ("a" + ".a" * 200_000 + " = 1", "nested too deeply"),
+        ("[" + "a." * 200_000 + "a]", "nested too deeply"),
+        ("a = " + "9" * 5000, "too many digits; expected at most 4300"),
+        ("a = 1e", "line 1, column"),
+    ],
+)
+def test_toml_that_would_never_end_is_refused(text, expected):
+    with pytest.raises(InputError, match=expected):
+        toml(text)
+
+
+def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "pipe")
+    large = tmp_path / "large.toml"
+    large.write_bytes(b"#" * 2_000_000)
+    (tmp_path / "latin").write_bytes(b"a = '\xe9'")
+    for path, wrong in (
+        ("/dev/zero", "a device, pipe"), (tmp_path / "pipe", "a device, pipe"),
+        (tmp_path, "a folder"), (large, "larger than 1 MiB"), ("a\0b", "no name of a"),
+        (tmp_path / "latin", "not UTF-8"), (tmp_path / "none", "No such file"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=f"{wrong}.*; expected a TOML file"):
+            read_toml(tmp_path / path)
+
+    monkeypatch.setenv(VARIABLE, "3")
+    assert read_toml(large) == {}
+    monkeypatch.setenv(VARIABLE, "lots")
+    with pytest.raises(InputError, match="expected a number of MiB, such as 100"):
+        read_toml(large)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 9000, "[" * 99 + "]" * 99, '{"a": NaN}', "{", ""]
+)
+def test_json_that_is_none_is_refused_with_its_file(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+
+    with pytest.raises(InputError, match=r"a\.json: .*expected"):
+        read_json(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ("null_arm = []", "null_arm = []; expected a text"),
+        ("repeats = 1_000_000_000_000", "expected an integer of at most 1000000"),
+        ("tolerances = [1e-6, 1e-6]", "expected distinct numbers"),
+        ("tolerances = [nan]", "expected distinct numbers between 0 and 1"),
+        ("budget = inf", "budget = inf; expected a positive number"),
+        ('null_arm = "a\\u0000b"', "expected a text without control characters"),
+        (f"precision = {'9' * 4000}", "expected a number between 0 and 1"),
+        ("time_limit = 1e400", "time_limit = inf; expected a positive number"),
+    ],
+)
+def test_odd_values_of_a_suite_are_refused_briefly(tmp_path, change, expected):
+    path = tmp_path / "s.toml"
+    path.write_text(f"{change}\n{SUITE}")
+
+    with pytest.raises(InputError) as e:
+        load_suite(path, PROBLEMS, SOLVERS)
+    assert expected in str(e.value)
+    assert len(str(e.value)) < len(str(path)) + 400
+
+
+def test_a_grid_beyond_the_limit_says_how_to_raise_it_before_it_is_spanned(tmp_path):
+    path, many = tmp_path / "s.toml", list(range(1, 951))
+    grid = f"params = {{ Nr = {many}, Nh = {many}, step = 1 }}\nforms = ['dual']\n"
+    path.write_text(SUITE + grid)
+    with pytest.raises(InputError, match="spans 902500 cases; expected at most 100000"):
+        load_suite(path, PROBLEMS, SOLVERS)
+
+    few = f"params = {{ Nr = {many[:3]}, step = 1 }}\nforms = ['dual']\n"
+    path.write_text(f"max_cases = 2\n{SUITE}{few}")
+    with pytest.raises(InputError, match="set max_cases = 3 in the suite"):
+        load_suite(path, PROBLEMS, SOLVERS)
+    path.write_text(f"max_cases = 3\n{SUITE}{few}")
+    assert len(load_suite(path, PROBLEMS, SOLVERS).names) == 3
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "beam-ring/Nr=1_0/dual", "beam-ring/Nr=\u0661/dual",
+        "hertz-plane/load=1_0/dual",
+        "hertz-plane/load=nan/dual", "hertz-plane/load=1e400/dual",
+        "hertz-plane/load=1e308/dual", "hertz-plane/load=1e-320/dual",
+        "hertz-plane/halvings=9000000000000000000/dual", "beam-ring/Nr=1000000000/dual",
+        "beam-ring/steps=100000000000000000000/dual", "beam-ring/steps=1000000/dual",
+        "obstacle/n=1000000000/primal", "contact-patch/lower=1000000000/dual",
+        "beam-ring/Nr=" + "9" * 5000 + "/dual",
+        "beam-ring/" + "x" * 100_000 + "=1/dual",
+        "bodies:a\0b.toml/dual", "y" * 100_000 + "/dual", "beam-ring/" + "z" * 100_000,
+    ],
+)  # fmt: skip
+def test_cases_that_cannot_be_are_refused_by_name_and_briefly(name):
+    with pytest.raises(InputError) as e:
+        parse(name, PROBLEMS)
+    assert len(str(e.value)) < 600
+    assert not any(letter * 201 in str(e.value) for letter in "9xyz")
+
+
+def test_minus_zero_is_zero():
+    family = PROBLEMS["hertz-plane"]
+    with pytest.raises(InputError, match=r"load=0\.0 must be positive"):
+        parse("hertz-plane/load=-0/dual", PROBLEMS)
+    assert "-" not in canonical(parse("hertz-plane/n=+7/dual", PROBLEMS), family)[11:]
+
+
+def test_how_much_memory_a_case_may_take_can_be_raised(monkeypatch):
+    monkeypatch.setenv(CASE_VARIABLE, "0.5")
+    with pytest.raises(
+        InputError, match="or MORTARBENCH_CASE_MIB set to what there is"
+    ):
+        parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
+    monkeypatch.setenv(CASE_VARIABLE, "1000")
+    assert parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS).params["Nr"] == 30
+    monkeypatch.setenv(CASE_VARIABLE, "-1")
+    with pytest.raises(InputError, match="expected a number of MiB"):
+        parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
+
+
+def test_a_message_repeats_little_of_a_long_input_but_paths_that_exist(tmp_path):
+    deep = tmp_path / ("d" * 200) / ("e" * 200)
+    deep.mkdir(parents=True)
+
+    assert one_line(f"{deep}: what\nis it") == f"{deep}: what is it"
+    assert "q" * 201 not in one_line(f"unknown thing {'q' * 5000!r}; known: a, b")
+    assert len(one_line("word " * 5000)) < 700
+    assert shown([1] * 5000).startswith("[1, 1")
+    assert len(shown([1] * 5000)) == 200
+    nested = []
+    for _ in range(100_000):
+        nested = [nested]
+    assert shown(nested) == "a list too long to show"
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ("run", "/dev/zero"), ("run", "pipe"), ("run", "."), ("run", "x" * 5000),
+        ("run", "a\udcffb.toml"), ("report", "a\udcffb"), ("report", "/dev/null"),
+        ("solve", "beam-ring/Nr=" + "9" * 5000 + "/dual", "--solver", "osqp"),
+        ("solve", "beam-ring/Nr=4/dual", "--solver", "w" * 100_000),
+        ("solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "v" * 100_000),
+        ("solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "nan"),
+        ("report", ".", "--factor", "inf"), ("report", ".", "--format", "u" * 100_000),
+        ("validate", ".", "--budget", "inf"), ("replay", ".", ""), ("list", "t" * 9000),
+        ("s" * 100_000,), ("run", "demo", "--repeats", "9" * 5000),
+        ("run", "", "--out", ""),
+        ("run", "demo", "--repeats", "1000000000000"), ("run", "demo", "--case", "["),
+        ("run", "demo", "--memory-limit", "1e400"), ("run", "demo", "--solver", ""),
+    ],
+)  # fmt: skip
+def test_no_command_ends_with_a_traceback_or_repeats_a_long_input(
+    refused, tmp_path, argv
+):
+    os.mkfifo(tmp_path / "pipe")
+
+    message = refused(*argv)
+
+    assert not any(letter * 201 in message for letter in "stuvwxyz9")
+    assert len(message) < 1500
