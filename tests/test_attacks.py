@@ -143,7 +143,7 @@ def left(attacked):
 
 
 def soon(condition):
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.02)
     return condition()
