@@ -475,9 +475,12 @@ Bench(Path(sys.argv[1]))("hangswithadaemon", time_limit=3600)
 
 def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, attacked):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)])
-    assert soon(lambda: len(left(attacked)) == 4)  # run, sub-reaper, worker, daemon
-    parent.kill()
-    parent.wait()
+    try:
+        # run, sub-reaper, worker, daemon
+        assert soon(lambda: len(left(attacked)) == 4)
+    finally:
+        parent.kill()
+        parent.wait()
 
     assert soon(lambda: left(attacked) == [])
 
