@@ -28,6 +28,7 @@ from harness.run import run
 from harness.serving import ForeignReplyError, checked_answer, event_of
 from harness.suite import Suite
 from harness.supervisor import REPLACED, Clock, Reply, WorkerProcess
+from solvers.reference import reference_solution
 
 PLUGIN = Path(__file__).with_name("attackers.py")
 START = [sys.executable, "-P", str(PLUGIN)]
@@ -172,8 +173,10 @@ class Bench:
             sample_seconds=SAMPLE_SECONDS,
         )  # fmt: skip
         worker = self.workers[solver]
-        limits = dict(time_limit=time_limit, memory_limit=self.memory_limit)
-        return measured(worker, self.qp, record, request, **limits)[0]
+        return measured(
+            worker, self.qp, record, request, time_limit=time_limit,
+            memory_limit=self.memory_limit, reference=reference_solution,
+        )[0]  # fmt: skip
 
     def process(self, solver):
         return self.workers[solver]._worker
