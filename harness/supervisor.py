@@ -493,7 +493,9 @@ class WorkerProcess:
         if self._process is not None:
             reaper.end_all(self._process.pid, mark=self._mark)
             self._process.kill()
-            self._process.communicate()
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+            self._process.wait()
             self._footprint.remove_files()
         self._process = None
         self._worker, self._is_stopped, self._was_busy = 0, False, False

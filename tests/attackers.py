@@ -334,6 +334,24 @@ class HoardsInShm(Honest):
         return at_the_row(qp)
 
 
+class SharesPages(Honest):
+    """150 MiB that four processes share: 600 if each were counted."""
+
+    def act(self, qp):
+        hoard = np.ones(150 * 2**17)
+        children = []
+        for _ in range(3):
+            if (child := os.fork()) == 0:
+                hoard.sum()
+                time.sleep(3600)
+            children.append(child)
+        time.sleep(0.5)
+        for child in children:
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        return at_the_row(qp)
+
+
 class HoardsInADaemon(Honest):
     """600 MiB in a process that has left the session."""
 

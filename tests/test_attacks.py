@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from harness import Verdict, supervisor
+from harness import Solution, Status, Verdict, supervisor
 from harness.block import Commands
 from harness.errors import FaultError
 from harness.journal import read_journal
@@ -23,11 +23,12 @@ from harness.names import CaseName
 from harness.qpfile import save_qp
 from harness.reaper import lives
 from harness.registry import SolverSpec, load_plugin, resolve
-from harness.remote import measured, scratch_folder
+from harness.remote import _believed, measured, scratch_folder
 from harness.run import run
 from harness.serving import ForeignReplyError, checked_answer, event_of
 from harness.suite import Suite
-from harness.supervisor import REPLACED, WorkerProcess
+from harness.supervisor import REPLACED, Clock, Reply, WorkerProcess
+from solvers.reference import reference_solution
 
 PLUGIN = Path(__file__).with_name("attackers.py")
 START = [sys.executable, "-P", str(PLUGIN)]
@@ -69,6 +70,7 @@ OUTCOMES = {
     "pools": (Verdict.VERIFIED, "^$"),
     "hoardsinmemfd": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
+    "sharespages": (Verdict.VERIFIED, "^$"),
     "hoardsinadaemon": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "patchestheclock": (Verdict.VERIFIED, OURS),
     "sleepsbehindtheclock": (Verdict.VERIFIED, OURS),
@@ -83,7 +85,7 @@ QUICK = {
     "writesnoise", "writesendlessly", "forges", "text", "complex",
     "bombs", "leavesafifo", "leavesafolder", "leavesgigabytes", "faults", "daemon",
     "forkbomb", "burns", "hoardsinshm", "hoardsinadaemon", "sleepsbehindtheclock",
-    "killsitsreaper", "closesall",
+    "killsitsreaper", "closesall", "sharespages",
 }  # fmt: skip
 ANSWER = dict(
     claimed="solved", message="", iterations=1, counts={"products": 3},
@@ -143,7 +145,7 @@ def left(attacked):
 
 
 def soon(condition):
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while not condition() and time.monotonic() < deadline:
         time.sleep(0.02)
     return condition()
@@ -171,8 +173,10 @@ class Bench:
             sample_seconds=SAMPLE_SECONDS,
         )  # fmt: skip
         worker = self.workers[solver]
-        limits = dict(time_limit=time_limit, memory_limit=self.memory_limit)
-        return measured(worker, self.qp, record, request, **limits)[0]
+        return measured(
+            worker, self.qp, record, request, time_limit=time_limit,
+            memory_limit=self.memory_limit, reference=reference_solution,
+        )[0]  # fmt: skip
 
     def process(self, solver):
         return self.workers[solver]._worker
@@ -235,6 +239,52 @@ def test_an_answer_of_another_form_is_refused(change, message):
         checked_answer({"qp": ""}, ANSWER | change)
 
     assert len(str(e.value)) < 300
+
+
+CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "solve", "first", "inner", "is_believed"),
+    [
+        (0.05, 0.06, None, 1, True),
+        (0.001, 0.001, 0.1, 10, True),
+        (0.15, 0.06, None, 1, False),  # longer than from request to end
+        (0.05, 0.04, None, 1, False),  # shorter than the CPU time
+        (0.001, 0.001, 0.01, 10, False),
+        (-0.05, 0.16, None, 1, False),
+        (-1e-6, -1e-6, None, 1, False),
+    ],
+)
+def test_a_time_is_believed_within_what_the_parent_knows(
+    prepare, solve, first, inner, is_believed
+):
+    seconds = dict(
+        prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
+        first_seconds=first, inner=inner,
+    )  # fmt: skip
+    qp = TINY.build("plain", TINY.defaults, None).qp
+    reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
+    m, *notes = _believed(reply, Solution.without_point(qp, Status.FAILED))
+
+    assert bool(notes) is not is_believed
+    if is_believed:
+        assert m.total_seconds == prepare + solve
+    else:
+        assert m.total_seconds == 0.15 / (inner + (first is not None))
+        assert m.prepare_seconds is m.solve_seconds is None
+
+
+def test_a_total_that_is_not_the_sum_of_its_phases_is_ours():
+    seconds = dict(prepare_seconds=0.01, solve_seconds=0.01, total_seconds=0.15)
+    qp = TINY.build("plain", TINY.defaults, None).qp
+    m, note = _believed(
+        Reply(answer=ANSWER | seconds, clock=CLOCK),
+        Solution.without_point(qp, Status.FAILED),
+    )
+
+    assert OURS in note
+    assert m.total_seconds == CLOCK.seen
 
 
 @pytest.mark.parametrize(
@@ -428,9 +478,12 @@ Bench(Path(sys.argv[1]))("hangswithadaemon", time_limit=3600)
 
 def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, attacked):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)])
-    assert soon(lambda: len(left(attacked)) == 4)  # run, sub-reaper, worker, daemon
-    parent.kill()
-    parent.wait()
+    try:
+        # run, sub-reaper, worker, daemon
+        assert soon(lambda: len(left(attacked)) == 4)
+    finally:
+        parent.kill()
+        parent.wait()
 
     assert soon(lambda: left(attacked) == [])
 
