@@ -47,11 +47,12 @@ def entry(
 ) -> Entry:
     """Find a case, or have it built by the one process that comes first.
 
+    folder : made if need be, in one that is there
     environment : digest of what the case is built with
     make : writes the QP to a file and returns the meta data; what it raises comes
         through and leaves no entry
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
     identity = [name.family, name.params, name.form, environment]
     key = sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
     with _held(folder / f"{key}.lock"):

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness import commands, examine, one, processes, validate
+from harness.durable import FULL
 from harness.errors import InputError, one_line
 from harness.kkt import VERIFIED_FACTOR
 from harness.registry import entry_point_plugins
@@ -54,6 +55,8 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
     except Exception as e:
         if isinstance(e, OSError) and e.filename is not None:
             return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
+        if isinstance(e, OSError) and e.errno in FULL:
+            return _complain(f"a file could not be written: {e.strerror}")
         traceback.print_exc()
         return 3
 

@@ -25,7 +25,6 @@ next mesh is.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -34,6 +33,7 @@ from pathlib import Path
 from time import perf_counter
 
 from harness.build import build, unbuilt
+from harness.durable import full_disk_told, replace_file
 from harness.errors import InputError
 from harness.halving import prolongation
 from harness.mechanics import Extended, Grid, Mechanics, Real
@@ -188,10 +188,9 @@ def _continues(old: Discretisation, new: Discretisation) -> bool:
 def _write(path: Path, found: Iterable[Discretisation]) -> None:
     """Replace the file as a whole."""
     data = {"schema": SCHEMA, "cases": [asdict(d) for d in found]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", "utf-8")
-    os.replace(temporary, path)
+    text = json.dumps(data, indent=1, allow_nan=False) + "\n"
+    with full_disk_told(path.parent):
+        replace_file(path, text.encode())
 
 
 class _Halving:

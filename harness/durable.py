@@ -25,7 +25,7 @@ _OTHERS = ("*.tmp", "*.new", ".*.new")  #: of older versions, and of a case bein
 _OLD = ("suite.tmp", "environment.tmp")
 
 #: of an OSError: the disk, or our share of it, takes no more
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PROBE_BYTES = 2**16
 _CHUNK = 2**16
 _MIB = 2**20
@@ -164,7 +164,7 @@ def full_disk_told(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as e:
-        if e.errno not in _FULL:
+        if e.errno not in FULL:
             raise
         raise InputError(_full(folder, e.errno)) from e
 
@@ -181,7 +181,7 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
         When it was, with the file system and how to go on.
 
     """
-    for code in _FULL:
+    for code in FULL:
         if os.strerror(code) in failure:
             raise InputError(_full(folder, code))
     with full_disk_told(folder):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ from typing import Any
 from harness.agreement import as_data
 from harness.crossval import brief
 from harness.discretisation import Discretisation, discretisation_errors
+from harness.durable import full_disk_told, replace_file
 from harness.errors import InputError
 from harness.journal import read_journal
 from harness.names import assemble
@@ -37,9 +37,9 @@ def validate(workbench: Workbench, options: Namespace) -> int:
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{options.folder}: no stored answer can be judged: {why}")
     target = options.folder / "validation.json"
-    temporary = target.with_suffix(".tmp")
-    temporary.write_text(json.dumps(data, allow_nan=False) + "\n", "utf-8")
-    os.replace(temporary, target)
+    text = json.dumps(data, allow_nan=False) + "\n"
+    with full_disk_told(options.folder):
+        replace_file(target, text.encode())
     pages = workbench.validation(options.folder, data, ())
     if meshes := _meshes(workbench, options.folder, options.budget):
         # the page was there while meshes were solved; now it tells of them, too

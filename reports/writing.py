@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
+from harness.durable import replace_file
 from reports.figures import save_all
 from reports.latex import latex
 from reports.layout import Page
@@ -35,9 +36,8 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a file; folders are made, lines end alike everywhere."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
+    """Write a file whole or not at all; folders are made."""
+    replace_file(path, text.encode())
     return path
 
 

@@ -7,11 +7,15 @@ kernel answers as at the end of a disk: by a short write, then by an error.
 import errno
 import os
 import resource
+import signal
+import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
-from harness import InputError
+from harness import InputError, remote
+from harness.cli import main
 from harness.durable import (
     Lines,
     full_disk_told,
@@ -19,8 +23,13 @@ from harness.durable import (
     remove_unfinished,
     replace_file,
 )
+from harness.errors import FaultError
 from harness.faults import FAULTS, Fault, in_words, left, read_faults
 from harness.folder import Held, refuse_foreign
+from harness.registry import load_plugin
+from harness.workbench import Workbench
+from reports.data import read_evidence
+from reports.summary import summary
 
 
 @contextmanager
@@ -248,3 +257,79 @@ def test_a_damaged_fault_is_named_with_its_line(tmp_path, line):
 
     with pytest.raises(InputError, match=r"faults\.jsonl, line 2: damaged; expected"):
         read_faults(tmp_path)
+
+
+WELLS = Path(__file__).with_name("wells.py")
+SUITE = """
+name = "wells"
+repeats = 2
+solvers = ["exact", "near"]
+[[problems]]
+family = "well"
+forms = ["dual"]
+"""
+
+
+def first_page(folder, _formats):
+    """Write what the summary of a report says."""
+    (folder / "said").write_text("\n".join(summary(read_evidence(folder)).prose))
+    return []
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Run a command line on wells in an empty folder; its code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "wells.toml").write_text(SUITE)
+    plugin = load_plugin(WELLS)
+    nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
+    workbench = Workbench(
+        families=plugin.problems,
+        solvers=plugin.solvers,
+        report=first_page,
+        start=(sys.executable, "-P", str(WELLS)),
+        **nothing,
+    )
+
+    def cli(*argv):
+        code = main(workbench, argv)
+        return code, *capsys.readouterr()
+
+    return cli
+
+
+def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_path):
+    def measured(worker, qp, record, request, **limits):
+        if record.solver == "near":
+            raise FaultError("the worker could not be started")
+        return remote.measured(worker, qp, record, request, **limits)
+
+    monkeypatch.setattr("harness.station.measured", measured)
+    code, out, err = cli("run", "wells.toml", "--out", "d")
+    told = "2 measurements could not be made, by no fault of a solver: the worker could"
+
+    assert code == 1
+    assert f"{told} not be started; the same command tries again\n" in out
+    assert err.count("it is tried again") == err.count("it was not measured") == 2
+    assert told in (tmp_path / "d" / "said").read_text()
+
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = cli("run", "wells.toml", "--out", "d")
+    assert code == 0
+    assert "could not be made" not in out
+    assert told not in (tmp_path / "d" / "said").read_text()
+
+
+def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+
+    def measured(*_, **__):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("harness.station.measured", measured)
+    with pytest.raises(SystemExit) as e:
+        cli("run", "wells.toml", "--out", "d")
+
+    assert e.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -768,13 +768,22 @@ def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
     assert (len(tally.records), tally.skipped) == (3, 0)
 
 
-def kill_worker(solver):
-    """Kill the processes that serve a solver: those with its name as an argument."""
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
+def family(process):
+    """A process, then those that it started, and those that these did."""
+    yield process
+    for tasks in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
-            words = path.read_bytes().split(b"\0")
-            if str(PLUGIN).encode() in words and solver.encode() in words:
-                os.kill(int(path.parent.name), signal.SIGKILL)
+            for child in tasks.read_text().split():
+                yield from family(int(child))
+
+
+def kill_worker(solver):
+    """Kill what serves a solver: our processes with its name as an argument."""
+    for process in list(family(os.getpid()))[1:]:
+        with suppress(OSError):
+            words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
+            if solver.encode() in words:
+                os.kill(process, signal.SIGKILL)
 
 
 def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
