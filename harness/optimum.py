@@ -38,7 +38,7 @@ from harness.qp import QP, Vector
 from harness.solution import Solution
 
 LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
-CLOSE = 1e-9  #: KKT residual of a point that may be an optimum
+CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optimum
 FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
 EPS = float(np.finfo(float).eps)
 SPARED = 10.0  #: the objective adds up what residuals say of single rows

@@ -64,11 +64,13 @@ class _Problem:
 
 
 @np.errstate(all="ignore")  # what diverges is not finite, and is seen
-def polished(qp: QP, start: Solution) -> Iterator[Solution]:
+def polished(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
     """Give refined points, each with a better guess of the active set; few, often one.
 
     qp : with the largest entries about one; P, A and G all dense or all sparse
     start : near a solution, mostly of an interior-point method
+    delta : with a smaller one the steps see weaker curvature and rows nearer to others,
+        but the factor is that of a matrix nearer to singular
     """
     problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
@@ -78,7 +80,7 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
     active = _Active(side, start.z > slack)
     for k in range(CHANGES):
         try:
-            at = _refined(problem, active, at)
+            at = _refined(problem, active, at, delta)
         except ArithmeticError:
             return
         yield replace(_rounded(problem, active, at), iterations=start.iterations)
@@ -88,7 +90,7 @@ def polished(qp: QP, start: Solution) -> Iterator[Solution]:
         active = new
 
 
-def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
+def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _Point:
     """Solve the KKT equations of an active set, in steps until they hardly shrink."""
     qp, m = problem.qp, problem.qp.b.size
     free, rows = np.flatnonzero(active.side == 0), np.flatnonzero(active.rows)
@@ -96,7 +98,7 @@ def _refined(problem: _Problem, active: _Active, at: _Point) -> _Point:
     y, z = at.y.copy(), np.where(active.rows, at.z, 0)
     P, A, G = qp.P[free][:, free], qp.A[:, free], qp.G[rows][:, free]
     B = np.vstack([A, G]) if isinstance(P, np.ndarray) else vstack([A, G])
-    solve = saddle(P, B, np.full(free.size, DELTA), np.full(B.shape[0], DELTA))
+    solve = saddle(P, B, np.full(free.size, delta), np.full(B.shape[0], delta))
     size = np.inf
     for _ in range(STEPS):
         r = problem.gradient(_Point(x, y, z))[free]

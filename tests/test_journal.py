@@ -143,7 +143,8 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
         del row[name]
     file = tmp_path / "journal" / "here.jsonl"
     file.parent.mkdir()
-    file.write_text(json.dumps(row | {"schema": 1}) + "\n" + json.dumps(row) + "\n")
+    lines = [row | {"schema": 1}, row | {"run_id": "b"}]
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
     old, new = read_journal(tmp_path)
 
