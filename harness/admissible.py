@@ -7,20 +7,27 @@ be held, and a mortar row couples several.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array
+from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from harness.mechanics import Extended, Mechanics, Real
+from harness.mechanics import UNFELT, Extended, Mechanics, Real, felt_first
 from harness.qp import Vector
 
 ROUNDS = 20  #: of growing the set of rows
 DENSE = 2000  #: rows up to which F_VV is formed
+#: of the best held motion: how little forces, at the power ½, hold a loose one
+LOOSE = 1e-5
+ROUNDED = 1e-12  #: of its terms, that a load along a loose or free motion may be
 _EPS = Real(np.finfo(Real).eps)
+
+
+class UncertifiableError(Exception):
+    """Why there is no certificate: no admissible pair was found."""
 
 
 def admissible(
@@ -34,13 +41,13 @@ def admissible(
     that does not end, θu with θ < 1 is admissible while c > 0.
     """
     B, c = mechanics.exact.B, mechanics.exact.c
-    size = np.abs(u).max(initial=Real(0))  # of what is added up to get there
-    reach = abs(B) @ (16 * np.abs(u) + 4 * size)
-    inside = _EPS * (reach + 16 * np.abs(c))
     held = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(ROUNDS):
         gap = c - B @ moved
+        size = np.abs(moved).max(initial=Real(0))  # of what is added up to get there
+        reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
+        inside = _EPS * (reach + 16 * np.abs(c))
         wanted = held | closed | (gap < 0)
         if not wanted.any():
             return u
@@ -77,10 +84,11 @@ def _nearest(
     """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t."""
     B_V = csr_array(mechanics.primal.G)[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
+    felt = mechanics.motions.felt.astype(np.float64)
 
     def step(t: Vector) -> Vector:
-        mu, alpha = solve(t, np.zeros(inverse.kernel.shape[1]))
-        return np.asarray(inverse.kernel @ alpha - inverse(B_V.T @ mu))
+        mu, alpha = solve(t, np.zeros(mechanics.motions.felt.shape[1]))
+        return np.asarray(felt @ alpha - inverse(B_V.T @ mu))
 
     return step
 
@@ -92,37 +100,58 @@ def closing(
 
     ::
 
-        F_VV μ − B_V R α = t,    RᵀB_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ
+        F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
-    for excesses t (v,) and loads e (r,) that are to be balanced.
+    for excesses t (v,) and loads e (p,) along the motions R that contact feels; of
+    those that the rows V do not feel, α = 0. F_VV may be singular where K⁺ holds what a
+    row touches, so that (F_VV + ρUUᵀ)μ is put for F_VV μ, where U spans G_V. All rows
+    are scaled to about the same compliance, which stiff and soft bodies need.
     """
-    B_V = csr_array(mechanics.primal.G)[np.flatnonzero(rows)]
-    F = _compliance(mechanics, B_V)
-    G = np.asarray(B_V @ mechanics.inverse.kernel)
-    FG = np.stack([F(g) for g in G.T], axis=1) if G.size else G
-    S = np.linalg.pinv(G.T @ FG)
+    if not rows.any():
+        return lambda t, e: (t, 0 * e)
+    exact, motions = mechanics.exact, mechanics.motions
+    V = np.flatnonzero(rows)
+    loose = exact.loose[V].astype(np.float64)
+    scale = 1 / np.sqrt(np.where(loose > 0, loose, 1.0))
+    B_V = csr_array(diags_array(scale) @ csr_array(mechanics.primal.G)[V])
+    R = motions.felt.toarray().astype(np.float64)
+    turn, p = felt_first(B_V, R)
+    U, T = np.linalg.qr((B_V @ R) @ turn[:, :p])
+    F = _compliance(mechanics, B_V, U)
+    FU = np.stack([F(g) for g in U.T], axis=1) if p else U
+    S = np.linalg.pinv(U.T @ FU, hermitian=True)
 
     def solve(t: Vector, e: Vector) -> tuple[Vector, Vector]:
-        Ft = F(t)
-        alpha = S @ (e - G.T @ Ft)
-        return Ft + FG @ alpha, alpha
+        along = np.linalg.solve(T.T, turn[:, :p].T @ e)  # what Uᵀμ has to be
+        Ft = F(scale * t)
+        beta = S @ (along - U.T @ Ft)
+        return scale * (Ft + FU @ beta), turn[:, :p] @ np.linalg.solve(T, beta)
 
     return solve
 
 
-def _compliance(mechanics: Mechanics, B_V: Any) -> Callable[[Vector], Vector]:
-    """Return the solve with F_VV = B_V K⁺B_Vᵀ, or, for very many rows, CG with it.
+def _compliance(
+    mechanics: Mechanics, B_V: Any, U: NDArray[np.float64]
+) -> Callable[[Vector], Vector]:
+    """Return the solve with F_VV + ρUUᵀ, or, for very many rows, CG with it.
 
-    F_VV may be singular, or very nearly; what a shift of the last digits leaves, the
+    It may be singular, or very nearly; what a shift of the last digits leaves, the
     next round mends. CG is preconditioned by B_V K B_Vᵀ (lumped, as FETI's).
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= DENSE:
         F = inverse.congruence(B_V)
+        F += F.diagonal().mean() * (U @ U.T) if U.size else 0
         F[np.diag_indices(v)] += 1e-13 * F.diagonal().max() + np.finfo(float).tiny
         factor = cho_factor(F, lower=True)
         return lambda t: np.asarray(cho_solve(factor, t))
-    F = LinearOperator((v, v), lambda mu: B_V @ inverse(B_V.T @ mu.ravel()))
+    rho = inverse.congruence(B_V[:DENSE]).diagonal().mean() if U.size else 0.0
+
+    def product(mu: Vector) -> Vector:
+        mu = mu.ravel()
+        return np.asarray(B_V @ inverse(B_V.T @ mu) + rho * (U @ (U.T @ mu)))
+
+    F = LinearOperator((v, v), product)
     stiffness = csc_array(B_V @ mechanics.primal.P @ B_V.T)
     shift = 1e-10 * stiffness.diagonal().max()
     lumped = splu(csc_matrix(stiffness + shift * eye_array(v)))
@@ -130,33 +159,132 @@ def _compliance(mechanics: Mechanics, B_V: Any) -> Callable[[Vector], Vector]:
     return lambda t: np.asarray(cg(F, t, rtol=1e-8, maxiter=300, M=M)[0])
 
 
-def balanced(mechanics: Mechanics, multipliers: Extended) -> Extended | None:
-    """Find λ̂ ≥ 0 near `multipliers` ≥ 0 with RᵀBᵀλ̂ = Rᵀf; None if there is none.
+def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
+    """Find λ̂ ≥ 0 near `multipliers` ≥ 0 with Rᵀ(f − Bᵀλ̂ − Ku) = 0; R is what is felt.
 
     Nearest relative to their sizes, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ with wᵢ ≈ λᵢ: what balances the
-    load must not act across wide gaps, where it would do work. λ̂ = (λ + WGν)₊ with
-    G = BR, where ν minimises a convex function of as many variables as there are rigid
-    motions: semismooth Newton with halved steps.
+    load must not act across wide gaps, where it would do work. Along motions that λ
+    does not hold, see `held_and_loose`, the load has to vanish up to its rounding, or
+    else all rows have to help.
+
+    Raises
+    ------
+    UncertifiableError
+        When a load drives a motion that contact does not feel, or one that contact
+        would have to pull back.
+
     """
-    R = mechanics.inverse.kernel
-    if not R.shape[1]:
+    exact, motions = mechanics.exact, mechanics.motions
+    if (driven := _driven(mechanics)) is not None:
+        raise UncertifiableError(driven)
+    G = motions.G
+    if not G.shape[1]:
         return multipliers
-    G = mechanics.exact.B @ R.astype(Real)
-    load = R.T.astype(Real) @ mechanics.exact.f
+    problem = _Balance(
+        G,
+        np.asarray((abs(exact.B) @ motions.largest).toarray()),
+        motions.felt.T @ exact.f,
+        motions.largest.T @ np.abs(exact.f),
+        motions.KR.T @ u,
+    )
+    w = relative(multipliers)
+    found = problem.solved(multipliers, w)
+    if found is None:
+        found = problem.solved(multipliers, w + 1e-6)
+    if found is None:
+        raise UncertifiableError(
+            "contact would have to pull to balance the load: some body is driven away "
+            "from all that touches it, and no support holds it"
+        )
+    return found
+
+
+def _driven(mechanics: Mechanics) -> str | None:
+    """Say which load nothing can balance; None where there is none."""
+    free, f, rigid = mechanics.motions.free, mechanics.exact.f, mechanics.rigid
+    along, terms = free.T @ f, abs(free).T @ np.abs(f)
+    largest = abs(free).max(axis=0).toarray().ravel() if free.nnz else terms
+    rounding = UNFELT * terms + ROUNDED * np.abs(f).sum() * largest
+    if (np.abs(along) <= rounding).all():
+        return None
+    pushed = np.abs(rigid.T @ (free @ along)) if rigid.size else np.zeros(1)
+    most = int(pushed.argmax())
+    per_body = rigid.shape[1] // len(mechanics.names) if mechanics.names else 1
+    directions = ("along x", "along y", "turning")
+    which = f"body {mechanics.names[most // 3]}" if per_body == 3 else "some body"
+    return (
+        f"nothing balances the load of {which} "
+        f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
+        "contact does not feel that motion, and no support holds it"
+    )
+
+
+def relative(multipliers: Extended) -> Extended:
+    """Divide by the largest; ones where there is none."""
     largest = multipliers.max(initial=Real(0))
-    w = multipliers / largest if largest > 0 else np.ones_like(multipliers)
-    on = w > 0
-    if (found := _balanced(multipliers[on], w[on], G[on], load)) is not None:
-        multipliers = multipliers.copy()
-        multipliers[on] = found
-        return multipliers
-    return _balanced(multipliers, w + 1e-6, G, load)  # others have to help
+    return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
 
-def _balanced(
-    multipliers: Extended, w: Extended, G: Extended, load: Extended
-) -> Extended | None:
-    """Minimise for positive weights; None where no λ̂ ≥ 0 balances the load."""
+def held_and_loose(
+    G: Extended, w: Extended
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split motions (p,) by whether rows with the weights w, of at most 1, hold them.
+
+    Returns orthonormal bases (p, h) and (p, p − h); ‖√w Gν‖ is at most LOOSE times its
+    maximum in the second.
+    """
+    weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
+    _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
+    h = int((sizes > LOOSE * sizes.max(initial=0.0)).sum())
+    return turn[:h].T, turn[h:].T
+
+
+class _Balance(NamedTuple):
+    """Gᵀλ = load − bent, and how large terms are that G and load are added up from."""
+
+    G: Extended  #: (m, p)
+    G_terms: Extended  #: (m, p)
+    load: Extended  #: (p,)
+    load_terms: Extended  #: (p,)
+    bent: Extended  #: (p,)  (KR)ᵀu
+
+    def solved(self, multipliers: Extended, w: Extended) -> Extended | None:
+        """Balance by the rows with w > 0; None where that is impossible.
+
+        λ̂ = (λ + WGν)₊, where ν minimises a convex function of as many variables as
+        there are motions.
+        """
+        held, loose = held_and_loose(self.G, w)
+        on = w > 0
+        basis = held @ _whitening((np.sqrt(w)[:, None] * self.G) @ held)
+        found = _newton(
+            multipliers[on], w[on], self.G[on] @ basis,
+            basis.T @ (self.load - self.bent),
+            lambda lam: np.abs(basis).T @ self._terms(on, lam),
+        )  # fmt: skip
+        if found is None:
+            return None
+        lam = np.zeros_like(multipliers)
+        lam[on] = found
+        missing = np.abs(loose.T @ (self.load - self.G.T @ lam))
+        total = np.abs(loose).T @ self._terms(on, found)
+        return lam if (missing <= ROUNDED * total).all() else None
+
+    def _terms(self, on: NDArray[np.bool_], lam: Extended) -> Extended:
+        return np.asarray(self.load_terms + self.G_terms[on].T @ lam)
+
+
+def _whitening(M: Extended) -> NDArray[np.float64]:
+    """Return X (h, h) such that MX has orthonormal columns, for M of full rank."""
+    _, sizes, turn = np.linalg.svd(M.astype(np.float64), full_matrices=False)
+    return np.asarray(turn.T / sizes)
+
+
+def _newton(
+    multipliers: Extended, w: Extended, G: Extended, load: Extended,
+    terms: Callable[[Extended], Extended],
+) -> Extended | None:  # fmt: skip
+    """Minimise for positive weights and GᵀWG = 1; None where nothing balances."""
 
     def shifted(nu: Extended) -> tuple[Extended, Any]:
         lam = np.maximum(multipliers + w * (G @ nu), 0)
@@ -164,14 +292,14 @@ def _balanced(
 
     nu = np.zeros(load.size, dtype=Real)
     lam, value = shifted(nu)
-    everything = G.T @ (w[:, None] * G)
     for _ in range(100):
         missing = load - G.T @ lam
-        if (np.abs(missing) <= 64 * _EPS * (np.abs(load) + np.abs(G).T @ lam)).all():
+        if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
         on = lam > 0
-        hessian = G[on].T @ (w[on, None] * G[on]) + 1e-8 * everything
-        step = np.linalg.pinv(hessian.astype(np.float64)) @ missing.astype(np.float64)
+        hessian = (G[on].T @ (w[on, None] * G[on])).astype(np.float64)
+        hessian += 1e-8 * np.eye(load.size)
+        step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):
             lam, trial = shifted(nu + step)
             if trial <= value - 1e-4 * (missing @ step) + 4 * _EPS * abs(value):

@@ -26,17 +26,16 @@ _EPS = Real(np.finfo(Real).eps)
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
     """Solve  K u = force  on the free components, zero on the others.
 
-    Returns u and the energy norm of what one refinement left undone, √(rᵀK⁺r) with the
-    residual r, in extended precision.
+    Returns u, without rigid motion, and the energy norm of what one refinement left
+    undone, √(rᵀK⁺r) with the residual r, in extended precision.
     """
-    K, held, solve = mechanics.exact.K, mechanics.exact.held, mechanics.inverse
-    R = solve.kernel
+    K, held = mechanics.exact.K, mechanics.exact.held
     u = np.zeros(force.size, dtype=Real)
     for _ in range(3):
         r = force - K @ u
         r[held] = 0
-        r = r - R @ (R.T @ r)
-        step = solve(r.astype(np.float64))
+        r = mechanics.still(r)
+        step = mechanics.relaxed(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
     return u - step, left
@@ -51,7 +50,7 @@ def unconstrained_guess(mechanics: Mechanics) -> NDArray[np.bool_]:
 
 
 def exchanged(
-    mechanics: Mechanics, active: NDArray[np.bool_]
+    mechanics: Mechanics, active: NDArray[np.bool_], rounds: int = EXCHANGES
 ) -> tuple[Extended, Extended, NDArray[np.bool_]]:
     """Exchange rows from a guess on; return u (n,), multipliers (m,) ≥ 0, and rows.
 
@@ -59,7 +58,7 @@ def exchanged(
     right is for a certificate to say.
     """
     exact, seen = mechanics.exact, set[bytes]()
-    for _ in range(EXCHANGES):
+    for _ in range(rounds):
         u, lam = _given(mechanics, active)
         gap = exact.c - exact.B @ u
         rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
@@ -76,15 +75,18 @@ def _given(
     mechanics: Mechanics, active: NDArray[np.bool_]
 ) -> tuple[Extended, Extended]:
     """Solve with equality on the active rows: u (n,) and multipliers (m,)."""
-    exact, R = mechanics.exact, mechanics.inverse.kernel
+    exact, motions = mechanics.exact, mechanics.motions
+    R = motions.felt
     close = closing(mechanics, active)
     lam = np.zeros(exact.c.size, dtype=Real)
     alpha = np.zeros(R.shape[1], dtype=Real)
     for _ in range(REFINEMENTS):
         force = exact.f - exact.B.T @ lam
-        u = equilibrium(mechanics, force)[0] + R @ alpha
+        at_rest = equilibrium(mechanics, force - motions.KR @ alpha)[0]
+        u = at_rest + R @ alpha
         excess = (exact.B @ u - exact.c)[active]
-        mu, further = close(excess.astype(np.float64), (R.T @ force).astype(np.float64))
+        force = R.T @ force - motions.KR.T @ u
+        mu, further = close(excess.astype(np.float64), force.astype(np.float64))
         lam[active] += mu
         alpha = alpha + further
     return u, lam

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness.admissible import DENSE
-from harness.certificate import proof
+from harness.certificate import UncertifiableError, proof
 from harness.errors import InputError
 from harness.exchange import exchanged, unconstrained_guess
 from harness.mechanics import Extended, Mechanics
@@ -85,9 +85,12 @@ def _stored(path: Path, rows: int) -> NDArray[np.bool_] | None:
 
 def _solved(mechanics: Mechanics, guess: NDArray[np.bool_]) -> ReferencePoint:
     u, lam, active = exchanged(mechanics, guess)
-    found = proof(mechanics, u, u, lam, active)
-    if found is None:
-        raise UnsolvedError("the reference solve found no admissible pair")
+    try:
+        found = proof(mechanics, u, u, lam, active)
+    except UncertifiableError as e:
+        raise UnsolvedError(
+            f"the reference solve found no admissible pair: {e}"
+        ) from None
     return ReferencePoint(
         u=found.u, multipliers=found.multipliers, equilibrium=found.equilibrium,
         active=active, norm=found.norm, bound=found.bound,
@@ -97,7 +100,7 @@ def _solved(mechanics: Mechanics, guess: NDArray[np.bool_]) -> ReferencePoint:
 def _identified(mechanics: Mechanics, solve: Reference) -> NDArray[np.bool_]:
     """Guess the active rows; of very many, those that bodies alone would violate."""
     inverse = mechanics.inverse
-    R, m = inverse.kernel, mechanics.primal.h.size
+    R, m = mechanics.motions.felt.toarray().astype(np.float64), mechanics.primal.h.size
     f, B = -mechanics.primal.q, csr_array(mechanics.primal.G)
     if m > DENSE and not R.shape[1]:
         return unconstrained_guess(mechanics)

@@ -64,8 +64,8 @@ def contact_case(
         dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=primal, back=new.recover, factorise=supported,
-            mesh_size=bodies.mesh_size, rigid=bodies.rigid, scale=energy,
-            grid=Grid(
+            mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
+            scale=energy, grid=Grid(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),

@@ -1,0 +1,200 @@
+"""Bodies that contact alone holds, and solutions to twice the digits of doubles.
+
+The solutions come from the KKT equations of the stored data for given closed rows:
+Gaussian elimination in extended precision, refined with residuals in fractions. None of
+the code under test has a part in that, but for the guess of which rows are closed.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Case, Mechanics
+from harness.mechanics import Extended, Real
+from problems.bodies import ContactPair, assemble, clamped, floating, supported
+from problems.elasticity import Material
+from problems.emit import contact_case
+from problems.linearise import linearisation
+from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from problems.results import quantities
+from problems.stepping import primal_qp
+
+PRESSURE = 1e7  #: Pa
+
+
+def disc_between_plates(
+    n: int = 4,
+    *,
+    form: str = "primal",
+    contact: str = "nts",
+    disc_is_slave: bool = True,
+    rollers: bool = False,
+    turn: float = 0.3,
+    tilt: float = 0.0,
+    push: float = 0.0,
+    E: tuple[float, float, float] = (70e9, 200e9, 70e9),
+) -> Case:
+    """Press a disc of radius 1 m between a plate that is held and one that is not.
+
+    n : cells across the disc
+    rollers : at the left side of the upper plate
+    turn, tilt : angles, of the mesh within the disc and of everything
+    push : share of the pressure that acts sideways
+    """
+    lower = rectangle((-1.5, -1.0), (3.0, 1.0), (2 * n, n // 2))
+    upper = rectangle((-1.5, 2.0), (3.0, 0.5), (2 * n + 1, n // 3))
+    mesh, body = join((
+        prefixed(lower, "lower_"),
+        prefixed(_disc(n, turn), "disc_"),
+        prefixed(upper, "upper_"),
+    ))  # fmt: skip
+    side = mesh.boundaries
+    top, load = side["upper_top"], np.zeros((len(mesh.points), 2))
+    load[top] = np.outer(nodal_lengths(mesh.points[top]), [push, -1.0]) * PRESSURE
+    T = _rotation(tilt)
+    mesh = Mesh(mesh.points @ T.T, mesh.cells, side)
+    feet = side["lower_bottom"]
+    fixed = [2 * feet, 2 * feet + 1] + ([2 * side["upper_left"]] if rollers else [])
+    faces = (
+        (side["disc_down"], side["lower_top"]),
+        (side["disc_up"], side["upper_bottom"]),
+    )
+    bodies = assemble(
+        mesh, body, names=("lower", "disc", "upper"),
+        materials=(Material(E[0], 0.33), Material(E[1], 0.3), Material(E[2], 0.33)),
+        plane="strain", units=(3.0, 3 * PRESSURE), fixed=np.concatenate(fixed),
+        load=(load @ T.T).ravel(),
+        pairs=tuple(ContactPair(*(f if disc_is_slave else f[::-1])) for f in faces),
+    )  # fmt: skip
+    rows = linearisation(bodies, contact, "dual")(np.zeros(mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    return contact_case(
+        bodies, primal, form,
+        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies),
+        quantities=lambda s: quantities(bodies, primal, s),
+    )  # fmt: skip
+
+
+def _disc(n: int, turn: float) -> Mesh:
+    """Mesh the disc around (0, 1) by n² cells, rings from a square to the rim."""
+    grid = np.linspace(-1, 1, n + 1)
+    p = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+    r = np.abs(p).max(axis=1)
+    square = p / np.where(r > 0, r, 1)[:, None]
+    x, y = square.T
+    beside = np.abs(x) >= np.abs(y)
+    angle = np.where(
+        beside,
+        np.pi / 4 * y * np.sign(x) + np.pi * (x < 0),
+        np.pi / 2 * np.sign(y) - np.pi / 4 * x * np.sign(y),
+    )
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = r[:, None] * ((1 - r[:, None]) * square / np.sqrt(2) + r[:, None] * circle)
+    points = points @ _rotation(turn).T
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    corners = (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:])
+    rim = np.concatenate([i[:, 0], i[-1, 1:], i[:-1, -1][::-1], i[0, 1:-1][::-1]])
+    around = np.arctan2(*points[rim].T[::-1])
+    sides = {}
+    for name, middle in (("down", -np.pi / 2), ("up", np.pi / 2)):
+        off = (around - middle + np.pi) % (2 * np.pi) - np.pi
+        near = np.abs(off) < 0.9
+        sides[name] = rim[near][np.argsort(off[near])]
+    points[:, 1] += 1
+    return Mesh(points, np.stack(corners, axis=-1).reshape(-1, 4), sides)
+
+
+def _rotation(angle: float) -> NDArray[np.float64]:
+    return np.array([
+        [np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]
+    ])  # fmt: skip
+
+
+def stored_solution(
+    mechanics: Mechanics, closed: NDArray[np.bool_], near: Extended
+) -> tuple[Extended, Extended]:
+    """Solve for u and λ of the stored data; rigid motions that are loose are as `near`.
+
+    Raises AssertionError unless no closed row pulls and no other one is violated.
+    """
+    primal = mechanics.primal
+    K, B = primal.P.toarray(), primal.G.toarray()
+    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.held)
+    rows = B[closed][:, free]
+    loose = _loose(rows, mechanics.inverse.kernel[free])
+    rows = np.vstack([rows, loose.T])
+    whole = np.block(
+        [[K[np.ix_(free, free)], rows.T], [rows, np.zeros(2 * rows.shape[:1])]]
+    )
+    at = loose.T @ near[free].astype(np.float64)
+    x = _solve(whole, np.concatenate([-primal.q[free], primal.h[closed], at]))
+    u, lam = np.zeros(len(K), dtype=Real), np.zeros(len(B), dtype=Real)
+    u[free], lam[closed] = x[: free.size], x[free.size :][: closed.sum()]
+    gap = mechanics.exact.c - mechanics.exact.B @ u
+    assert lam.min() >= -1e-12 * lam.max()
+    assert gap.min() >= -1e-12 * max(np.abs(gap).max(), np.abs(u).max())
+    return u, lam
+
+
+def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the motions among R that these rows do not feel."""
+    _, sizes, turn = np.linalg.svd(rows @ R)
+    count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
+    return np.asarray(R @ turn[count:].T)
+
+
+def _solve(A: NDArray[np.float64], b: NDArray[np.float64]) -> Extended:
+    n, scale, scaled = len(b), np.ones(len(b)), A.copy()
+    for _ in range(20):
+        by = 2.0 ** np.round(0.5 * np.log2(np.abs(scaled).max(axis=1)))
+        scale, scaled = scale / by, scaled / by[:, None] / by
+    factor, order = _eliminated(scaled.astype(Real))
+    entries = [[(j, Fraction(A[i, j])) for j in np.flatnonzero(A[i])] for i in range(n)]
+    x = [Fraction(0)] * n
+    for _ in range(6):
+        left = [
+            Fraction(v) - sum(a * x[j] for j, a in e)
+            for v, e in zip(b, entries, strict=True)
+        ]
+        r = np.array([Real(float(v)) for v in left]) * scale
+        step = _substituted(factor, r[order]) * scale
+        x = [_short(v + Fraction(float(s))) for v, s in zip(x, step, strict=True)]
+    assert np.abs(step).max() < 1e-20 * np.abs(_extended(x)).max()
+    return _extended(x)
+
+
+def _eliminated(A: Extended) -> tuple[Extended, NDArray[np.int64]]:
+    order = np.arange(len(A))
+    for k in range(len(A)):
+        pivot = k + int(np.abs(A[k:, k]).argmax())
+        A[[k, pivot]], order[[k, pivot]] = A[[pivot, k]], order[[pivot, k]]
+        A[k + 1 :, k] /= A[k, k]
+        A[k + 1 :, k + 1 :] -= np.outer(A[k + 1 :, k], A[k, k + 1 :])
+    return A, order
+
+
+def _substituted(factor: Extended, b: Extended) -> Extended:
+    x = b.copy()
+    for k in range(len(x)):
+        x[k + 1 :] -= factor[k + 1 :, k] * x[k]
+    for k in reversed(range(len(x))):
+        x[k] /= factor[k, k]
+        x[:k] -= factor[:k, k] * x[k]
+    return x
+
+
+def _short(v: Fraction) -> Fraction:
+    """Keep 200 bits."""
+    shift = 200 - v.numerator.bit_length() + v.denominator.bit_length()
+    return Fraction(round(v * Fraction(2) ** shift)) / Fraction(2) ** shift if v else v
+
+
+def _extended(x: list[Fraction]) -> Extended:
+    first: Any = np.array([float(v) for v in x])
+    rest = [float(v - Fraction(a)) for v, a in zip(x, first, strict=True)]
+    return np.asarray(first.astype(Real) + np.array(rest))
