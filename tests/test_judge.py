@@ -1,12 +1,15 @@
 """From what a solver returned to a record, by our own evaluation."""
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Solution, Status, Verdict
+from harness.certificate import UncertifiableError
 from harness.judge import blank, certified, judged, quantities_of
 from harness.measure import Measurement
 from harness.names import CaseName
@@ -58,6 +61,7 @@ def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
         record(mode="sequence", accuracy=1e-3).run_id,
     ]
     assert len(set(names)) == len(names)
+    assert all(re.fullmatch("[0-9a-f]{12}", name) for name in names)
     assert record(options={"b": 2, "a": 1}).run_id == names[3]
     assert record(block=7, environment="other").run_id == names[0]
     assert (record().block, record(block=7).block) == (0, 7)
@@ -118,3 +122,28 @@ def test_what_a_family_cannot_compute_is_a_note_of_one_line():
 
 def test_without_mechanics_there_is_no_bound_and_nothing_to_note():
     assert certified(case(), POINT) == ({}, "")
+
+
+@pytest.mark.parametrize("is_bounded", [True, False])
+def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
+    monkeypatch, is_bounded
+):
+    """By a clock that is 2 s later at its second look."""
+
+    def certify(mechanics, point):
+        if is_bounded:
+            return SimpleNamespace(bound=0.5, parts={"pair": 0.5})
+        raise UncertifiableError("no admissible pair")
+
+    looks = iter([10.0, 12.0])
+    monkeypatch.setattr("harness.judge.certify", certify)
+    monkeypatch.setattr("harness.judge.perf_counter", lambda: next(looks))
+    fields, note = certified(case(mechanics=SimpleNamespace(back=lambda s: s)), POINT)
+
+    assert fields.pop("certify_seconds") == 2.0
+    if is_bounded:
+        assert (fields, note) == (
+            {"energy_bound": 0.5, "certificate": {"pair": 0.5}}, "",
+        )  # fmt: skip
+    else:
+        assert (fields, note) == ({}, "no energy_bound: no admissible pair")
