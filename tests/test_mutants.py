@@ -1,258 +1,76 @@
-"""Every reader of text takes or refuses a damaged one: no traceback, no hang."""
+"""What tools/mutants.py changes, and that its list is about this code."""
 
-import importlib.util
-import json
-import random
-import warnings
+import ast
+import sys
 from pathlib import Path
 
 import pytest
 
-from harness import InputError
-from harness.__main__ import _workbench
-from harness.cli import main
-from harness.folder import environment_of
-from harness.journal import read_journal
-from harness.names import canonical, parse
-from harness.suite import load_suite
-from problems import PROBLEMS
-from problems.description import described_bodies
-from reports.data import read_evidence
-from reports.folder import compose, write_report
-from solvers import SOLVERS
+sys.path.append(str(Path(__file__).parent.parent / "tools"))
+import mutants
+
+ROOT = mutants.ROOT
 
 
-def helper(name):
-    path = Path(__file__).with_name(f"{name}.py")
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def changes(code):
+    found = mutants.mutants_of("m.py", code.encode())
+    for m in found:
+        ast.parse(m.source)
+    return {m.change for m in found}
 
 
-mutants, crowd = helper("mutants"), helper("crowd")
-
-FEW, MANY = 150, 1000
-COUNTS = pytest.mark.parametrize(
-    "count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)]
-)
-
-SUITE = """\
-name = "demo"
-tolerances = [1e-6, 1e-3]
-repeats = 3
-time_limit = 60
-memory_limit = 4096.0
-null_arm = "osqp"
-precision = 0.1
-solvers = ["osqp", { name = "clarabel", label = "few", options = { max_iter = 200 } }]
-
-[[problems]]
-family = "beam-ring"
-forms = ["primal", "dual"]
-params = { Nr = [4, 12], Nh = [3, 6], step = [1, 5, 10] }
-zip = [["Nr", "Nh"]]
-
-[[problems]]
-family = "hertz-plane"
-params = { n = 4, load = [1.0, 2.5] }
-sequence = "load"
-"""
-BODIES = """\
-mesh = "two.msh"
-plane = "strain"
-contact = "nts"
-basis = "dual"
-steps = 10
-relin = 1
-units = { length = 2.0, force = 1e8 }
-[[bodies]]
-name = "low"
-E = 200e9
-nu = 0.3
-[[bodies]]
-name = "high"
-E = 1e9
-nu = 0.25
-[[supports]]
-boundary = "floor"
-fix = ["x", "y"]
-[[loads]]
-boundary = "top"
-traction = [0.0, -1e6]
-[[contacts]]
-slave = "under"
-master = "over"
-"""
-MESH = """\
-$MeshFormat
-2.2 0 8
-$EndMeshFormat
-$PhysicalNames
-6
-1 1 "floor"
-1 2 "over"
-1 3 "under"
-1 4 "top"
-2 5 "low"
-2 6 "high"
-$EndPhysicalNames
-$Nodes
-8
-1 0 0 0
-2 1 0 0
-3 1 1 0
-4 0 1 0
-5 0 1.1 0
-6 1 1.1 0
-7 1 2 0
-8 0 2 0
-$EndNodes
-$Elements
-6
-1 1 2 1 1 1 2
-2 1 2 2 2 3 4
-3 1 2 3 3 5 6
-4 1 2 4 4 7 8
-5 3 2 5 5 1 2 3 4
-6 3 2 6 6 5 6 7 8
-$EndElements
-"""
-NAMES = (
-    "beam-ring/Nr=30/Nh=15/step=10/dual", "hertz-plane/n=4/load=2.5/primal",
-    "obstacle/dim=2/n=20/dual-bounds", "contact-patch/ratio=1.5/lower=3/dual",
-    "bodies:press.toml/steps=2/primal", "file:a.npz",
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("y = a + b", {"a + b -> (a - b)"}),
+        ("y = -x", {"-x -> (x)"}),
+        ("y = x < z", {"x < z -> (x > z)"}),
+        ("y = x < 1", {"x < 1 -> (x > 1)", "x < 1 -> (x <= 1)", "1 -> (2)"}),
+        ("y = a or b", {"a or b -> (a and b)", "a or b -> (a)", "a or b -> (b)"}),
+        ("y = np.abs(gap).max()", {
+            "np.abs(gap).max() -> (np.abs(gap).min())", "np.abs(gap) -> (gap)",
+        }),
+        ("y = 2.5", {"2.5 -> (5.0)"}),
+        ("left.reverse()", {"left.reverse() -> pass"}),
+        ("def f():\n    if bad:\n        return\n    go(λ)", {
+            "return -> pass", "go(λ) -> pass",
+        }),
+    ],
 )  # fmt: skip
-NESTED = ("params", "sizes", "options", "counts", "reported", "quantities")
-ENVIRONMENT = {
-    "digest": "8c2f9a56e00f", "now": {"load": 0.1, "time": "2026-11-21"},
-    "machine": {"cpu": "a processor", "usable_cores": 2, "memory_mib": 8192},
-    "versions": {"numpy": "2.0"}, "plugins": ["a.py"],
-    "threads": [{"library": "openblas", "threads": 1}], "variables": {},
-}  # fmt: skip
+def test_one_place_is_changed_at_a_time(code, expected):
+    assert changes(code) == expected
 
 
-def tried(text, read):
-    """Read one text: whether it was taken; anything but an InputError is a fault."""
-    try:
-        with mutants.no_hang(), warnings.catch_warnings():
-            warnings.simplefilter("error")
-            read()
-    except InputError:
-        return False
-    except BaseException as e:
-        e.add_note(f"of the text {text!r:.3000}")
-        raise
-    return True
+def test_texts_types_and_messages_are_left_as_they_are():
+    code = """
+"A docstring."
+x: Literal[1, 2]
+@cache(3)
+def f(a: int | str) -> Literal[4]:
+    "Another."
+    return f"{a + 5}" + "6"
+"""
+    assert changes(code) == set()
 
 
-def written(path, text):
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    return path
+def test_equal_changes_of_one_function_have_numbers():
+    assert changes("y = f(1) + f(1)") >= {"1 -> (2)", "1 -> (2) (2)"}
 
 
-@COUNTS
-def test_a_damaged_suite_is_read_or_refused(tmp_path, count):
-    chance, path = random.Random(count), tmp_path / "suite.toml"
-    for _ in range(count):
-        text = mutants.damaged(SUITE, chance)
-        written(path, text)
-        tried(text, lambda: load_suite(path, PROBLEMS, SOLVERS))
+def test_a_change_elsewhere_leaves_the_choice_of_mutants():
+    code = "def f(x):\n    return x + 1\n"
+    alone = mutants.mutants_of("m.py", code.encode())
+    moved = mutants.mutants_of("m.py", b"y = 2 * z\n\n\n" + code.encode())
+
+    assert {m.rank for m in alone} < {m.rank for m in moved}
 
 
-@COUNTS
-def test_a_damaged_description_of_bodies_is_read_or_refused(tmp_path, count):
-    (tmp_path / "two.msh").write_text(MESH)
-    chance, path = random.Random(count), tmp_path / "bodies.toml"
-    path.write_text(BODIES)
-    assert described_bodies(path, "strain").K.shape == (16, 16)
-    for _ in range(count):
-        text = mutants.damaged(BODIES, chance)
-        written(path, text)
-        tried(text, lambda: described_bodies(path, "strain"))
-
-
-@COUNTS
-def test_a_damaged_name_of_a_case_is_read_or_refused(count):
-    chance = random.Random(count)
-
-    def read(text):
-        name = parse(text, PROBLEMS)
-        again = canonical(name, PROBLEMS[name.family])
-        assert parse(again, PROBLEMS) == name
-
-    for _ in range(count):
-        text = mutants.damaged(chance.choice(NAMES), chance)
-        tried(text, lambda text=text: read(text))
-
-
-def lines(count, chance):
-    """Journal lines with odd values, each under a run_id of its own."""
-    sound = [json.loads(r.to_json()) for r in crowd.crowd(3, 4, 2)]
-    for i in range(count):
-        row = chance.choice(sound) | {"run_id": f"{i:012x}"}
-        part = chance.choice((*NESTED, "message", "claimed", "started", "node", ""))
-        changed = mutants.distorted({part: row[part]} if part else row, chance)
-        row |= changed
-        text = json.dumps(row)
-        yield mutants.damaged(text, chance) if chance.random() < 0.3 else text
-
-
-@COUNTS
-def test_odd_lines_of_a_journal_are_refused_or_reported(tmp_path, count):
-    journal = tmp_path / "journal" / "odd.jsonl"
-    journal.parent.mkdir()
-    taken = {}
-    for line in lines(count, random.Random(count)):
-        text = line.replace("\n", " ") + "\n"
-        written(journal, text)
-        if tried(text, lambda: read_journal(tmp_path)):
-            taken[read_journal(tmp_path)[0].run_id] = text
-    assert count / 10 < len(taken) < count
-    written(journal, "".join(taken.values()))
-    (tmp_path / "environment.json").write_text(json.dumps(ENVIRONMENT))
-
-    assert tried("all that were taken", lambda: compose(read_evidence(tmp_path)))
-    assert tried("", lambda: write_report(tmp_path, ("csv", "parquet")))
-
-
-@COUNTS
-def test_an_odd_environment_is_refused_or_reported(tmp_path, count):
-    chance = random.Random(count)
-    crowd.write(tmp_path, 1, 1, 1)
-    path = tmp_path / "environment.json"
-    for i in range(count):
-        text = json.dumps(mutants.distorted(ENVIRONMENT, chance), ensure_ascii=False)
-        text = mutants.damaged(text, chance) if chance.random() < 0.3 else text
-        written(path, text)
-        tried(text, lambda: environment_of(tmp_path, "8c2f9a56e00f"))
-        taken = tried(text, lambda: read_evidence(tmp_path))
-        if taken and i % 10 == 0:
-            assert tried(text, lambda: compose(read_evidence(tmp_path)))
-
-
-@COUNTS
-def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
-    tmp_path, monkeypatch, capsys, count
-):
-    monkeypatch.chdir(tmp_path)
-    crowd.write(tmp_path / "run", 1, 1, 1)
-    commands = [
-        ["report", "nowhere", "--factor", "10"], ["replay", "run", "68bf42c63dd7"],
-        ["validate", "nowhere", "--budget", "30"], ["list", "problems"],
-        ["run", "demo.toml", "--time-limit", "60"], ["report", "run", "--format", "md"],
-        ["solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "2"],
-        ["export", "beam-ring/dual", "a.txt"], ["run", "nowhere", "--case", "*"],
-    ]  # fmt: skip
-    chance, workbench = random.Random(count), _workbench()
-    for _ in range(count // 3):
-        argv = [*chance.choice(commands)]
-        at = chance.randrange(1, len(argv))
-        argv[at] = mutants.damaged(argv[at], chance).replace("\x00", "")
-        if argv in commands or "\n" in argv[at] or "-h" in argv[at]:
-            continue
-        with mutants.no_hang():
-            assert main(workbench, argv) == 2, argv
-        message = capsys.readouterr().err
-        assert message.count("\n") == 1, argv
-        assert len(message) < 1500
+def test_the_list_names_modules_tests_and_mutants_that_there_are():
+    plan = mutants.read_plan()
+    for module, tests in plan.tests.items():
+        assert (ROOT / module).is_file()
+        assert (ROOT / tests[0]).is_file()
+    for (module, where, change), reason in plan.accepted.items():
+        keys = {m.key for m in mutants.mutants_of(module, (ROOT / module).read_bytes())}
+        assert (module, where, change) in keys
+        assert reason

@@ -403,6 +403,14 @@ def test_three_sizes_make_no_test():
         growth_of([1, 2, 3, 3], [1, 2, 3, 3])
 
 
+@pytest.mark.parametrize("values", [[0, 1, 2, 3], [1, 2, 3, -1]])
+def test_growth_is_that_of_positive_values(values):
+    with pytest.raises(ValueError, match="positive values"):
+        growth_of([1, 2, 3, 4], values)
+    with pytest.raises(ValueError, match="positive values"):
+        growth_of(values, [1, 2, 3, 4])
+
+
 def test_nothing_is_predicted_beyond_the_measured_sizes():
     n = np.array([100, 400, 1600, 6400])
     found = growth_of(n, 2e-6 * n**1.5)

@@ -149,7 +149,7 @@ def _shown(code: str) -> str:
 
 
 def _changes(
-    tree: ast.AST, where: str = "", inside: ast.AST | None = None
+    tree: ast.AST, where: str = ""
 ) -> Iterator[tuple[str, ast.expr | ast.stmt, str]]:
     """Walk through what has a meaning for results: no texts, types or messages."""
     for child in _children(tree):
@@ -161,9 +161,9 @@ def _changes(
         ):
             for new in _expressions(child):
                 yield where, child, f"({ast.unparse(new)})"
-        if isinstance(child, ast.stmt) and _can_go(child, inside):
+        if isinstance(child, ast.stmt) and _can_go(child, tree):
             yield where, child, "pass"
-        yield from _changes(child, name, tree)
+        yield from _changes(child, name)
 
 
 def _children(node: ast.AST) -> Iterator[ast.AST]:
@@ -256,7 +256,7 @@ def _is_text(node: ast.AST) -> bool:
     )
 
 
-def _can_go(node: ast.stmt, inside: ast.AST | None) -> bool:
+def _can_go(node: ast.stmt, parent: ast.AST) -> bool:
     """Whether a statement is left out: what acts on something, or guards."""
     match node:
         case ast.Expr(value=ast.Constant()):
@@ -266,7 +266,7 @@ def _can_go(node: ast.stmt, inside: ast.AST | None) -> bool:
         case ast.Assign(targets=[ast.Attribute() | ast.Subscript()]):
             return True
         case ast.Return():
-            return isinstance(inside, ast.If)
+            return isinstance(parent, ast.If)
         case _:
             return False
 
