@@ -31,7 +31,9 @@ from harness.build import build, unbuilt
 from harness.judge import certified, note_of, plain, quantities_of
 from harness.names import CaseName, canonical
 from harness.plugin import Case, Family, Reference
+from harness.qp import QP
 from harness.qpfile import load_qp, save_qp
+from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.serving import Events, answer_requests
 from harness.solution import Status
@@ -41,8 +43,14 @@ from harness.store import field_arrays, read_point, write_arrays, write_point
 class Generator:
     """Builds cases of `families`, with the injected `reference` solve."""
 
-    def __init__(self, families: Mapping[str, Family], reference: Reference) -> None:
+    def __init__(
+        self,
+        families: Mapping[str, Family],
+        reference: Reference,
+        operators: Mapping[str, Maker] = NO_MAKERS,
+    ) -> None:
         self._families = families
+        self._operators = operators
         self._reference = reference
         self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
         self._build_seconds = 0.0  # of the last case that was built
@@ -63,10 +71,13 @@ class Generator:
 
     def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
-            write_point(point, self._reference(load_qp(qp)[0]))
+            write_point(point, self._reference(self._loaded(qp)))
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
             return {"found": False}
         return {"found": True}
+
+    def _loaded(self, qp: Path) -> QP:
+        return load_qp(qp, operators=self._operators)[0]
 
     def _case(self, name: CaseName, keep: int) -> Case:
         family = self._families[name.family]

@@ -32,7 +32,7 @@ def generator(workbench: Workbench, arguments: Sequence[str]) -> int:
     files = [Path(file) for file in json.loads(text)["plugins"]]
     workbench = workbench.with_files(files)
     serve_cases(
-        Generator(workbench.families, workbench.reference),
+        Generator(workbench.families, workbench.reference, workbench.operators),
         int(request_fd),
         int(reply_fd),
     )

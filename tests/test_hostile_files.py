@@ -111,13 +111,14 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     """A request without a digest: the file may be anybody's."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
-        "import os, sys; from harness.worker import _Bench; "
-        "_Bench(None, {'subprocess:call': os.abort}).answer({'qp': sys.argv[1]}, None)"
+        "import os, sys; from harness.worker import _Bench; qp, out = sys.argv[1:]; "
+        "bench = _Bench(None, {'subprocess:call': os.abort}); "
+        "bench.answer({'qp': qp, 'out': out}, None)"
     )
+    files = [str(tmp_path / name) for name in ("a.npz", "point.npz")]
     done = subprocess.run(
-        [sys.executable, "-P", "-c", program, str(tmp_path / "a.npz")],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [sys.executable, "-P", "-c", program, *files], capture_output=True, text=True
+    )
 
     assert "P as an operator" in done.stderr.splitlines()[-1]
 
