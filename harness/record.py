@@ -234,9 +234,20 @@ def _share(record: Record, shared: dict[Any, Any]) -> Record:
         key = (repr(table),)  # a tuple: no text is taken for a table
         if key not in shared:
             _check_nested(name, table, MOST_LEVELS)
+            if name == "params":
+                _check_values(table)
             shared[key] = table
         object.__setattr__(record, name, shared[key])
     return record
+
+
+def _check_values(params: Mapping[str, Any]) -> None:
+    """Refuse what no case name can hold."""
+    for key, value in params.items():
+        if isinstance(value, dict | list):
+            raise ValueError(
+                f"params.{key} = {shown(value)}; expected a number or a text"
+            )
 
 
 def _check_nested(where: str, data: Any, levels: int) -> None:

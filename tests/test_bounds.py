@@ -77,6 +77,7 @@ def refused(capsys, monkeypatch, tmp_path):
         ({"counts": {"steps": 10**400}}, "counts.steps = 1000"),
         ({"quantities": {"a": [[2**63]]}}, "expected an integer of at most 64 bits"),
         ({"status": "fine"}, "status = 'fine'; expected one of verified, inaccurate"),
+        ({"params": {"n": [1]}}, "params.n = [1]; expected a number or a text"),
         ({"run_id": ""}, "run_id is empty; expected a text"),
         ({"options": {"x": [[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]}}, "deeper"),
         ({"message": 10**5000 // 7 % 10**300}, "expected str"),
