@@ -134,7 +134,8 @@ def attack(name: str, count: int) -> tuple[list[str], list[float]]:
         try:
             found = certify(mechanics, s)
         except UncertifiableError as e:
-            told.append(f"{kind.__name__} {size:.0e}: {e}")
+            if mechanics.norm(s.x.astype(Real) - u) < length:  # others need none
+                told.append(f"{kind.__name__} {size:.0e}: {e}")
             continue
         errors = errors_of(mechanics, u, s, found)
         if max(errors) > ROUNDED * found.bound * length:
