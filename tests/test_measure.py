@@ -108,7 +108,7 @@ def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
     hungry = measure(Hungry(), qp, 1e-6).peak_mib
     after = measure(modest, qp, 1e-6).peak_mib
 
-    assert hungry > before + 100
+    assert before + 100 < hungry < before + 300
     assert after < before + 50
 
 
