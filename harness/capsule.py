@@ -114,7 +114,7 @@ def _cell(r: Record) -> tuple[Any, ...]:
 
 
 def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
-    by_id = {r.run_id: r for r in records}  # the latest of each
+    by_id = {r.run_id: r for r in records}
     candidates = [name for name in by_id if run_id and name.startswith(run_id)]
     if run_id in by_id or len(candidates) == 1:
         return by_id[run_id if run_id in by_id else candidates[0]]

@@ -46,9 +46,10 @@ def refuse_links(folder: Path) -> None:
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.name in (*_FOLDERS, _SCRATCH):
-                if not entry.is_dir(follow_symlinks=False):
+                if not _is_plain(entry):
                     raise _not_plain(entry.path, "a folder of its own")
-                _only_plain(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    _only_plain(entry.path)
             elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
                 raise _not_plain(entry.path, "a file of its own")
 

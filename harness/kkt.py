@@ -84,10 +84,10 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     * complementarity: max |zᵢ(h − Gx)ᵢ|/E over rows and bounds
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
-    Dᵢ is the larger of |xᵢ| and the step |rᵢ|/Pᵢᵢ to the minimum along i, but no longer
-    than the way to the bounds. From each residual is taken first what rounding to
-    double precision explains: 8·2⁻⁵² of the sum of its absolute terms, but never more
-    than 2e-4 of its scale.
+    Dᵢ is the larger of |xᵢ| and the step |rᵢ|/Pᵢᵢ to the minimum along i (Xᵢ for a
+    variable without curvature and cost), but no longer than the way to the bounds. From
+    each residual is taken first what rounding to double precision explains: 8·2⁻⁵² of
+    the sum of its absolute terms, but never more than 2e-4 of its scale.
 
     generous : with the largest scale of energy that can be justified
     """
@@ -95,7 +95,7 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     E, X = scales_at(qp, s.x, _energy(qp, t, generous), t.curvature)
     return Residuals(
         violation(qp, s.x, X),
-        _dual(qp, s, t, E),
+        _dual(qp, s, t, E, X),
         _complementarity(qp, s, E),
         _excess(t.energies.sum(keepdims=True), t.energies_size, E),
     )
@@ -159,7 +159,7 @@ def _violated(error: Vector, rhs: Vector, terms: Vector, known: Vector) -> float
     )
 
 
-def _dual(qp: QP, s: Solution, t: _Terms, E: float) -> float:
+def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     curved = t.curvature[t.curvature > 0]
     least = np.sqrt(E * curved.min()) if curved.size else 0.0
     S = _largest(_sup(t.Px), _sup(qp.q), _sup(t.forces), least)
@@ -167,7 +167,10 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float) -> float:
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
     own_r = np.maximum(r - ROUNDING * size, 0)
-    step = _over(r, t.curvature) if qp.is_explicit else t.x  # else no Pᵢᵢ is known
+    # an operator tells no Pᵢᵢ, and what neither bends nor costs is as long as it is
+    is_idle = (t.curvature == 0) & (qp.q == 0)
+    step = _over(r, t.curvature) if qp.is_explicit else t.x
+    step = np.where(is_idle, np.maximum(t.x, X), step)
     way = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
     gain = np.where(own_r > 0, own_r * step, 0.0)

@@ -127,7 +127,7 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     else:
         known = told = terms
     rounding = min(ROUNDING * size, EXCUSED * told)
-    if not doubt <= EXCUSED * known:
+    if not (known > 0 and doubt <= EXCUSED * known):  # f* = 0 of nothing has no scale
         return None
     return Optimum(
         value=float(value), doubt=doubt + rounding, energy=SPARED * known,

@@ -434,7 +434,7 @@ WRONG = {
     ),
     "absurd integer": (
         ("solve", f"well/n={5000 * '9'}/primal", "--solver", "exact"),
-        "…; expected an integer, such as 4",
+        "; expected an integer, such as 4",
     ),
     "nowhere to write": (("run", "tiny", "--out", ""), "--out is empty; expected a"),
     "nothing to draw": (

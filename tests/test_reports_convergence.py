@@ -4,6 +4,8 @@ The first course below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.
 (0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
 """
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,8 @@ def folder(tmp_path):
 
     def make(*measured):
         out = tmp_path / "out"
-        out.mkdir(exist_ok=True)
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
         with Journal(out, "test") as journal:
             for i, (solver, history, changes) in enumerate(measured):
                 journal.append(_record(out, i, solver, history, changes))
