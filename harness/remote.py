@@ -36,8 +36,10 @@ from harness.store import write_point
 from harness.supervisor import Reply, WorkerProcess, out_of_memory
 
 MOST_HISTORY = 2**28  #: bytes of a history, and of what a file has around its arrays
-OWN_SECONDS = 0.002  #: of our own work while a worker's clock is stopped
-OWN_SECONDS_PER_REPEAT = 1e-4
+OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
+OWN_SECONDS_PER_REPEAT = (
+    3e-4  #: 0.12 ms on a busy machine, so that none is accused of it
+)
 FAR_LESS = 20.0  #: a repeat that is so many times faster …
 LEAST_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
 LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
