@@ -169,6 +169,8 @@ class Mechanics:
 
     def still(self, v: Extended) -> Extended:
         """Take the rigid motions out of `v` (n,):  v − R Rᵀv."""
+        if not self.kernel.shape[1]:  # sparse matrices take long over nothing
+            return v
         return np.asarray(v - self.kernel @ (self.kernel.T @ v))
 
     def relaxed(self, force: Extended) -> Extended:
