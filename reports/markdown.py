@@ -6,6 +6,10 @@ import re
 
 from reports.layout import Cell, Page, Section, Table
 
+_MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
+_LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
+_LIST = re.compile(r"^(\d*)([-+.)])(?=\s)")
+
 
 def markdown(page: Page) -> str:
     """Render the whole report; figures are linked, tables are pipes."""
@@ -47,6 +51,6 @@ def _cell(cell: Cell) -> str:
 def escaped(text: str) -> str:
     """Escape what Markdown or HTML would read as markup, or make a link or list of."""
     safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    safe = re.sub(r"([\\`*_\[\]|~#$@])", r"\\\1", safe)
-    safe = re.sub(r"(:)(?=//)|(?<=www)(\.)", r"\\\g<0>", safe, flags=re.IGNORECASE)
-    return re.sub(r"^(\d*)([-+.)])(?=\s)", r"\1\\\2", safe)
+    safe = _MARKUP.sub(r"\\\1", safe)
+    safe = _LINK.sub(r"\\\g<0>", safe)
+    return _LIST.sub(r"\1\\\2", safe)

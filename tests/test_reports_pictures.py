@@ -1,15 +1,19 @@
 """Pictures of two rectangles: what is drawn is where and what the fields say."""
 
+import re
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from matplotlib.collections import TriMesh
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from harness import Fields, InputError
-from reports.figures import look
+from reports.figures import inline_svg, look, save_all
+from reports.layout import Page, Picture, Section
 from reports.mechanics import deformed_figure, draw_deformed, outlines
+from reports.writing import ENDINGS, write_page
 
 LOWER, UPPER = 3, 6  # columns of cells
 
@@ -185,3 +189,38 @@ def test_fifty_solvers_look_different_from_each_other():
     looks = {(look(i)["color"], look(i)["marker"]) for i in range(50)}
 
     assert len(looks) == 50
+
+
+def test_a_figure_is_drawn_once_per_format_and_once_to_be_laid_out(
+    tmp_path, monkeypatch
+):
+    drawings = []
+    draw = Figure.draw
+    monkeypatch.setattr(Figure, "draw", lambda *a: (drawings.append(1), draw(*a)))
+    figure = Figure(figsize=(6, 3), layout="constrained")
+    figure.subplots().plot([1, 2], [3, 4])
+    picture = Picture(name="line", caption="A line.", figure=figure)
+    section = Section(name="line", title="A line", pictures=(picture,))
+    page = Page(title="One figure", dateline="", sections=(section,))
+    write_page(page, tmp_path, {"html", "md"})
+    assert len(drawings) == 1 + len(ENDINGS)
+
+
+def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure(
+    tmp_path,
+):
+    figure = Figure(figsize=(6, 3))
+    axes = figure.add_axes((0.25, 0.5, 0.5, 0.25))
+    axes.set(xticks=[], yticks=[])
+    axes.patch.set_facecolor("#123456")
+    (file,) = save_all(figure, [tmp_path / "frame.svg"])
+    svg = inline_svg(figure, "frame")
+    left, top, width, height = map(float, re.search('viewBox="(.*?)"', svg)[1].split())
+    body = svg[: svg.index("#123456")].rpartition('d="')[2]
+    corners = np.array(re.findall(r"[ML] (\S+) (\S+)", body), dtype=float)
+    assert (width, height) == (6 * 72, 3 * 72)
+    expected = [0.25 * width, 0.25 * height], [0.75 * width, 0.5 * height]
+    assert corners.min(axis=0) - (left, top) == pytest.approx(expected[0], abs=1e-3)
+    assert corners.max(axis=0) - (left, top) == pytest.approx(expected[1], abs=1e-3)
+    assert "#ffffff" in file.read_text()
+    assert "#ffffff" not in svg
