@@ -171,7 +171,9 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, tmp_path):
     }  # fmt: skip
     files = [*(tmp_path / "data").glob("*.csv")]
     for name in ("figure1", "verification", "fleet"):
-        figures = [tmp_path / f"figures/{name}{end}" for end in (".svg", ".pdf", ".png")]
+        figures = [
+            tmp_path / f"figures/{name}{end}" for end in (".svg", ".pdf", ".png")
+        ]
         figures[0].parent.mkdir(exist_ok=True)
         files += save_all(pictures[name].figure, figures)
 
