@@ -30,7 +30,7 @@ demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
 test: setup browser check  ## check, then run the tests on all CPUs
-	$(BIN)/pytest -q -n auto -m 'not slow and not alone'
+	$(BIN)/pytest -q -n auto --dist loadgroup -m 'not slow and not alone'
 	$(BIN)/pytest -q -m 'alone and not slow'
 
 mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)

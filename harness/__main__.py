@@ -6,15 +6,11 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from threadpoolctl import threadpool_limits
 
 from harness import Reference, cli
-from harness.beyond import measured
-from harness.discretisation import Discretisation
-from harness.environment import capture
-from harness.experiment import save_experiment
 from harness.kkt import VERIFIED_FACTOR
 from harness.plugin import Fields
 from harness.supervisor import ONE_THREAD
@@ -22,6 +18,9 @@ from harness.workbench import Workbench
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference import reference_solution
+
+if TYPE_CHECKING:
+    from harness.discretisation import Discretisation
 
 
 def main() -> None:
@@ -89,6 +88,9 @@ def _vtu(fields: Fields, path: Path) -> None:
 
 
 def _paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
+    from harness.beyond import measured
+    from harness.environment import capture
+    from harness.experiment import save_experiment
     from problems.experiments import PAPER, QUICK, paper_experiment
     from reports.paper import write_paper
 

@@ -46,7 +46,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from harness.admissible import (
     UncertifiableError,
@@ -342,6 +341,8 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Find y ≥ 0 with  columns·y = target  (p,); infinite where none is found."""
+    from scipy.optimize import nnls  # late: it takes long, and workers need none
+
     try:
         y, left = nnls(columns, target)
     except RuntimeError:  # it has an iteration limit

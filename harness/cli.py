@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from harness import commands, examine, one, processes, validate
+from harness import processes
 from harness.durable import FULL
 from harness.errors import InputError, one_line
 from harness.kkt import VERIFIED_FACTOR
@@ -103,6 +103,9 @@ def _print_no_more() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
+    # late: the processes that runs start parse no commands, and start sooner so
+    from harness import commands, examine, one, validate
+
     parser = _Parser(
         prog="mortarbench",
         description="Compare QP solvers on elastic contact problems.",

@@ -133,6 +133,8 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     """
     if case.mechanics is None or not has_point(s):
         return {}, ""
+    import scipy.optimize  # noqa: F401  # `certify` may need it: that is not timed
+
     start = perf_counter()
     try:
         found = certify(case.mechanics, case.mechanics.back(s))

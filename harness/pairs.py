@@ -7,7 +7,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 COVERAGE = 0.95
 
@@ -47,7 +47,7 @@ def paired_ratio(a: Mapping[int, float], b: Mapping[int, float]) -> Ratio | None
 @cache
 def _student(n: int) -> float:
     """Half-width of the interval from n values, in errors of their mean."""
-    return float(t.ppf(0.5 + COVERAGE / 2, n - 1))
+    return float(stdtrit(n - 1, 0.5 + COVERAGE / 2))
 
 
 def widest(times: Mapping[str, Mapping[int, float]]) -> float | None:

@@ -7,14 +7,16 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from harness.block import Commands
-from harness.discretisation import Discretisation
 from harness.errors import InputError, unknown
 from harness.plugin import Family, Fields, Reference, Solver
 from harness.recipe import Maker
 from harness.registry import Plugin, SolverSpec, load_plugin, merged
+
+if TYPE_CHECKING:  # it takes long to import, and workers need none
+    from harness.discretisation import Discretisation
 
 SUITES = Path(__file__).parents[1] / "suites"  #: of the checkout
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report

@@ -22,7 +22,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.optimize import nnls
 
 from harness import QP, Solution, Status, kkt_residuals
 from harness.optimum import is_small
@@ -142,6 +141,8 @@ def _is_nonnegative(qp: QP) -> bool:
 
 def _nonnegative(qp: QP) -> Solution:
     """Solve  min ½xᵀPx + qᵀx, x ≥ lb, by nonnegative least squares."""
+    from scipy.optimize import nnls  # late: it takes long, and workers need none
+
     P, gradient_at_lb = qp.P, qp.q + qp.P @ qp.lb
     L = cholesky(P, lower=True)
     y, _ = nnls(L.T, -solve_triangular(L, gradient_at_lb, lower=True))

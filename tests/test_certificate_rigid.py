@@ -53,6 +53,9 @@ MAKERS: dict[str, Callable[[], Case]] = {
     "stiff disc": disc(E=(70e6, 70e14, 70e6)),
     "soft plate": disc(E=(70e3, 70e9, 70e12)),
 }  # fmt: skip
+#: its solution in rational arithmetic takes many seconds: a slow test
+LONG = "hertz-plane/n=3"
+NAMES = [n if n != LONG else pytest.param(n, marks=pytest.mark.slow) for n in MAKERS]
 
 
 @cache
@@ -154,9 +157,9 @@ def errors_of(
     return [mechanics.norm(v - u) for v in points]
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_no_answer_is_further_from_the_stored_problem_than_its_bound(name):
-    told, _ = attack(name, 14)
+    told, _ = attack(name, 7)
     assert told == []
 
 
@@ -167,7 +170,7 @@ def test_none_of_ten_thousand_is_and_bounds_are_sharp():
     assert np.median([e for _, sharp in results for e in sharp]) <= 2
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_stored_solution_is_certified_to_six_digits(name):
     mechanics, u, lam, _ = known(name)
     assert certify(mechanics, answer(u, lam)).bound <= 1e-6

@@ -78,16 +78,20 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 #: threads of the test runner's own count, too, where tests run in parallel
 ONE_THREAD = "computes in one thread"
+#: goes on to the last of its iterations, for many seconds
+LONG = ("proxqp", "claims no success: unbounded")
+
+
+def marks(name, check):
+    if (name, check) == LONG:
+        return pytest.mark.slow
+    return pytest.mark.alone if check == ONE_THREAD else ()
 
 
 @pytest.mark.parametrize(
-    "check",
-    [
-        pytest.param(c, marks=pytest.mark.alone) if c == ONE_THREAD else c
-        for c in STRICT
-    ],
+    ("name", "check"),
+    [pytest.param(n, c, marks=marks(n, c)) for n in CONCRETE for c in STRICT],
 )
-@pytest.mark.parametrize("name", CONCRETE)
 def test_a_solver_conforms(name, check):
     grade, message, _ = run_check(check, CONCRETE[name])
     if grade is Grade.DECLINE:

@@ -443,6 +443,7 @@ def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
     assert verdict["counts"]["pairs"] == 10 + 3  # of answers at one tolerance
 
 
+@pytest.mark.slow  # the solve; those of HiGHS and of a candidate by hand are quick
 def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
     text = "obstacle/n=16/primal"
     case = built(text)

@@ -32,7 +32,7 @@ def helper(name):
 
 damage, crowd = helper("damage"), helper("crowd")
 
-FEW, MANY = 150, 1000
+FEW, MANY = 30, 1000
 COUNTS = pytest.mark.parametrize(
     "count", [FEW, pytest.param(MANY, marks=pytest.mark.slow)]
 )

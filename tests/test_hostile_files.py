@@ -550,7 +550,7 @@ KINDS = ("npz", "mat", "qps", "msh", "parquet")
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
-    fuzz(kind, 4 if kind == "parquet" else 150, 11, tmp_path, seconds=120)
+    fuzz(kind, 2 if kind == "parquet" else 30, 11, tmp_path, seconds=120)
 
 
 @pytest.mark.slow

@@ -18,16 +18,16 @@ from harness.journal import read_journal
 PLUGIN = Path(__file__).with_name("adversaries.py")
 SUITE = """
 name = "killed"
-repeats = 4
+repeats = {repeats}
 time_limit = 20
 solvers = ["sleeps", "honest", "dies", "declines", "chains"]
 [[problems]]
 family = "tiny"
-params = { h = [0.5, 1.0] }
+params = {{ h = [0.5, 1.0] }}
 [[problems]]
 family = "tiny"
 sequence = "h"
-params = { h = [0.5, 1.0, 1.5] }
+params = {{ h = [0.5, 1.0, 1.5] }}
 """
 #: a run in a process of its own: suite, folder
 RUNS = f"""
@@ -157,14 +157,14 @@ def disturbed(suite, out, events, rng, longest):
     assert ended(started(suite, out))[0] == 0  # what could not be built, again
 
 
-def check(tmp_path, events, seed, out=None):
+def check(tmp_path, events, seed, out=None, repeats=4):
     suite = tmp_path / "suite.toml"
-    suite.write_text(SUITE)
+    suite.write_text(SUITE.format(repeats=repeats))
     begin = time.monotonic()
     assert ended(started(suite, tmp_path / "whole"))[0] == 0
     longest = (time.monotonic() - begin) / 2
     whole = read_journal(tmp_path / "whole")
-    assert len(whole) == 2 * (4 * 4 + 1) + 3 * (4 * 4 + 1)
+    assert len(whole) == 5 * (4 * repeats + 1)
 
     rng = random.Random(seed)
     rng.shuffle(events)
@@ -186,6 +186,11 @@ def check(tmp_path, events, seed, out=None):
 
 
 def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path):
+    check(tmp_path, [kill_one, ask_to_end, fill_by_limit], seed=161803, repeats=1)
+
+
+@pytest.mark.slow
+def test_so_does_one_of_four_repeats(tmp_path):
     check(tmp_path, [kill_one] * 2 + [ask_to_end] + [fill_by_limit] * 2, seed=161803)
 
 

@@ -1,6 +1,7 @@
 """The clock in this process; what kills a process is in test_run.py."""
 
 import gc
+import subprocess
 import sys
 from pathlib import Path
 
@@ -162,3 +163,20 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
 
     assert asked == [1]  # the clock had been read once
     assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked
+
+
+def test_processes_of_runs_import_nothing_that_they_never_call():
+    """They start tens of times a run: statistics alone would double what that takes."""
+    needless = {
+        "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.spatial",
+        "matplotlib", "pandas", "pyarrow", "distributed", "rich",
+    }  # fmt: skip
+    program = "import sys, harness.__main__; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert needless & set(done.stdout.split()) == set()

@@ -24,7 +24,8 @@ from problems.experiments.physics import stepping
 from problems.inverse import Factorised
 from problems.mesh import half_ring
 from problems.triplets import stiffness_by_triplets
-from reports.data import Evidence, arrange
+from reports.data import Evidence, arrange, read_evidence
+from reports.figures import save_all
 from reports.paper import write_paper
 from reports.paper.contact import active
 from reports.paper.fleet import (
@@ -41,6 +42,9 @@ from reports.paper.stress import extent
 from reports.paper.tables import PARTS
 from solvers.reference import reference_solution
 from solvers.smalbe import PAPER, SMALBE
+
+#: it measures and draws once: one process has all of it
+pytestmark = pytest.mark.xdist_group("paper")
 
 FIGURES = [
     *(f"figure{i}" for i in range(1, 8)),
@@ -145,7 +149,8 @@ def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
-def test_the_same_data_are_drawn_to_the_same_bytes(folder, experiment, tmp_path):
+@pytest.mark.slow
+def test_all_of_the_same_data_is_drawn_to_the_same_bytes(folder, experiment, tmp_path):
     """From the files in data/ alone: nothing is measured again."""
     shutil.copytree(folder / "data", tmp_path / "data")
     save_experiment(load_experiment(folder / "data"), tmp_path / "data")
@@ -153,6 +158,27 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, experiment, tmp_path)
 
     assert len(again) == 1 + 14 * 3 + 5 + 8
     for path in [*again, *(tmp_path / "data").glob("*.csv")]:
+        assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
+
+
+def test_the_same_data_are_drawn_to_the_same_bytes(folder, tmp_path):
+    """What is stored, and a figure of each sort: a mesh, curves, solvers."""
+    again = load_experiment(folder / "data")
+    save_experiment(again, tmp_path / "data")
+    suites = {n: read_evidence(folder / "data" / n) for n in planted()}
+    pictures = {
+        p.name: p for s in compose(again, suites).sections for p in s.pictures
+    }  # fmt: skip
+    files = [*(tmp_path / "data").glob("*.csv")]
+    for name in ("figure1", "verification", "fleet"):
+        figures = [
+            tmp_path / f"figures/{name}{end}" for end in (".svg", ".pdf", ".png")
+        ]
+        figures[0].parent.mkdir(exist_ok=True)
+        files += save_all(pictures[name].figure, figures)
+
+    assert len(files) > 9
+    for path in files:
         assert path.read_bytes() == (folder / path.relative_to(tmp_path)).read_bytes()
 
 

@@ -17,6 +17,9 @@ from harness.qpfile import load_qp, save_qp
 from harness.registry import load_plugin
 from harness.workbench import Workbench
 
+#: one process has the run that all replay
+pytestmark = pytest.mark.xdist_group("replay")
+
 WELLS = Path(__file__).with_name("wells.py")
 PLUGIN = load_plugin(WELLS)
 SUITE = """
@@ -256,7 +259,8 @@ def test_a_capsule_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
 def test_a_plug_in_that_is_needed_is_asked_for(cli, workbench, tmp_path, lost):
     (tmp_path / "wells.toml").write_text(SUITE)
     (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
-    cli("run", "wells.toml", "--out", "done", "--plugin", "empty.py")
+    little = ("--solver", "exact", "--repeats", "1")
+    cli("run", "wells.toml", "--out", "done", "--plugin", "empty.py", *little)
     run_id = read_journal(tmp_path / "done")[0].run_id
     code, _, err = cli("replay", "done", run_id, workbench=replace(workbench, **lost))
 

@@ -403,10 +403,10 @@ def search(seed, tries, each=40):
 
 
 def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted():
-    wrong, refuted, verified = search(271828, 1000)
+    wrong, refuted, verified = search(271828, 120)
 
     assert (wrong, refuted) == ([], [])
-    assert verified > 50
+    assert verified > 5
 
 
 @pytest.mark.slow
