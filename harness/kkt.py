@@ -89,15 +89,16 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     each residual is taken first what rounding to double precision explains: 8·2⁻⁵² of
     the sum of its absolute terms, but never more than 2e-4 of its scale.
 
-    generous : with the largest scale of energy that can be justified
+    generous : with the largest scale of energy that can be justified, and all rounding
+        of energies forgiven
     """
-    t = _terms(qp, s)
+    t, excused = _terms(qp, s), np.inf if generous else EXCUSED
     E, X = scales_at(qp, s.x, _energy(qp, t, generous), t.curvature)
     return Residuals(
         violation(qp, s.x, X),
         _dual(qp, s, t, E, X),
-        _complementarity(qp, s, E),
-        _excess(t.energies.sum(keepdims=True), t.energies_size, E),
+        _complementarity(qp, s, E, excused),
+        _excess(t.energies.sum(keepdims=True), t.energies_size, E, excused),
     )
 
 
@@ -184,15 +185,19 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     )
 
 
-def _complementarity(qp: QP, s: Solution, E: float) -> float:
+def _complementarity(qp: QP, s: Solution, E: float, excused: float) -> float:
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
     x, box = np.abs(s.x), (qp.lb[lower], qp.ub[upper])
     z_lb, z_ub = np.maximum(-s.z_box, 0)[lower], np.maximum(s.z_box, 0)[upper]
     size = _abs(qp.G) @ x + np.abs(qp.h)
     return _largest(
-        _excess(s.z * (qp.h - qp.G @ s.x), np.abs(s.z) * size, E),
-        _excess(z_lb * (s.x[lower] - box[0]), z_lb * (x[lower] + np.abs(box[0])), E),
-        _excess(z_ub * (box[1] - s.x[upper]), z_ub * (x[upper] + np.abs(box[1])), E),
+        _excess(s.z * (qp.h - qp.G @ s.x), np.abs(s.z) * size, E, excused),
+        _excess(
+            z_lb * (s.x[lower] - box[0]), z_lb * (x[lower] + np.abs(box[0])), E, excused
+        ),
+        _excess(
+            z_ub * (box[1] - s.x[upper]), z_ub * (x[upper] + np.abs(box[1])), E, excused
+        ),
     )
 
 
@@ -234,13 +239,19 @@ def _alone(
 ) -> Vector:
     """List natural energies: what a variable alone can gain, of each that tells one.
 
-    qᵢ²/Pᵢᵢ from its minimum, or |qᵢ|wᵢ over its feasible width, if that is less.
+    Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
+    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ over its feasible width, if that is less.
 
     by_length : where both are infinite |qᵢ|lᵢ, and where q is rounding Pᵢᵢlᵢ², of the
         least length lᵢ that a row or bound knows, 1 if none does
     """
     q = np.abs(qp.q)
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * width), 0)
+    least = np.clip(-np.sign(qp.q) * _over(q, d), qp.lb, qp.ub)
+    own = np.abs(d / 2 * least**2 + qp.q * least)
+    gain = np.where(
+        (q > 0) & (least != 0) & np.isfinite(own), np.minimum(own, gain), gain
+    )
     lengths = _lengths(qp) if by_length else np.full(q.size, np.inf)
     if by_length and not np.isfinite(lengths).any():
         lengths = np.ones(q.size)
@@ -433,9 +444,17 @@ def _ratio(error: Vector, scale: Vector | float) -> float:
     return float(_ratios(error, scale).max(initial=0.0))
 
 
-def _excess(error: Vector, size: Vector | float, scale: Vector | float) -> float:
-    """Largest ratio to the scale of what rounding of terms of that size leaves open."""
-    rounding = np.minimum(ROUNDING * size, EXCUSED * scale)
+def _excess(
+    error: Vector,
+    size: Vector | float,
+    scale: Vector | float,
+    excused: float = EXCUSED,
+) -> float:
+    """Largest ratio to the scale of what rounding of terms of that size leaves open.
+
+    excused : of the scale, what is called rounding at most
+    """
+    rounding = np.minimum(ROUNDING * size, excused * scale)
     rounding = np.where(np.isfinite(rounding), rounding, 0)
     return _ratio(np.maximum(np.abs(error) - rounding, 0), scale)
 
