@@ -22,7 +22,7 @@ from harness.assessment import Assessment, Deviation, distances, energy_allowed
 from harness.errors import some
 from harness.judge import note_of
 from harness.kkt import allowed, verdict
-from harness.optimum import decided, remembered
+from harness.optimum import Proves, decided, proves
 from harness.plugin import Reference
 from harness.record import Verdict
 from harness.solution import Status
@@ -98,10 +98,10 @@ def compared(
     solve : the reference solve
     references : folder that keeps reference points
     """
-    solve = remembered(solve)
+    prove = proves(solve)
     truth = truth_of(given, solve, references)
     if isinstance(truth, str):
-        alone = tuple(_answer(g, None, None, solve) for g in given)
+        alone = tuple(_answer(g, None, None, prove) for g in given)
         return Problem(
             name=name, truth="", doubt=None, closed=None, answers=alone, pairs=(),
             unresolved=(), note=truth,
@@ -112,10 +112,10 @@ def compared(
             assessment, deviation = truth.assess(g)
         except Exception as e:  # the family's code, of the way back
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
-            answers.append(_answer(g, None, None, solve))
+            answers.append(_answer(g, None, None, prove))
             continue
         deviations.append((len(answers), deviation))
-        answers.append(_answer(g, assessment, truth.doubt, solve))
+        answers.append(_answer(g, assessment, truth.doubt, prove))
     pairs = _pairs(answers, deviations, truth)
     unresolved = [
         p
@@ -131,11 +131,11 @@ def compared(
 
 
 def _answer(
-    g: Given, found: Assessment | None, doubt: float | None, solve: Reference
+    g: Given, found: Assessment | None, doubt: float | None, prove: Proves
 ) -> Answer:
     """Put together what is known of an answer, and whether its claim stands."""
     r, residuals = g.record, residuals_of(g)
-    error = decided(g.case.qp, g.solution, residuals, r.tol, solve)
+    error = decided(g.case.qp, g.solution, residuals, r.tol, prove)
     answer = Answer(
         run_id=r.run_id, repeats=g.repeats, solver=g.label, case=r.case, form=r.form,
         tol=r.tol, claimed=r.claimed or "", stored=r.status,

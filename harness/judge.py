@@ -15,8 +15,8 @@ from harness.certificate import UncertifiableError, certify
 from harness.kkt import kkt_residuals, verdict
 from harness.measure import Measurement
 from harness.names import CaseName
-from harness.optimum import decided
-from harness.plugin import Case, Reference
+from harness.optimum import Proves, decided
+from harness.plugin import Case
 from harness.qp import QP
 from harness.record import Record, Verdict
 from harness.registry import SolverSpec
@@ -73,11 +73,11 @@ def blank(
 
 
 def judged(
-    record: Record, qp: QP, measurement: Measurement, reference: Reference | None = None
+    record: Record, qp: QP, measurement: Measurement, prove: Proves | None = None
 ) -> Record:
     """Fill in what `measurement` is worth on `qp`, by our own evaluation.
 
-    reference : solves `qp` where residuals cannot decide, see `harness.optimum`
+    prove : finds the optimum of `qp` where residuals cannot decide
     """
     s = measurement.solution
     record = record.but(
@@ -101,8 +101,8 @@ def judged(
         residuals = kkt_residuals(qp, s)
         objective = qp.objective(s.x)
     tol, error = record.accuracy or record.tol, None
-    if reference is not None:
-        error = decided(qp, s, residuals, tol, reference)
+    if prove is not None:
+        error = decided(qp, s, residuals, tol, prove)
     return record.but(
         status=verdict(s.status, residuals, tol, error=error),
         objective=objective,

@@ -159,8 +159,9 @@ def _anew(qp: QP) -> QP:
             )  # fmt: skip
         return M
 
-    parts = ("P", "q", "A", "b", "G", "h", "lb", "ub")
-    return replace(qp, **{name: other(getattr(qp, name)) for name in parts})
+    new = copy(qp)  # not checked once more: that takes longer than a small solve
+    vars(new).update({name: other(part) for name, part in vars(qp).items()})
+    return new
 
 
 def _inner(seconds: float, sample_seconds: float) -> int:

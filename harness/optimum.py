@@ -16,6 +16,7 @@ taken on trust: the bound of |x*ᵢ − x̂ᵢ| (`FAR`), and that x̃ is as near
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,17 +55,22 @@ class Optimum:
     x: Vector  #: (n,) sizes of the variables
 
 
+Proves = Callable[[QP], Optimum | None]
+
+
 def decided(
     qp: QP,
     s: Solution,
     residuals: Residuals,
     tol: float,
-    solve: Reference,
+    prove: Proves,
 ) -> float | None:
     """Measure a point against the proven optimum; None where residuals decide.
 
     They do where they exceed 10·tol even against the most generous scales, where the QP
     is large or its P an operator, or where nothing could be proven.
+
+    prove : finds the optimum, see `proves`
 
     Returns
     -------
@@ -75,9 +81,11 @@ def decided(
     if not is_small(qp):
         return None
     most = allowed(tol)
-    if not min(residuals.worst, kkt_residuals(qp, s, generous=True).worst) <= most:
+    if not (
+        residuals.worst <= most or kkt_residuals(qp, s, generous=True).worst <= most
+    ):
         return None
-    found = proven_optimum(qp, solve)
+    found = prove(qp)
     return None if found is None else error_at(qp, s, found)
 
 
@@ -135,20 +143,14 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     )  # fmt: skip
 
 
-def remembered(solve: Reference) -> Reference:
-    """Solve every QP, told by identity, only once; what was raised is raised again."""
-    known: dict[int, tuple[QP, Solution | Exception]] = {}
+def proves(solve: Reference) -> Proves:
+    """Prove the optimum of every QP, told by identity, only once."""
+    known: dict[int, tuple[QP, Optimum | None]] = {}
 
-    def once(qp: QP) -> Solution:
+    def once(qp: QP) -> Optimum | None:
         if id(qp) not in known:  # the QP is kept, or another could get its id
-            try:
-                known[id(qp)] = qp, solve(qp)
-            except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:
-                known[id(qp)] = qp, e
-        found = known[id(qp)][1]
-        if isinstance(found, Exception):
-            raise found
-        return found
+            known[id(qp)] = qp, proven_optimum(qp, solve)
+        return known[id(qp)][1]
 
     return once
 

@@ -156,6 +156,7 @@ def main(arguments: list[str]) -> None:
             os.read(woken, 4096)
         status = _reap().get(worker)
     end_all(reaper)
+    _reap()  # or they stay in the table of processes where init collects nothing
     _end_as(status)
 
 

@@ -26,6 +26,7 @@ from harness.errors import FaultError
 from harness.history import checked
 from harness.judge import certified, has_point, judged, noted, quantities_of
 from harness.measure import Measurement, one_line
+from harness.optimum import Proves, proves
 from harness.plugin import Case, Reference
 from harness.qp import QP
 from harness.qpfile import save_qp
@@ -68,14 +69,14 @@ def measured(
     *,
     time_limit: float,
     memory_limit: float,
-    reference: Reference,
+    prove: Proves,
 ) -> tuple[Record, Solution | None]:
     """Fill in `record` by one measurement; no solution where the worker ended.
 
     request : to the worker, see `harness.worker`; less what stands in the record.
         The point is in the file ``out`` afterwards, as we have read it
     time_limit, memory_limit : s and MiB
-    reference : solves the QP where residuals cannot decide, see `harness.optimum`
+    prove : finds the optimum where residuals cannot decide, see `harness.optimum`
 
     Raises
     ------
@@ -117,7 +118,7 @@ def measured(
     measurement, *notes = _believed(reply, solution)
     if not notes:
         notes = _cached(measurement, worker.first_seconds, (record.qp, record.tol))
-    record = noted(judged(record, qp, measurement, reference), reply.message, *notes)
+    record = noted(judged(record, qp, measurement, prove), reply.message, *notes)
     return _within(memory_limit, record).but(
         canary_seconds=reply.answer["canary_seconds"]
     ), solution
@@ -282,7 +283,7 @@ def measured_once(
     """Do as `measured`, with a worker for this one measurement and without limits.
 
     command : starts the worker; two file descriptors are appended to it
-    reference : as of `measured`
+    reference : solves the QP where residuals cannot decide
 
     Raises
     ------
@@ -304,7 +305,7 @@ def measured_once(
         }
         once = partial(
             measured, worker, case.qp, record, request,
-            time_limit=inf, memory_limit=inf, reference=reference,
+            time_limit=inf, memory_limit=inf, prove=proves(reference),
         )  # fmt: skip
         try:
             record, solution = once()

@@ -17,6 +17,7 @@ from harness.errors import FaultError
 from harness.judge import has_point, noted
 from harness.measure import SAMPLE_SECONDS
 from harness.names import CaseName
+from harness.optimum import Optimum, proven_optimum
 from harness.qp import QP
 from harness.qpfile import load_qp
 from harness.recipe import NO_MAKERS, Maker
@@ -26,7 +27,7 @@ from harness.solution import Solution, Status
 from harness.store import point_arrays, read_arrays, read_point
 from harness.supervisor import WorkerProcess
 
-_MOST_SOLVED = 1000  #: small QPs whose reference solutions are kept
+_MOST_PROVEN = 1000  #: small QPs whose optima are kept
 
 
 class Station:
@@ -52,7 +53,7 @@ class Station:
         self._workers: dict[str, WorkerProcess] = {}
         self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
         self._loaded: dict[str, QP] = {}  # theirs, by digest
-        self._solved: dict[str, Solution | None] = {}  # small QPs, by digest
+        self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
 
     def __enter__(self) -> Self:
         return self
@@ -139,7 +140,7 @@ class Station:
                 request,
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
-                reference=partial(self._reference, at),
+                prove=partial(self._optimum, at),
             )
             if record.status in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self._scratch, "")  # whatever it died of
@@ -209,8 +210,17 @@ class Station:
             raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
         return reply.answer
 
+    def _optimum(self, at: Entry, qp: QP) -> Optimum | None:
+        """Prove the optimum of the QP of an entry, once."""
+        if at.digest not in self._optima:
+            found = proven_optimum(qp, partial(self._reference, at))
+            while len(self._optima) >= _MOST_PROVEN:
+                del self._optima[next(iter(self._optima))]
+            self._optima[at.digest] = found
+        return self._optima[at.digest]
+
     def _reference(self, at: Entry, qp: QP) -> Solution:
-        """Have the generator solve the QP of an entry by the reference, once.
+        """Have the generator solve the QP of an entry by the reference.
 
         Raises
         ------
@@ -220,22 +230,14 @@ class Station:
             When it died, or a file between us failed.
 
         """
-        if at.digest not in self._solved:
-            point = self._scratch / "reference.npz"
-            request = {"solve": str(at.qp), "point": str(point)}
-            reply = self._generator.ask(request, time_limit=inf, memory_limit=inf)
-            if reply.answer is None:
-                raise FaultError(f"the reference solve failed: {reply.message}")
-            while len(self._solved) >= _MOST_SOLVED:
-                del self._solved[next(iter(self._solved))]
-            found = reply.answer["found"]
-            self._solved[at.digest] = (
-                read_point(point, Status.SOLVED) if found else None
-            )
-        solution = self._solved[at.digest]
-        if solution is None:
+        point = self._scratch / "reference.npz"
+        request = {"solve": str(at.qp), "point": str(point)}
+        reply = self._generator.ask(request, time_limit=inf, memory_limit=inf)
+        if reply.answer is None:
+            raise FaultError(f"the reference solve failed: {reply.message}")
+        if not reply.answer["found"]:
             raise ArithmeticError("the reference solve found no solution")
-        return solution
+        return read_point(point, Status.SOLVED)
 
     def _worker(self, label: str) -> WorkerProcess:
         if label not in self._workers:

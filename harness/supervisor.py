@@ -47,6 +47,7 @@ START_SECONDS = 120.0  #: for imports, and for loading a QP
 WARM_UP_SECONDS = 60.0
 POINT_SECONDS = 120.0  #: to write the point of an answer
 CLOSE_SECONDS = 1.0
+END_SECONDS = 1.0  #: for the sub-reaper to end when all below it are dead
 SETTLE_SECONDS = 0.5  #: after an answer: threads of pools go to sleep within that
 BUSY = 0.5  #: share of the time between answer and request that is too much CPU time
 LEAST_BUSY_SECONDS = 0.01  #: CPU time between answer and request that is nothing
@@ -492,10 +493,13 @@ class WorkerProcess:
         """End all processes, and remove what they left in shared memory."""
         if self._process is not None:
             reaper.end_all(self._process.pid, mark=self._mark)
-            self._process.kill()
             if self._process.stdin is not None:
-                self._process.stdin.close()
-            self._process.wait()
+                self._process.stdin.close()  # the sub-reaper collects the dead and ends
+            try:
+                self._process.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:  # a solver has stopped it
+                self._process.kill()
+                self._process.wait()
             self._footprint.remove_files()
         self._process = None
         self._worker, self._is_stopped, self._was_busy = 0, False, False

@@ -20,6 +20,7 @@ from harness.journal import read_journal
 from harness.judge import blank
 from harness.measure import SAMPLE_SECONDS
 from harness.names import CaseName
+from harness.optimum import proves
 from harness.qpfile import save_qp
 from harness.reaper import lives
 from harness.registry import SolverSpec, load_plugin, resolve
@@ -175,7 +176,7 @@ class Bench:
         worker = self.workers[solver]
         return measured(
             worker, self.qp, record, request, time_limit=time_limit,
-            memory_limit=self.memory_limit, reference=reference_solution,
+            memory_limit=self.memory_limit, prove=proves(reference_solution),
         )[0]  # fmt: skip
 
     def process(self, solver):

@@ -16,6 +16,7 @@ from harness.cli import main
 from harness.journal import Journal, read_journal
 from harness.progress import shown_on
 from harness.qpfile import load_qp
+from harness.reaper import lives
 from harness.registry import load_plugin
 from harness.workbench import Workbench
 
@@ -298,7 +299,7 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
-    assert not Path(f"/proc/{started.read_text()}").exists()
+    assert not lives(int(started.read_text()))
 
 
 def test_what_a_plugin_prints_is_no_result(cli, pit):

@@ -10,7 +10,7 @@ from harness.hard import KINDS, hard
 from harness.judge import judged
 from harness.kkt import Residuals, rejudged, widths
 from harness.measure import Measurement
-from harness.optimum import decided, proven_optimum, remembered
+from harness.optimum import decided, proven_optimum, proves
 from harness.record import Record
 from solvers.reference import reference_solution
 
@@ -142,7 +142,9 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
 def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
     assert kkt_residuals(WEAK, SHORT).worst <= 10 * TOL
 
-    measured = judged(blank(), WEAK, Measurement(solution=SHORT), reference_solution)
+    measured = judged(
+        blank(), WEAK, Measurement(solution=SHORT), proves(reference_solution)
+    )
 
     assert measured.status is Verdict.WRONG
     assert measured.decided_by == "reference"
@@ -180,7 +182,9 @@ def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
     broken = replace(s, **{name: np.full_like(getattr(s, name), np.nan)})
     assert judge(qp, s) is Verdict.VERIFIED
 
-    measured = judged(blank(), qp, Measurement(solution=broken), reference_solution)
+    measured = judged(
+        blank(), qp, Measurement(solution=broken), proves(reference_solution)
+    )
 
     assert measured.status is Verdict.WRONG
 
@@ -191,7 +195,7 @@ def test_where_the_reference_fails_residuals_stand():
 
     residuals = kkt_residuals(NEARLY, BETWEEN)
 
-    assert decided(NEARLY, BETWEEN, residuals, TOL, fails) is None
+    assert decided(NEARLY, BETWEEN, residuals, TOL, proves(fails)) is None
 
 
 def test_a_false_reference_proves_nothing():
@@ -204,7 +208,7 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
     qp = qp_of([1, 0], [0, -0.5], A=[[1, 0]], b=[1], lb=[-INF, 1], ub=[INF, 1])
     s = at([1 + 1e-9, 1], [-1 - 1e-9], z_box=[0, 0.5])
 
-    error = decided(qp, s, kkt_residuals(qp, s), TOL, reference_solution)
+    error = decided(qp, s, kkt_residuals(qp, s), TOL, proves(reference_solution))
 
     assert error == pytest.approx(1e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
@@ -247,11 +251,11 @@ class Attack:
     def __init__(self, planted, rng):
         self.qp, self.s, self.value = planted.qp, planted.solution, planted.value
         self.rng = rng
-        self.reference = remembered(reference_solution)
+        self.prove = proves(reference_solution)
 
     def verified(self, s):
         residuals = kkt_residuals(self.qp, s)
-        error = decided(self.qp, s, residuals, TOL, self.reference)
+        error = decided(self.qp, s, residuals, TOL, self.prove)
         found = verdict(Status.SOLVED, residuals, TOL, error=error)
         return found is Verdict.VERIFIED
 
