@@ -135,8 +135,8 @@ def _box(figure: Figure) -> Bbox:
     """
     if figure not in _BOXES:
         with rc_context(STYLE):
-            if figure.get_layout_engine() is not None:
-                figure.draw_without_rendering()
+            if (engine := figure.get_layout_engine()) is not None:
+                engine.execute(figure)
                 with rc_context(_LAID_OUT):
                     figure.set_layout_engine(None)
             canvas, pad = FigureCanvasAgg(figure), float(rcParams["savefig.pad_inches"])

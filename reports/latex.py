@@ -21,6 +21,9 @@ _SPECIAL = {
     "\0": "{}",
 }  # fmt: skip
 
+#: text that needs no escape
+_PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
+
 
 def latex(tables: tuple[Table, ...]) -> str:
     r"""Render tables one after the other; they need \usepackage{booktabs} only.
@@ -75,6 +78,8 @@ def escaped(text: str) -> str:
     A leading bracket is braced: after a row's end TeX would read an optional argument.
     So are hyphens in a row, which TeX would join to dashes.
     """
+    if _PLAIN.fullmatch(text):  # most cells of a large report
+        return text
     hyphens = re.sub("-(?=-)", "-\0", text)
     safe = "".join(_SPECIAL.get(c) or _known(c) for c in hyphens)
     return f"{{}}{safe}" if safe.startswith(("[", "*")) else safe

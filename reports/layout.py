@@ -105,7 +105,8 @@ def named(title: str) -> list[str]:
 
 def short(run_id: str) -> str:
     """Print a run_id; ours are short, those of a foreign journal may not be."""
-    return clean(run_id, 40)
+    is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
+    return run_id if is_ours else clean(run_id, 40)
 
 
 def verdict_cell(outcome: Outcome, after: str = "") -> Cell:

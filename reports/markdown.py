@@ -9,6 +9,8 @@ from reports.layout import Cell, Page, Section, Table
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
 _LIST = re.compile(r"^(\d*)([-+.)])(?=\s)")
+#: what has none of all these, as most cells of a large report, stays as it is
+_ANY = re.compile(r"[&<>\\`*_\[\]|~#$@]|://|www\.|^\d*[-+.)]\s", re.IGNORECASE)
 
 
 def markdown(page: Page) -> str:
@@ -50,6 +52,8 @@ def _cell(cell: Cell) -> str:
 
 def escaped(text: str) -> str:
     """Escape what Markdown or HTML would read as markup, or make a link or list of."""
+    if not _ANY.search(text):
+        return text
     safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     safe = _MARKUP.sub(r"\\\1", safe)
     safe = _LINK.sub(r"\\\g<0>", safe)

@@ -49,8 +49,10 @@ def texts(values: Iterable[Any]) -> list[str | None]:
     known: dict[int, str] = {}  # by identity: a journal's records share their tables
 
     def text(value: Any) -> str | None:
+        if value is None or type(value) is str:
+            return value
         if not isinstance(value, Mapping | list):
-            return None if value is None else str(value)  # a verdict, plainly
+            return str(value)  # a verdict, plainly
         if id(value) not in known:
             known[id(value)] = json.dumps(finite(value), ensure_ascii=False)
         return known[id(value)]

@@ -175,10 +175,11 @@ def _quantities(
         return None
     rows = []
     for best, answers in chosen:
-        peers = [o for o in answers if o.tol == best.tol]
+        own = leaves(best, sizes=sizes)
+        peers = [leaves(o, sizes=sizes) for o in answers if o.tol == best.tol]
         which = f"{_who(best)}, {power(best.worst)} at tol {tolerance(best.tol)}"
         answer = Cell(text=which, kind="words", title=source(best))
-        cells = [quantity(path, best, peers) for path in paths]
+        cells = [quantity(path, best, own.get(path), peers) for path in paths]
         rows.append((name_cell(best.physical), *cells, *([] if sizes else [answer])))
     what = "Sizes" if sizes else "Physical results"
     return Table(

@@ -33,6 +33,9 @@ class Leaf(NamedTuple):
     scale: float  #: its size, of a component that of its vector
 
 
+Leaves = dict[tuple[str, ...], Leaf]  #: by path
+
+
 def elastic(outcome: Outcome) -> bool:
     """Whether quantities are in SI units: those of elastic bodies are."""
     return _STRESS in outcome.quantities
@@ -53,7 +56,7 @@ def known_digits(doubt: float, most: int) -> int:
     return min(max(math.floor(-math.log10(doubt)) + 1, 1), most)
 
 
-def leaves(outcome: Outcome, *, sizes: bool) -> dict[tuple[str, ...], Leaf]:
+def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
     """List every scalar by its path, vectors by component, in their order."""
     found: dict[tuple[str, ...], Leaf] = {}
     for name, value in outcome.quantities.items():
@@ -87,15 +90,19 @@ def head(path: tuple[str, ...], outcomes: Sequence[Outcome]) -> str:
     return f"{words} in {only}" if only else words
 
 
-def quantity(path: tuple[str, ...], best: Outcome, answers: Sequence[Outcome]) -> Cell:
-    """Print what the best answer says, in so many digits as all `answers` bear out."""
-    sizes = path[0] in SIZES
-    leaf = leaves(best, sizes=sizes).get(path)
+def quantity(
+    path: tuple[str, ...], best: Outcome, leaf: Leaf | None, peers: Sequence[Leaves]
+) -> Cell:
+    """Print what the best answer says, in so many digits as all answers bear out.
+
+    leaf : of the best answer, if it has one there
+    peers : all leaves of each answer
+    """
     if leaf is None or leaf.value is None or isinstance(leaf.value, bool):
         return Cell()
     if not isinstance(leaf.value, int | float):
         return Cell(text=clean(str(leaf.value), 40), kind="words")
-    others = [leaves(o, sizes=sizes).get(path) for o in answers]
+    others = [found.get(path) for found in peers]
     values = [
         o.value
         for o in others
