@@ -36,8 +36,17 @@ from harness.qpfile import load_qp, save_qp
 from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.serving import Events, answer_requests
-from harness.solution import Status
-from harness.store import field_arrays, read_point, write_arrays, write_point
+from harness.solution import Solution, Status
+from harness.store import (
+    digest_of,
+    field_arrays,
+    point_arrays,
+    read_point,
+    write_arrays,
+    write_point,
+)
+
+MOST_CERTIFIED = 10_000  #: points whose bounds are kept
 
 
 class Generator:
@@ -54,6 +63,9 @@ class Generator:
         self._reference = reference
         self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
         self._build_seconds = 0.0  # of the last case that was built
+        self._bounds: dict[
+            tuple[str, str], tuple[dict[str, Any], str]
+        ] = {}  # certified
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request, whatever the family's code does."""
@@ -67,7 +79,49 @@ class Generator:
             return {"unbuilt": text, "trace": traceback.format_exc()}
         if "build" in request:
             return self._written(case, name, Path(request["qp"]))
-        return _described(case, request)
+        return self._described(case, name, request)
+
+    def _described(
+        self, case: Case, name: CaseName, request: dict[str, Any]
+    ) -> dict[str, Any]:
+        s = read_point(Path(request["point"]), Status.SOLVED)
+        start = perf_counter()
+        quantities, note = quantities_of(case, s)
+        seconds = perf_counter() - start
+        bounds, objection = self._certified(case, name, s)
+        notes = [text for text in (note, objection) if text]
+        if request["fields"] is not None and case.fields is not None:
+            try:
+                fields = field_arrays(case.fields(s))
+            except Exception as e:  # the family's code; it must not lose the record
+                notes.append(note_of("fields", e))
+            else:
+                write_arrays(Path(request["fields"]), fields)
+        return {
+            "quantities": quantities,
+            "bounds": finite(bounds),
+            "notes": notes,
+            "seconds": seconds,
+        }
+
+    def _certified(
+        self, case: Case, name: CaseName, s: Solution
+    ) -> tuple[dict[str, Any], str]:
+        """Bound the error of a point; one that came before is not certified again.
+
+        Most solvers give the same digits at each repeat. Only the first takes time, and
+        only its record has a `certify_seconds`.
+        """
+        key = canonical(name, self._families[name.family]), digest_of(point_arrays(s))
+        if key in self._bounds:
+            bounds, objection = self._bounds[key]
+            return {
+                k: v for k, v in bounds.items() if k != "certify_seconds"
+            }, objection
+        while len(self._bounds) >= MOST_CERTIFIED:
+            del self._bounds[next(iter(self._bounds))]
+        self._bounds[key] = certified(case, s)
+        return self._bounds[key]
 
     def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
@@ -114,25 +168,3 @@ def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
         return generator.answer(request)
 
     answer_requests(handle, lambda: None, request_fd, reply_fd)
-
-
-def _described(case: Case, request: dict[str, Any]) -> dict[str, Any]:
-    s = read_point(Path(request["point"]), Status.SOLVED)
-    start = perf_counter()
-    quantities, note = quantities_of(case, s)
-    seconds = perf_counter() - start
-    bounds, objection = certified(case, s)
-    notes = [text for text in (note, objection) if text]
-    if request["fields"] is not None and case.fields is not None:
-        try:
-            fields = field_arrays(case.fields(s))
-        except Exception as e:  # the family's code; its fault must not lose the record
-            notes.append(note_of("fields", e))
-        else:
-            write_arrays(Path(request["fields"]), fields)
-    return {
-        "quantities": quantities,
-        "bounds": finite(bounds),
-        "notes": notes,
-        "seconds": seconds,
-    }

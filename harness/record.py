@@ -93,7 +93,7 @@ class Record:
         None  #: part of build: factor, dual; dual forms only
     )
     recover_seconds: float | None = None  #: from the point to quantities
-    certify_seconds: float | None = None  #: from the point to energy_bound
+    certify_seconds: float | None = None  #: from a new point to energy_bound
     canary_seconds: float | None = None  #: a fixed kernel, just before: drift
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to

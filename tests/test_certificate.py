@@ -9,13 +9,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import Mechanics, Solution, Status, UncertifiableError, certify
+from harness import Mechanics, Solution, Status, UncertifiableError, certify, generator
 from harness.build import build
 from harness.certificate import Certificate
-from harness.judge import has_point
+from harness.judge import certified, has_point
 from harness.mechanics import Extended, Real
 from harness.names import parse
 from harness.references import ReferencePoint, reference_point
+from harness.store import write_point
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference import reference_solution
@@ -254,3 +255,31 @@ def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
         assert again.bound < 1e-8
     stored.write_bytes(b"PK")
     assert reference_point(mechanics, reference_solution, tmp_path).bound < 1e-8
+
+
+def test_the_same_point_is_certified_once_and_another_one_anew(tmp_path, monkeypatch):
+    calls = []
+
+    def counted(case, s):
+        calls.append(s)
+        return certified(case, s)
+
+    monkeypatch.setattr(generator, "certified", counted)
+    name = parse("beam-ring/Nr=4/Nh=3/step=1/dual", PROBLEMS)
+    of = {"family": name.family, "params": dict(name.params), "form": name.form}
+    at = {"describe": of, "point": str(tmp_path / "s.npz"), "fields": None, "keep": 1}
+    made = generator.Generator(PROBLEMS, reference_solution)
+    qp = build(name, PROBLEMS[name.family], reference_solution).qp
+    s = SOLVERS["clarabel"].prepare(qp, 1e-8)()
+
+    def bounds(point):
+        write_point(tmp_path / "s.npz", point)
+        return made.answer(dict(at))["bounds"]
+
+    first, again = bounds(s), bounds(s)
+    other = bounds(replace(s, x=s.x * (1 + 1e-3)))
+
+    assert len(calls) == 2
+    assert first.pop("certify_seconds") > 0
+    assert again == first
+    assert other["energy_bound"] > 10 * first["energy_bound"]
