@@ -1,6 +1,7 @@
 """No wrong answer is verified, no right one refuted: by hand, then by search."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from harness.hard import KINDS, hard
 from harness.judge import judged
 from harness.kkt import Residuals, rejudged, widths
 from harness.measure import Measurement
-from harness.optimum import decided, proven_optimum, proves
+from harness.optimum import decided, exact_value, proven_optimum, proves
 from harness.record import Record
 from solvers.reference import reference_solution
 
@@ -201,6 +202,34 @@ def test_where_the_reference_fails_residuals_stand():
 def test_a_false_reference_proves_nothing():
     assert proven_optimum(FAR, lambda _: at([1, 1], [0])) is None
     assert proven_optimum(COSTLY, lambda _: at([0, 0], z_box=[-1e9, 0])) is None
+
+
+CANCELLED = (  # f* = 2⁻²⁰ between terms of 50 to 1400; some multipliers are not unique
+    (("cancelled", "far bounds", "free direction"), 360818169),
+    (("cancelled", "fixed", "redundant"), 879083487),
+    (("big-M", "cancelled", "fixed"), 878510873),
+    (("cancelled", "duplicates", "redundant"), 716254695),
+)
+
+
+@pytest.mark.parametrize(("kinds", "number"), CANCELLED)
+def test_what_is_left_when_terms_cancel_is_known_exactly(kinds, number):
+    planted = hard(frozenset(kinds), number)
+    attack = Attack(planted, np.random.default_rng(1))
+
+    assert exact_value(planted.qp, reference_solution(planted.qp)) == 2.0**-20
+    passed = [s for s in attack.points(100) if attack.verified(s)]
+    assert passed
+    assert max(attack.error(s) for s in passed) <= 1e-3
+    assert all(attack.verified(attack.rounded()) for _ in range(5))
+
+
+def test_a_point_that_is_no_optimum_has_no_exact_value():
+    qp = qp_of(np.eye(2), [-1, -1], A=[[1, 1]], b=[1], ub=[1e7, 1e7])
+    right, wrong = at([0.5, 0.5], [0.5]), at([1e7, 0], [0], z_box=[1, 0])
+
+    assert exact_value(qp, right) == Fraction(-3, 4)
+    assert exact_value(qp, wrong) is None  # the bound would pull
 
 
 def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
