@@ -15,6 +15,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import isinf
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
@@ -110,7 +111,9 @@ def read_json(path: Path, expected: str = "a JSON file") -> Any:
     """Read and parse a JSON file."""
     text = read_text(path, expected, MOST_JSON)
     try:
-        data = json.loads(text, parse_constant=_no_constant)
+        data = json.loads(
+            text, parse_constant=_no_constant, parse_int=_integer, parse_float=_number
+        )
         _refuse_deep(data)
     except json.JSONDecodeError as e:
         raise InputError(
@@ -145,6 +148,17 @@ def _too_deep() -> InputError:
 
 def _no_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is no number in JSON")
+
+
+def _integer(text: str) -> int:
+    _number(text)
+    return int(text)
+
+
+def _number(text: str) -> float:
+    if isinf(value := float(text)):
+        raise ValueError(f"{text[:20]}… is beyond the range of a double")
+    return value
 
 
 def _limit(most: float) -> float:
