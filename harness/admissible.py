@@ -165,7 +165,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
     Nearest relative to their sizes, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ with wᵢ ≈ λᵢ: what balances the
     load must not act across wide gaps, where it would do work. Along motions that λ
     does not hold, see `held_and_loose`, the load has to vanish up to its rounding, or
-    else all rows have to help.
+    else all rows have to help, in the end each as much as any other.
 
     Raises
     ------
@@ -188,15 +188,13 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
         motions.KR.T @ u,
     )
     w = relative(multipliers)
-    found = problem.solved(multipliers, w)
-    if found is None:
-        found = problem.solved(multipliers, w + 1e-6)
-    if found is None:
-        raise UncertifiableError(
-            "contact would have to pull to balance the load: some body is driven away "
-            "from all that touches it, and no support holds it"
-        )
-    return found
+    for shares in (w, w + 1e-6, np.ones_like(w)):
+        if (found := problem.solved(multipliers, shares)) is not None:
+            return found
+    raise UncertifiableError(
+        "contact would have to pull to balance the load: some body is driven away "
+        "from all that touches it, and no support holds it"
+    )
 
 
 def _driven(mechanics: Mechanics) -> str | None:

@@ -317,3 +317,13 @@ def test_balance_is_not_sought_beyond_what_rounding_allows():
     found = _newton(lam, lam, G, load, lambda lam: np.abs(G).T @ lam)
     assert found is not None
     assert (found == lam).all()
+
+
+@pytest.mark.parametrize("name", ["disc under rollers", "stiff disc"])
+def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
+    """Contact pushes, but not where the answer says: that is no reason for a null."""
+    mechanics, u, lam, _ = known(name)
+    rng = np.random.default_rng(sum(map(ord, name)))
+    s = answer(u, lam)
+    for _ in range(40):
+        assert certify(mechanics, _swapped_rows(mechanics, s, 1e-6, rng)).bound > 0
