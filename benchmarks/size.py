@@ -20,7 +20,7 @@ from problems.bodies import clamped, floating
 from problems.contact import node_to_segment
 from problems.dual import dual_bounds, dualise
 from problems.stepping import primal_qp
-from solvers.smalbe import SMALBE
+from solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
 

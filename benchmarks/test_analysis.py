@@ -14,7 +14,7 @@ from problems.bodies import clamped, floating
 from problems.contact import node_to_segment
 from problems.dual import dual_bounds, dualise
 from problems.stepping import LoadPath
-from solvers.smalbe import SMALBE
+from solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
 TIP = [0.04101815, -0.29791196]  #: m, see tests/test_beam_ring.py

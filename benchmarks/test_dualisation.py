@@ -6,7 +6,7 @@ import pytest
 from problems.beam_ring import BeamRing, model
 from problems.bodies import floating
 from problems.dual import dualise
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from problems.bodies import clamped, floating
 from problems.contact import node_to_segment
 from problems.dual import dualise
 from problems.elasticity import elasticity_matrix, stiffness
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 SIZES = pytest.mark.parametrize(("Nr", "Nh"), [(12, 6), (30, 15)])
 

@@ -10,10 +10,10 @@ import pytest
 from harness import Status, kkt_residuals
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.outer import first_iterate
-from solvers.products import product
-from solvers.projected import by_lanczos, projected_problem
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.outer_loop import first_iterate
+from solvers.smalbe.products import product
+from solvers.smalbe.projected import by_lanczos, projected_problem
 
 #: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8
 PERMON = {

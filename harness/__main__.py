@@ -17,7 +17,7 @@ from harness.supervisor import ONE_THREAD
 from harness.workbench import Workbench
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 if TYPE_CHECKING:
     from harness.discretisation import Discretisation

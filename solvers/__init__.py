@@ -1,24 +1,24 @@
 """Every solver of the comparison, one line each."""
 
 from harness import Solver
-from solvers.bvls_ import BVLS
-from solvers.clarabel_ import Clarabel
-from solvers.cvxopt_ import CVXOPT
-from solvers.cvxpy_ import CVXPY
-from solvers.daqp_ import DAQP
-from solvers.highs_ import HiGHS
-from solvers.osqp_ import OSQP
-from solvers.pdas import PDAS
-from solvers.piqp_ import PIQP
-from solvers.projected_gradient import ProjectedGradient
-from solvers.proxqp_ import ProxQP
-from solvers.qoco_ import QOCO
-from solvers.qpalm_ import QPALM
-from solvers.qpsolvers_ import QPSolvers
-from solvers.qtqp_ import QTQP
-from solvers.quadprog_ import Quadprog
-from solvers.scs_ import SCS
-from solvers.smalbe import CONDENSED, ESPRESO, PAPER, PERMON, SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.adapters.cvxopt_ import CVXOPT
+from solvers.adapters.cvxpy_ import CVXPY
+from solvers.adapters.daqp_ import DAQP
+from solvers.adapters.highs_ import HiGHS
+from solvers.adapters.osqp_ import OSQP
+from solvers.adapters.piqp_ import PIQP
+from solvers.adapters.proxqp_ import ProxQP
+from solvers.adapters.qoco_ import QOCO
+from solvers.adapters.qpalm_ import QPALM
+from solvers.adapters.qpsolvers_ import QPSolvers
+from solvers.adapters.qtqp_ import QTQP
+from solvers.adapters.quadprog_ import Quadprog
+from solvers.adapters.scs_ import SCS
+from solvers.baselines.bvls import BVLS
+from solvers.baselines.pdas import PDAS
+from solvers.baselines.projected_gradient import ProjectedGradient
+from solvers.smalbe.solver import CONDENSED, ESPRESO, PAPER, PERMON, SMALBE
 
 SOLVERS: dict[str, Solver] = {
     "smalbe": SMALBE(),

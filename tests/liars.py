@@ -10,8 +10,8 @@ from scipy.sparse import eye_array, tril
 
 from harness import QP, Case, Solution, Status, no_rows
 from harness.planted import membrane
-from solvers.conversion import csc
-from solvers.reference import reference_solution
+from solvers.common.conversion import csc
+from solvers.reference.solve import reference_solution
 
 
 @dataclass(frozen=True)

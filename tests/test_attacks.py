@@ -29,7 +29,7 @@ from harness.run import run
 from harness.serving import ForeignReplyError, checked_answer, event_of
 from harness.suite import Suite
 from harness.supervisor import REPLACED, Clock, Reply, WorkerProcess
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 PLUGIN = Path(__file__).with_name("attackers.py")
 START = [sys.executable, "-P", str(PLUGIN)]

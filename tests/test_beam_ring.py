@@ -14,11 +14,11 @@ from problems.contact import node_to_segment
 from problems.dual import dual_bounds, dualise
 from problems.stepping import primal_qp
 from solvers import SOLVERS
-from solvers.clarabel_ import Clarabel
-from solvers.osqp_ import OSQP
-from solvers.proxqp_ import ProxQP
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.adapters.osqp_ import OSQP
+from solvers.adapters.proxqp_ import ProxQP
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 FAMILY = BeamRing()
 

@@ -8,8 +8,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
 from harness import QP, Status, kkt_residuals, no_rows
-from solvers import bvls_
-from solvers.bvls_ import BVLS
+from solvers.baselines import bvls
+from solvers.baselines.bvls import BVLS
 
 
 def boxed(P, q, lb=-np.inf, ub=np.inf):
@@ -61,7 +61,7 @@ def test_what_it_cannot_take_is_declined(planted, monkeypatch):
     assert BVLS().declines(planted("equalities")[0]) == "takes bounds only"
     assert BVLS().declines(operator) == "needs explicit matrices"
     assert BVLS().declines(singular) == "needs a positive definite P"
-    monkeypatch.setattr(bvls_, "LARGEST", 19)
+    monkeypatch.setattr(bvls, "LARGEST", 19)
     assert BVLS().declines(qp) == "makes P dense; takes at most 19 components"
 
 

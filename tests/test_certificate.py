@@ -19,7 +19,7 @@ from harness.references import ReferencePoint, reference_point
 from harness.store import write_point
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",

@@ -19,7 +19,7 @@ from harness.names import parse
 from harness.references import reference_point
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 from tests.held_by_contact import disc_between_plates, stored_solution
 
 ROUNDED = 1 + 1e-9

@@ -28,7 +28,7 @@ from harness.truth import Given, truth_of
 from harness.workbench import Workbench
 from problems import PROBLEMS
 from reports.validation import write_validation
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 LIARS = Path(__file__).with_name("liars.py")
 PLUGIN = load_plugin(LIARS)

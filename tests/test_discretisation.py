@@ -26,7 +26,7 @@ from harness.references import reference_point
 from problems import PROBLEMS
 from problems.hertz import halved
 from problems.obstacle import exact_energy, exact_height, obstacle_problem
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 
 def levels(*distances, bound=1e-9):

@@ -8,7 +8,7 @@ from harness.describe import about, solvers_page
 from harness.registry import load_plugin
 from problems.beam_ring import BeamRing
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 ROOT = Path(__file__).parents[1]
 
@@ -38,7 +38,7 @@ def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
     shown, _ = re.findall(
         r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
     )
-    assert shown == (ROOT / "solvers/piqp_.py").read_text()
+    assert shown == (ROOT / "solvers/adapters/piqp_.py").read_text()
 
 
 def test_the_page_of_solvers_is_up_to_date():

@@ -14,8 +14,8 @@ from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffn
 from problems.fixing import fixing_nodes, spectral_fixing_nodes
 from problems.inverse import floating_inverse, regular_inverse
 from problems.mesh import dofs_of, half_ring, join, rectangle
-from solvers.clarabel_ import Clarabel
-from solvers.reference import reference_solution
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
 
 D = elasticity_matrix(Material(E=2e3, nu=0.3), "strain")
 BEAM = rectangle((0, 0.5), (2, 0.25), (24, 3))

@@ -7,9 +7,9 @@ import pytest
 from scipy.sparse import bsr_array, coo_array, csr_array, dia_array
 
 from harness import QP, Status, kkt_residuals, no_rows
-from solvers.elimination import eliminate_free
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.elimination import eliminate_free
+from solvers.smalbe.solver import SMALBE
 
 EXACT = SMALBE(eliminate="never")
 

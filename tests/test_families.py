@@ -8,7 +8,7 @@ from harness.cli import main
 from harness.workbench import Workbench
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 CASES = [
     (name, form)

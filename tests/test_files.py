@@ -19,7 +19,7 @@ from problems import PROBLEMS
 from problems.qps import parse_qps
 from problems.twosided import one_sided
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 #: the example of Maros and Mészáros's report, with every kind of row, range and bound
 QPS = """\

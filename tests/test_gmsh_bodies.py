@@ -15,7 +15,7 @@ from problems.description import described_bodies
 from problems.mesh import nodal_lengths
 from problems.msh import read_msh
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 NR, NH = 2, 1
 RING = model(NR, NH, 2, "strain")

@@ -8,9 +8,9 @@ from scipy.integrate import quad
 
 from harness import InputError, kkt_residuals
 from problems.hertz import HertzCylinder, HertzPlane, LineContact, two_cylinders
-from solvers.clarabel_ import Clarabel
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 PLANE, CYLINDER = HertzPlane(), HertzCylinder()
 SOLVERS = {"dual": SMALBE(), "primal": Clarabel()}

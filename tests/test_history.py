@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from solvers import SOLVERS
-from solvers.certify import STEPS
-from solvers.history import COLUMNS
+from solvers.smalbe.driver import STEPS
+from solvers.smalbe.history import COLUMNS
 
 PRESETS = [
     "smalbe",

@@ -27,7 +27,7 @@ from harness.workbench import Workbench
 from problems import PROBLEMS
 from problems.msh import read_msh
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 from tests.fuzzing import MSH_41, QPS, fuzz, msh_22, tiny_qp
 
 ADDRESS_SPACE = 2**29  #: bytes that refusing may take at most

@@ -14,7 +14,7 @@ from harness.workbench import Workbench
 from problems import PROBLEMS
 from reports import write_report
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 from tests.test_hostile_files import hostile
 
 SUITE = 'name = "s"\nsolvers = ["clarabel"]\n[[problems]]\nfamily = "file"\n'

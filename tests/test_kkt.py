@@ -19,11 +19,11 @@ from harness import (
 )
 from harness.planted import planted
 from problems.beam_ring import BeamRing
-from solvers.clarabel_ import Clarabel
-from solvers.osqp_ import OSQP
-from solvers.proxqp_ import ProxQP
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.adapters.osqp_ import OSQP
+from solvers.adapters.proxqp_ import ProxQP
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 
 def one_variable(q=1.0, h=0.0):

@@ -18,7 +18,7 @@ from harness.metamorphic import (
     shift_unknowns,
 )
 from harness.planted import FORMS, SHAPES, strings
-from solvers.piqp_ import PIQP
+from solvers.adapters.piqp_ import PIQP
 
 
 def drawn():

@@ -10,8 +10,8 @@ from problems.emit import contact_case
 from problems.linearise import linearisation
 from problems.results import quantities
 from problems.stepping import LoadPath
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
 STEPS = 3

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from solvers import kernels
-from solvers.model import Model
-from solvers.mprgp import EXPANSIONS, Point, Rules, mprgp, split
-from solvers.spectrum import power_method
+from solvers.smalbe import kernels
+from solvers.smalbe.model import Model
+from solvers.smalbe.mprgp import EXPANSIONS, Point, Rules, mprgp, split
+from solvers.smalbe.spectrum import power_method
 
 MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 

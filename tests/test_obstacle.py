@@ -5,9 +5,9 @@ import pytest
 
 from harness import InputError, kkt_residuals
 from problems.obstacle import Obstacle, exact_energy, exact_height, obstacle_problem
-from solvers.clarabel_ import Clarabel
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 FAMILY = Obstacle()
 TOL = 1e-11

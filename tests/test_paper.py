@@ -40,8 +40,8 @@ from reports.paper.samples import curve, fit, medians
 from reports.paper.stepping import errors, order
 from reports.paper.stress import extent
 from reports.paper.tables import PARTS
-from solvers.reference import reference_solution
-from solvers.smalbe import PAPER, SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import PAPER, SMALBE
 
 #: it measures and draws once: one process has all of it
 pytestmark = pytest.mark.xdist_group("paper")

@@ -6,9 +6,9 @@ import pytest
 from harness import InputError, kkt_residuals
 from problems.mesh import as_vectors
 from problems.patch import ContactPatch, model
-from solvers.clarabel_ import Clarabel
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 FAMILY = ContactPatch()
 SOLVERS = {"dual": (SMALBE(), 1e-13), "primal": (Clarabel(), 1e-11)}

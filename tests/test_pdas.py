@@ -10,9 +10,9 @@ from scipy.sparse.linalg import aslinearoperator
 from harness import QP, Status, kkt_residuals, no_rows
 from harness.names import parse
 from problems import PROBLEMS
-from solvers.certificate import contradicts, descends
-from solvers.pdas import PDAS
-from solvers.reference import reference_solution
+from solvers.baselines.infeasibility_certificate import contradicts, descends
+from solvers.baselines.pdas import PDAS
+from solvers.reference.solve import reference_solution
 
 
 def quadratic(

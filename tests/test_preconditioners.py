@@ -9,10 +9,10 @@ from scipy.sparse import csr_array
 from harness import QP, Status, Structure, kkt_residuals, no_rows
 from harness.qpfile import load_qp, save_qp
 from problems import PROBLEMS
-from solvers.preconditioner import face_preconditioner
-from solvers.projected import by_lanczos, projected_problem
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.preconditioner import face_preconditioner
+from solvers.smalbe.projected import by_lanczos, projected_problem
+from solvers.smalbe.solver import SMALBE
 
 BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 

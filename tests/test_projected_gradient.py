@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
 from harness import QP, Status, kkt_residuals, no_rows
-from solvers.projected_gradient import ProjectedGradient
+from solvers.baselines.projected_gradient import ProjectedGradient
 
 
 def boxed(P, q, lb=-np.inf, ub=np.inf):

@@ -20,10 +20,10 @@ from harness.planted import (
     unbounded,
 )
 from problems import PROBLEMS
-from solvers.equilibrate import equilibrated
-from solvers.interior import interior_point
-from solvers.polish import polished
-from solvers.reference import reference_solution
+from solvers.reference.equilibrate import equilibrated
+from solvers.reference.interior import interior_point
+from solvers.reference.polish import polished
+from solvers.reference.solve import reference_solution
 
 EPS = np.finfo(float).eps
 
@@ -386,7 +386,7 @@ bare = types.ModuleType("solvers")  # solvers/__init__.py names every solver und
 bare.__path__ = [sys.argv[1]]
 sys.modules["solvers"] = bare
 from harness.planted import planted
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 for shape in ("everything", "singular", "bounds"):
     for dense in (False, True):
         reference_solution(planted(shape, dense=dense)[0])
@@ -409,6 +409,7 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
     packages, ours = (line.split() for line in run.stdout.splitlines())
     assert not FOREIGN & set(packages)
     assert ours == [
-        "solvers.equilibrate", "solvers.interior", "solvers.polish",
-        "solvers.reference", "solvers.saddle",
+        "solvers.reference", "solvers.reference.equilibrate",
+        "solvers.reference.interior", "solvers.reference.polish",
+        "solvers.reference.saddle", "solvers.reference.solve",
     ]  # fmt: skip

@@ -18,7 +18,7 @@ from problems import PROBLEMS
 from reports.data import read_evidence
 from reports.folder import compose, write_report
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 sizes = st.one_of(
     st.floats(0, 1, allow_nan=False),

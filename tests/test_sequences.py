@@ -8,8 +8,8 @@ import pytest
 from harness import Status, kkt_residuals
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 WARM = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 

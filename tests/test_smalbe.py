@@ -10,12 +10,12 @@ import pytest
 from harness import QP, Status, kkt_residuals, no_rows
 from problems import PROBLEMS
 from solvers import SOLVERS
-from solvers.mprgp import Rules
-from solvers.outer import Constants, Inner, first_iterate, smalbe
-from solvers.projected import by_lanczos, orthonormal_rows, projected_problem
-from solvers.reference import reference_solution
-from solvers.smalbe import SMALBE
-from solvers.spectrum import lanczos, power_method
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.mprgp import Rules
+from solvers.smalbe.outer_loop import Constants, Inner, first_iterate, smalbe
+from solvers.smalbe.projected import by_lanczos, orthonormal_rows, projected_problem
+from solvers.smalbe.solver import SMALBE
+from solvers.smalbe.spectrum import lanczos, power_method
 
 INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from solvers import kernels
-from solvers.products import product
+from solvers.smalbe import kernels
+from solvers.smalbe.products import product
 
 
 @pytest.fixture

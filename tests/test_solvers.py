@@ -13,10 +13,10 @@ from harness.planted import infeasible, one_of_each, unbounded
 from harness.registry import options_of
 from problems.beam_ring import BeamRing
 from solvers import SOLVERS
-from solvers.conversion import csc, on_present_bounds
-from solvers.cvxpy_ import REFUSED
-from solvers.reference import reference_solution
-from solvers.sequence import only_vectors_differ
+from solvers.adapters.cvxpy_ import REFUSED
+from solvers.common.conversion import csc, on_present_bounds
+from solvers.common.sequence import only_vectors_differ
+from solvers.reference.solve import reference_solution
 
 
 def _module(name):

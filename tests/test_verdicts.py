@@ -13,7 +13,7 @@ from harness.kkt import Residuals, rejudged, widths
 from harness.measure import Measurement
 from harness.optimum import decided, exact_value, proven_optimum, proves
 from harness.record import Record
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 TOL = 1e-8
 INF = np.inf

@@ -13,7 +13,7 @@ from harness.workbench import Workbench
 from problems import PROBLEMS
 from reports.vtu import write_series, write_vtu
 from solvers import SOLVERS
-from solvers.reference import reference_solution
+from solvers.reference.solve import reference_solution
 
 FIELDS = Fields(
     points=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0, 2], [1, 2], [1, 3], [0, 3]]),

@@ -1,0 +1,1 @@
+"""One solver, one file: other people's solvers behind our protocol."""

@@ -1,0 +1,104 @@
+"""CVXOPT's coneqp, a path-following method.
+
+Reference: L. Vandenberghe, The CVXOPT linear and quadratic cone program solvers,
+https://www.cvxopt.org/documentation (2010).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from harness import QP, About, Matrix, Solution, Status
+from solvers.common.conversion import (
+    csc,
+    dense,
+    from_one_sided,
+    needs_independent_rows,
+    needs_matrices,
+    objective_factor,
+    one_sided,
+    positive,
+)
+
+
+@dataclass(frozen=True)
+class CVXOPT:
+    """https://cvxopt.org, dense where P is dense, else sparse.
+
+    CVXOPT divides the residuals by max(1, ‖q‖) and max(1, size of the right-hand
+    sides), 2-norms, and takes the gap as closed absolutely (abstol) or relative to the
+    objective (reltol). So feastol = reltol = tol, abstol is negligible, and the
+    objective is multiplied until ‖q‖∞ = 1e4, where the 1 no longer counts.
+    """
+
+    max_iter: int = 200
+
+    about: ClassVar[About] = About(
+        title="CVXOPT",
+        method="interior point (path following)",
+        licence="GPL-3.0-or-later",
+        package="cvxopt",
+        linear_solver="CHOLMOD (sparse) or LAPACK (dense), bundled, one factorisation "
+        "per iteration",
+        phases="preparing converts only; solving does everything else",
+        limits=(
+            "Equality rows that depend on each other end in an error or as 'unknown' "
+            "(conformance, shape 'redundant'): declined.",
+            "Bodies that only equality rows hold (an exactly singular P) end as "
+            "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
+            "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_matrices(qp) or needs_independent_rows(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        import cvxopt
+        from cvxopt import solvers
+
+        is_dense = isinstance(qp.P, np.ndarray)
+        m, scale = qp.b.size, objective_factor(qp)
+        rows, rhs = one_sided(qp)
+        blocks = [
+            _matrix(cvxopt, M, is_dense) for M in (qp.P * scale, rows[m:], rows[:m])
+        ]
+        q, h, b = map(cvxopt.matrix, (qp.q * scale, rhs[m:].copy(), rhs[:m].copy()))
+        options = dict(
+            feastol=tol, reltol=tol, abstol=1e-300, maxiters=self.max_iter,
+            show_progress=False,
+        )  # fmt: skip
+
+        def solve() -> Solution:
+            P, G, A = blocks
+            try:
+                r = solvers.qp(P, q, G, h, A, b, options=options)
+            except (ValueError, ArithmeticError) as e:  # its own words for breakdown
+                return Solution.without_point(qp, Status.FAILED, str(e))
+            v = np.concatenate([np.ravel(r["y"]), np.ravel(r["z"])]) / scale
+            done = r["iterations"] >= self.max_iter
+            failed = Status.ITERATION_LIMIT if done else Status.FAILED
+            return Solution(
+                status=Status.SOLVED if r["status"] == "optimal" else failed,
+                x=np.ravel(r["x"]), **from_one_sided(qp, v),
+                iterations=r["iterations"], message=r["status"],
+                reported={"linear_solver": "lapack" if is_dense else "cholmod"},
+            )  # fmt: skip
+
+        return solve
+
+
+def _matrix(cvxopt: Any, M: Matrix, is_dense: bool) -> Any:
+    if is_dense:
+        return cvxopt.matrix(dense(M))
+    coo = csc(M).tocoo()
+    return cvxopt.spmatrix(
+        coo.data, coo.row.astype(int), coo.col.astype(int), coo.shape
+    )

@@ -1,0 +1,187 @@
+"""Every backend of cvxpy, through its modelling language.
+
+Reference: S. Diamond, S. Boyd, CVXPY: a Python-embedded modeling language for convex
+optimization, J. Mach. Learn. Res. 17(83) (2016) 1-5.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from harness import QP, About, Solution, Status
+from solvers.common.backends import Call, adapter_files, why_not
+from solvers.common.conversion import (
+    DIVERGED,
+    NEGLIGIBLE,
+    csc,
+    needs_matrices,
+    objective_factor,
+    on_present_bounds,
+)
+
+#: backend → how it is called; one that is not listed runs at cvxpy's defaults
+CALLS: Mapping[str, Call] = {
+    "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
+    "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
+    "HIGHS": Call(
+        ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
+        # HiGHS else adds 1e-7 to the Hessian and drops entries below 1e-9
+        {"qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1},
+        size=1.0, tighter=1e-2, floor=1e-10,
+    ),
+    "OSQP": Call(
+        ("eps_rel",),
+        {"eps_abs": NEGLIGIBLE, "max_iter": 1_000_000, "polishing": False},
+    ),
+    "PIQP": Call(
+        ("eps_rel", "eps_duality_gap_rel"),
+        {"eps_abs": NEGLIGIBLE, "eps_duality_gap_abs": NEGLIGIBLE},
+    ),
+    "QOCO": Call(("reltol", "reltol_inacc"), {"abstol": NEGLIGIBLE}),
+    "QPALM": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
+    "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
+}  # fmt: skip
+
+CONIC = "cvxpy states a QP as a cone program for it, which costs half of the digits"
+LINEAR = "takes linear programs only"
+REFUSED: Mapping[str, str] = {
+    "CVXOPT": CONIC, "ECOS": CONIC, "ECOS_BB": CONIC,
+    "GLPK": LINEAR, "GLPK_MI": LINEAR, "SCIPY": LINEAR,
+    "PROXQP": "cvxpy cannot switch on its test of the duality gap; take proxqp",
+}  # fmt: skip
+
+CLAIMS = {
+    "optimal": Status.SOLVED,
+    "user_limit": Status.ITERATION_LIMIT,
+    "infeasible": Status.INFEASIBLE,
+    "unbounded": Status.INFEASIBLE,
+    "infeasible_or_unbounded": Status.INFEASIBLE,
+}  #: anything else (optimal_inaccurate, …) is FAILED
+
+
+@dataclass(frozen=True)
+class CVXPY:
+    """One backend of cvxpy; compilation is preparing, the backend's setup solving.
+
+    The tolerance goes to the backend's own keywords (`CALLS`), the relative one where
+    there are two; a backend that is not listed there runs at cvxpy's defaults. As in
+    the native adapters the objective is multiplied until ‖q‖∞ = 1e4, or 1 where the
+    backend's test is absolute (HIGHS, DAQP). What cvxpy would turn into a cone program
+    first, and ProxQP, whose test of the gap it cannot switch on, are declined.
+    """
+
+    backend: str = ""  #: the NAME in cvxpy:NAME
+
+    about: ClassVar[About] = About(
+        title="cvxpy",
+        method="that of the backend NAME",
+        licence="Apache-2.0; each backend its own",
+        package="cvxpy",
+        linear_solver="the backend's",
+        phases="preparing compiles the model to the backend's data; solving is the "
+        "backend's setup and solve",
+        limits=(
+            "CVXOPT and ECOS get a cone program, which costs half of the digits (dual "
+            "residuals of 1e-5 at tol 1e-6, by the conformance suite): declined.",
+            "PROXQP without its gap test claims a complementarity of 2e-6 at tol 1e-9 "
+            "(conformance, shape 'bounds'): declined.",
+        ),
+    )
+
+    @staticmethod
+    def backends() -> tuple[str, ...]:
+        """List the names that the installed cvxpy knows, installed or not."""
+        return tuple(_files())
+
+    def declines(self, qp: QP) -> str | None:
+        if reason := why_not("cvxpy", self.backend, _files()):
+            return reason
+        if self.backend == "SCS" and sum(qp.sizes.values()) == qp.q.size:
+            return "needs a constraint"
+        return REFUSED.get(self.backend) or needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        import cvxpy
+
+        call = CALLS.get(self.backend, Call())
+        options, scale = call.options(tol), objective_factor(qp, call.size)
+        problem, x, constraints = _model(cvxpy, qp, scale)
+        data, chain, inverse = problem.get_problem_data(
+            self.backend, solver_opts=dict(options)
+        )
+
+        def solve() -> Solution:
+            with warnings.catch_warnings():  # they repeat the status
+                warnings.simplefilter("ignore")
+                try:
+                    raw = chain.solve_via_data(
+                        problem, data, warm_start=False, solver_opts=dict(options)
+                    )
+                    problem.unpack_results(raw, chain, inverse)
+                except cvxpy.SolverError as e:
+                    return Solution.without_point(qp, Status.FAILED, str(e))
+            status = CLAIMS.get(problem.status, Status.FAILED)
+            if status is Status.INFEASIBLE or x.value is None:
+                return Solution.without_point(qp, status, problem.status)
+            if status is Status.SOLVED and np.abs(x.value).max() > DIVERGED:
+                return Solution.without_point(qp, Status.FAILED, "diverged")
+            return _solution(qp, status, problem, x, constraints, scale)
+
+        return solve
+
+
+def _files() -> dict[str, Path]:
+    folder = "reductions/solvers"
+    conic = adapter_files("cvxpy", f"{folder}/conic_solvers/*_conif.py", "_conif.py")
+    quadratic = adapter_files("cvxpy", f"{folder}/qp_solvers/*_qpif.py", "_qpif.py")
+    return {name.upper(): path for name, path in sorted({**conic, **quadratic}.items())}
+
+
+def _model(cvxpy: Any, qp: QP, scale: float) -> tuple[Any, Any, dict[str, Any]]:
+    """State `qp` in cvxpy with constant data, each block of constraints by name."""
+    x = cvxpy.Variable(qp.q.size)
+    low, up = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    constraints = {}
+    if qp.b.size:
+        constraints["y"] = csc(qp.A) @ x == qp.b
+    if qp.h.size:
+        constraints["z"] = csc(qp.G) @ x <= qp.h
+    if low.any():
+        constraints["low"] = x[np.flatnonzero(low)] >= qp.lb[low]
+    if up.any():
+        constraints["up"] = x[np.flatnonzero(up)] <= qp.ub[up]
+    # assume_PSD: no eigenvalues are computed to prove convexity
+    energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
+    objective = cvxpy.Minimize(0.5 * energy + (qp.q * scale) @ x)
+    return cvxpy.Problem(objective, list(constraints.values())), x, constraints
+
+
+def _solution(
+    qp: QP,
+    status: Status,
+    problem: Any,
+    x: Any,
+    constraints: Mapping[str, Any],
+    scale: float,
+) -> Solution:
+    sizes = {"y": qp.b.size, "z": qp.h.size, "low": 0, "up": 0}
+    y, z, low, up = (
+        np.ravel(constraints[name].dual_value) / scale
+        if name in constraints
+        else np.zeros(k)
+        for name, k in sizes.items()
+    )
+    z_box = np.zeros(qp.q.size)
+    z_box[np.isfinite(qp.ub)] += up
+    z_box[np.isfinite(qp.lb)] -= low
+    return Solution(
+        status=status,
+        x=np.ravel(x.value), y=y, z=z, z_box=on_present_bounds(qp, z_box),
+        iterations=problem.solver_stats.num_iters, message=problem.status,
+    )  # fmt: skip

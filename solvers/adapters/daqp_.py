@@ -1,0 +1,127 @@
+"""DAQP, a dual active-set method.
+
+Reference: D. Arnström, A. Bemporad, D. Axehill, A dual active-set solver for embedded
+quadratic programming using recursive LDLᵀ updates, IEEE Trans. Automat. Control 67
+(2022) 4362-4369.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from harness import QP, About, Solution, Status, Vector
+from solvers.common.conversion import dense, needs_dense, objective_factor, positive
+from solvers.common.sequence import Session, in_sequence
+
+CLAIMS = {
+    1: Status.SOLVED,
+    2: Status.FAILED,  # solved a softened problem
+    -1: Status.INFEASIBLE,
+    -3: Status.INFEASIBLE,  # unbounded
+    -4: Status.ITERATION_LIMIT,
+}  #: anything else is FAILED
+WORDS = {
+    1: "optimal", 2: "soft optimal", -1: "infeasible", -2: "cycling", -3: "unbounded",
+    -4: "iteration limit", -5: "nonconvex", -6: "overdetermined initial working set",
+    -7: "time limit",
+}  # fmt: skip
+INFINITE = 1e30  #: DAQP's own infinity
+EQUALITY = 5  #: DAQP's mark of an equality
+TIGHTER = 1e-3  #: DAQP's tolerances relative to tol
+TIGHTEST = 1e-11  #: below, its proximal iterations stop early or cycle
+
+
+@dataclass(frozen=True)
+class DAQP:
+    """https://darnstrom.github.io/daqp, dense.
+
+    An active-set method ends at a vertex of the active-set search, where the KKT
+    conditions hold to rounding; primal_tol and dual_tol only say which violations and
+    multiplier signs count. Both are absolute, so the objective is multiplied until
+    ‖q‖∞ = 1 and both are tol/1000, at least 1e-11. A looser tol saves no steps.
+
+    A Hessian whose Cholesky breaks down is treated by DAQP's own proximal-point
+    iterations (eps_prox < 0, its automatic choice).
+    """
+
+    max_iter: int = 100_000
+
+    about: ClassVar[About] = About(
+        title="DAQP",
+        method="dual active set",
+        licence="MIT",
+        package="daqp",
+        linear_solver="its own dense LDLᵀ, updated as rows become active",
+        phases="preparing makes the dense matrices and factorises; solving iterates",
+        sequence="`update` of vectors keeps the factor and the active set",
+        limits=(
+            "Longer than 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
+            "(suites/fleet.toml).",
+            "With tolerances of 1e-12 its proximal iterations end with residuals of "
+            "7e-7 on singular QPs, so 1e-11 is the least that it is given.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_dense(qp, 3)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
+        import daqp
+
+        n, m = qp.q.size, qp.b.size
+        scale = objective_factor(qp, 1.0)
+        H, A = dense(qp.P) * scale, np.vstack([dense(qp.A), dense(qp.G)])
+        low, high = _sides(qp)
+        sense = np.zeros(high.size, dtype=np.int32)
+        sense[n : n + m] = EQUALITY
+        eps = max(tol * TIGHTER, TIGHTEST)
+        model = daqp.Model()
+        model.settings = dict(
+            primal_tol=eps, dual_tol=eps, iter_limit=self.max_iter, eps_prox=-1.0
+        )
+        _, setup_seconds = model.setup(H, qp.q * scale, A, high, low, sense)
+
+        def solve() -> Solution:
+            x, _, flag, info = model.solve()
+            status = CLAIMS.get(flag, Status.FAILED)
+            words = WORDS.get(flag, f"exit flag {flag}")
+            if status is Status.INFEASIBLE:
+                return Solution.without_point(qp, status, words)
+            lam: Vector = np.array(info["lam"]) / scale
+            return Solution(
+                status=status, x=np.array(x),
+                y=lam[n : n + m], z=lam[n + m :], z_box=lam[:n],
+                iterations=info["iterations"], message=words,
+                counts={"outer": info["nodes"]},
+                reported={
+                    "linear_solver": "dense ldl, updated",
+                    "setup_seconds": setup_seconds,
+                    "solve_seconds": info["solve_time"],
+                },
+            )  # fmt: skip
+
+        def update(new: QP) -> None:
+            low, high = _sides(new)
+            model.update(f=new.q * scale, bupper=high, blower=low)
+
+        return Session(solve, update)
+
+
+def _sides(qp: QP) -> tuple[Vector, Vector]:
+    """Stack bounds, equalities, inequalities, with DAQP's infinity."""
+    no_low = np.full(qp.h.size, -INFINITE)
+    low = np.concatenate([np.maximum(qp.lb, -INFINITE), qp.b, no_low])
+    return low, np.concatenate([np.minimum(qp.ub, INFINITE), qp.b, qp.h])

@@ -1,0 +1,161 @@
+"""HiGHS, an active-set and an interior-point method for QPs.
+
+Reference: Q. Huangfu, J. A. J. Hall, Parallelizing the dual revised simplex method,
+Math. Program. Comput. 10 (2018) 119-142; its QP solvers: https://highs.dev.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.sparse import csc_matrix, tril, vstack
+
+from harness import QP, About, Solution, Status
+from solvers.common.conversion import (
+    csc,
+    needs_dense,
+    needs_matrices,
+    objective_factor,
+    on_present_bounds,
+    one_of,
+    positive,
+)
+
+CLAIMS = {
+    "kOptimal": Status.SOLVED,
+    "kIterationLimit": Status.ITERATION_LIMIT,
+    "kTimeLimit": Status.TIME_LIMIT,
+    "kInfeasible": Status.INFEASIBLE,
+    "kUnbounded": Status.INFEASIBLE,
+    "kUnboundedOrInfeasible": Status.INFEASIBLE,
+}  #: anything else is FAILED
+TIGHTEST = 1e-10  #: the smallest tolerance that HiGHS takes
+SMALLEST_ENTRY = 1e-12  #: entries below are dropped; the smallest limit it takes
+
+
+@dataclass(frozen=True)
+class HiGHS:
+    """https://highs.dev, one thread: its active-set (qpasm) or interior-point (hipo).
+
+    HiGHS tests violations and multiplier signs in absolute terms. So the objective is
+    multiplied until ‖q‖∞ = 1, and all of its tolerances are tol/100, at least 1e-10,
+    the smallest that it takes; an active-set method loses little by that.
+
+    Three habits of HiGHS are worked around: qpasm claims an optimum after 0 iterations
+    on QPs with bounds only, so these get a row that binds nothing; a hidden 1e-7 on
+    the Hessian's diagonal (qp_regularization_value) is set to 0, without which a
+    singular QP of order one is left with residuals of 1e-6 at any tolerance; and
+    entries below 1e-9 would be dropped (small_matrix_value), which is lowered to 1e-12.
+    """
+
+    method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
+    max_iter: int = 1_000_000
+
+    about: ClassVar[About] = About(
+        title="HiGHS",
+        method="active set (qpasm) or interior point (hipo)",
+        licence="MIT; highspy-extras (hipo) Apache-2.0",
+        package="highspy",
+        linear_solver="qpasm: LU of the active rows and a dense reduced Hessian; hipo: "
+        "its own multifrontal LDLᵀ",
+        phases="preparing passes the model; solving does everything else",
+        limits=(
+            "qpasm takes longer than 20 s on the 4420 unknowns of "
+            "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
+            "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
+            "residuals of 5e-12.",
+            "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
+            "entries 1e6 times larger (tests/test_solvers.py).",
+            "On QPs with bounds only and without the free row, HiGHS 1.15.1 claims an "
+            "optimum after 0 iterations: a membrane of 225 nodes has a residual of 1 "
+            "(conformance check 'finds where a membrane of 400 nodes touches').",
+            "Without highspy-extras, hipo fails and HiGHS runs qpasm in silence; the "
+            "adapter calls that a failure.",
+            "qpasm keeps a dense Hessian of the null space of the active rows and "
+            "declines where that would not fit.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+        one_of("method", self.method, ("qpasm", "hipo"))
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_dense(qp, 1) if self.method == "qpasm" else needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        import highspy
+
+        if self.method == "hipo":
+            import highspy_extras  # noqa: F401  # without it HiGHS runs qpasm instead
+
+        scale = objective_factor(qp, 1.0)
+        solver = highspy.Highs()
+        for name, value in self._options(tol).items():
+            if solver.setOptionValue(name, value) != highspy.HighsStatus.kOk:
+                message = f"HiGHS refuses {name} = {value}"
+                return lambda: Solution.without_point(qp, Status.FAILED, message)
+        solver.passModel(_model(highspy, qp, scale))
+
+        def solve() -> Solution:
+            solver.run()
+            info, name = solver.getInfo(), solver.getModelStatus().name
+            status = CLAIMS.get(name, Status.FAILED)
+            found = solver.getSolution()
+            if status is Status.INFEASIBLE or not found.value_valid:
+                return Solution.without_point(qp, status, name)
+            row = -np.array(found.row_dual) / scale
+            z_box = -np.array(found.col_dual) / scale
+            steps = {
+                "qpasm": info.qp_iteration_count, "hipo": info.ipm_iteration_count
+            }  # fmt: skip
+            m, p = qp.b.size, qp.h.size
+            return Solution(
+                status=status, x=np.array(found.col_value),
+                y=row[:m], z=row[m : m + p], z_box=on_present_bounds(qp, z_box),
+                iterations=steps[self.method], message=name,
+                reported={
+                    "linear_solver": "lu, dense reduced hessian"
+                    if self.method == "qpasm" else "hipo",
+                    "solve_seconds": solver.getRunTime(),
+                },
+            )  # fmt: skip
+
+        return solve
+
+    def _options(self, tol: float) -> dict[str, Any]:
+        eps = max(tol / 100, TIGHTEST)
+        return {
+            "output_flag": False, "threads": 1, "solver": self.method,
+            "kkt_tolerance": eps, "ipm_optimality_tolerance": eps,
+            "qp_regularization_value": 0.0, "small_matrix_value": SMALLEST_ENTRY,
+            "qp_iteration_limit": self.max_iter, "ipm_iteration_limit": self.max_iter,
+            "qp_nullspace_limit": 2**31 - 1,
+        }  # fmt: skip
+
+
+def _model(highspy: Any, qp: QP, scale: float) -> Any:
+    """State `qp` as a HighsModel, with a free row where there is none."""
+    n = qp.q.size
+    rows = csc(vstack([csc(qp.A), csc(qp.G)]))
+    low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf)])
+    high = np.concatenate([qp.b, qp.h])
+    if not low.size:
+        rows = csc_matrix(([1.0], ([0], [0])), shape=(1, n))
+        low, high = np.array([-np.inf]), np.array([np.inf])
+    model = highspy.HighsModel()
+    lp, hessian, P = model.lp_, model.hessian_, csc(tril(csc(qp.P))) * scale
+    lp.num_col_, lp.num_row_ = n, low.size
+    lp.col_cost_, lp.col_lower_, lp.col_upper_ = qp.q * scale, qp.lb, qp.ub
+    lp.row_lower_, lp.row_upper_ = low, high
+    lp.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    lp.a_matrix_.num_col_, lp.a_matrix_.num_row_ = n, low.size
+    lp.a_matrix_.start_, lp.a_matrix_.index_ = rows.indptr, rows.indices
+    lp.a_matrix_.value_ = rows.data
+    hessian.dim_, hessian.format_ = n, highspy.HessianFormat.kTriangular
+    hessian.start_, hessian.index_ = P.indptr, P.indices
+    hessian.value_ = P.data
+    return model

@@ -1,0 +1,186 @@
+"""ProxQP, a proximal augmented Lagrangian method.
+
+Reference: A. Bambade et al., PROX-QP: yet another quadratic programming solver for
+robotics and beyond, Robotics: Science and Systems (2022).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from harness import QP, About, Solution, Status, Vector
+from solvers.common.conversion import (
+    NEGLIGIBLE,
+    as_stored,
+    boxed,
+    csc,
+    dense,
+    from_two_sided,
+    needs_dense,
+    needs_matrices,
+    on_present_bounds,
+    one_of,
+    positive,
+    two_sided,
+)
+from solvers.common.sequence import Session, in_sequence
+
+CLAIMS = {
+    "PROXQP_SOLVED": Status.SOLVED,
+    "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
+    "PROXQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    "PROXQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
+    "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
+}  #: anything else is FAILED
+CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
+
+
+@dataclass(frozen=True)
+class ProxQP:
+    """https://simple-robotics.github.io/proxsuite.
+
+    ProxQP stops when the max norms of the primal and dual residuals are below
+    eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
+    eps_abs. The test of the duality gap, off by default, is on. No test of ProxQP looks
+    at the sign of the multipliers, and its default first guess, which takes every row
+    as an equality, often passes them all with negative ones (primal forms, tol ≥ 1e-4).
+    Starting from zero makes that rare, if not impossible, and takes fewer iterations.
+
+    Certificates of infeasibility are tested in absolute terms: at the default 1e-4
+    ProxQP calls feasible QPs infeasible whose multipliers are of that size. At 1e-8 it
+    does not, but ends at the iteration limit where others find a certificate.
+    """
+
+    backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
+    max_iter: int = 10_000
+
+    about: ClassVar[About] = About(
+        title="ProxQP",
+        method="proximal augmented Lagrangian",
+        licence="BSD-2-Clause",
+        package="proxsuite",
+        linear_solver="its own LDLᵀ, dense or sparse, updated as rows become active",
+        phases="preparing equilibrates and, in the sparse backend, analyses; solving "
+        "factorises and iterates",
+        sequence="`update` of vectors keeps the equilibration; starts from the last "
+        "point",
+        limits=(
+            "No test looks at the sign of multipliers.",
+            "No time limit of its own, and it keeps Python's lock: only the harness's "
+            "kill ends it.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+        one_of("backend", self.backend, ("auto", "dense", "sparse"))
+
+    def declines(self, qp: QP) -> str | None:
+        as_dense = as_stored(self.backend, qp) == "dense"
+        return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
+        from proxsuite import proxqp
+
+        backend = as_stored(self.backend, qp)
+        form = _Dense(qp) if backend == "dense" else _Sparse(qp)
+        solver = form.made(proxqp)
+        settings = solver.settings
+        settings.eps_abs, settings.eps_rel = NEGLIGIBLE, tol
+        settings.check_duality_gap = settings.compute_timings = True
+        settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = NEGLIGIBLE, tol
+        settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
+        settings.initial_guess = proxqp.NO_INITIAL_GUESS
+        settings.max_iter = self.max_iter
+        warm: list[Solution] = []
+
+        def solve() -> Solution:
+            if warm:
+                settings.initial_guess = proxqp.WARM_START
+                s = warm.pop()
+                solver.solve(s.x, s.y, form.stacked(s))
+            else:
+                solver.solve()
+            r = solver.results
+            status = CLAIMS.get(r.info.status.name, Status.FAILED)
+            if status is Status.INFEASIBLE:
+                return Solution.without_point(qp, status, r.info.status.name)
+            return Solution(
+                status=status,
+                x=np.array(r.x), y=np.array(r.y), **form.multipliers(np.array(r.z)),
+                iterations=r.info.iter, message=r.info.status.name,
+                counts={"iter_ext": r.info.iter_ext, "mu_updates": r.info.mu_updates},
+                reported={
+                    "linear_solver": f"{backend} ldl, updated",
+                    "solve_seconds": r.info.solve_time / 1e6,
+                },
+            )  # fmt: skip
+
+        def update(new: QP) -> None:
+            settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT
+            solver.update(g=new.q, b=new.b, **form.sides(new))
+
+        # the dense backend takes no multipliers of bounds to start from
+        no_start = isinstance(form, _Dense) and form.boxed
+        return Session(solve, update, None if no_start else warm.append)
+
+
+class _Dense:
+    """The dense backend, which knows bounds: multipliers of all n follow those of G."""
+
+    def __init__(self, qp: QP) -> None:
+        self.qp, self.boxed = qp, bool(boxed(qp).any())
+
+    def made(self, proxqp: Any) -> Any:
+        qp = self.qp
+        solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.boxed)
+        P, A, G = dense(qp.P), dense(qp.A), dense(qp.G)
+        solver.init(P, qp.q, A, qp.b, G, **self.sides(qp))
+        return solver
+
+    def sides(self, qp: QP) -> dict[str, Vector]:
+        box = {"l_box": qp.lb, "u_box": qp.ub} if self.boxed else {}
+        return {"l": np.full(qp.h.size, -np.inf), "u": qp.h, **box}
+
+    def multipliers(self, v: Vector) -> dict[str, Any]:
+        z, z_box = np.split(v, [self.qp.h.size])
+        z_box = z_box if self.boxed else np.zeros(self.qp.q.size)
+        return {"z": z, "z_box": on_present_bounds(self.qp, z_box)}
+
+    def stacked(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box]) if self.boxed else s.z
+
+
+class _Sparse:
+    """The sparse backend, where bounds are rows of the identity."""
+
+    def __init__(self, qp: QP) -> None:
+        self.qp = qp
+
+    def made(self, proxqp: Any) -> Any:
+        qp = self.qp
+        rows = csc(two_sided(qp)[0][qp.b.size :])
+        solver = proxqp.sparse.QP(qp.q.size, qp.b.size, rows.shape[0])
+        solver.init(csc(qp.P), qp.q, csc(qp.A), qp.b, rows, **self.sides(qp))
+        return solver
+
+    def sides(self, qp: QP) -> dict[str, Vector]:
+        _, low, high = two_sided(qp)
+        return {"l": low[qp.b.size :], "u": high[qp.b.size :]}
+
+    def multipliers(self, v: Vector) -> dict[str, Any]:
+        parts = from_two_sided(self.qp, np.concatenate([np.zeros(self.qp.b.size), v]))
+        return {"z": parts["z"], "z_box": parts["z_box"]}
+
+    def stacked(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box[boxed(self.qp)]])

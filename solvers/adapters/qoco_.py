@@ -1,0 +1,114 @@
+"""QOCO, an interior-point method for quadratic and second-order cone programs.
+
+Reference: G. M. Chari, B. Açıkmeşe, QOCO: a quadratic objective conic optimizer with
+custom solver generation, arXiv:2503.12658 (2025).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from harness import QP, About, Solution, Status
+from solvers.common.conversion import (
+    DIVERGED,
+    NEGLIGIBLE,
+    csc,
+    from_one_sided,
+    needs_matrices,
+    objective_factor,
+    one_sided,
+    positive,
+)
+from solvers.common.sequence import Session, in_sequence
+
+CLAIMS = {
+    "QOCO_SOLVED": Status.SOLVED,
+    "QOCO_MAX_ITER": Status.ITERATION_LIMIT,
+}  #: anything else (QOCO_SOLVED_INACCURATE, …) is FAILED
+
+
+@dataclass(frozen=True)
+class QOCO:
+    """https://qoco-org.github.io/qoco.
+
+    QOCO stops when the max norms of the residuals are below abstol + reltol·(their
+    largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
+    negligible, reltol = tol, and the objective is multiplied until ‖q‖∞ = 1e4, where
+    the 1 no longer counts. QOCO has no certificates: on an unbounded QP its iterates
+    grow until every relative residual is small, which it calls solved; a claim with
+    ‖x‖∞ > 1e12 counts as failed.
+    """
+
+    max_iter: int = 200
+
+    about: ClassVar[About] = About(
+        title="QOCO",
+        method="interior point",
+        licence="BSD-3-Clause",
+        package="qoco",
+        linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
+        phases="preparing equilibrates and analyses; solving does all factorisations",
+        sequence="`update_vector_data` keeps the analysis; it cannot start warm",
+        limits=(
+            "No certificates of infeasibility; unbounded QPs are claimed solved with "
+            "‖x‖∞ of 1e16 (conformance check 'unbounded'), which the adapter catches.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
+        import qoco
+
+        m = qp.b.size
+        rows, rhs = one_sided(qp)
+        k, scale = rhs.size - m, objective_factor(qp)
+        solver = qoco.QOCO()
+        solver.setup(
+            qp.q.size, k, m, csc(qp.P) * scale, qp.q * scale,
+            csc(rows[:m]) if m else None, rhs[:m] if m else None,
+            csc(rows[m:]) if k else None, rhs[m:] if k else None,
+            k, 0, None,
+            abstol=NEGLIGIBLE, reltol=tol, abstol_inacc=NEGLIGIBLE,
+            reltol_inacc=tol, max_iters=self.max_iter, verbose=0,
+        )  # fmt: skip
+
+        def solve() -> Solution:
+            r = solver.solve()
+            v = np.concatenate([np.ravel(r.y)[:m], np.ravel(r.z)[:k]]) / scale
+            x, status = np.array(r.x), CLAIMS.get(r.status, Status.FAILED)
+            if status is Status.SOLVED and np.abs(x).max() > DIVERGED:
+                return Solution.without_point(qp, Status.FAILED, "diverged")
+            return Solution(
+                status=status,
+                x=x, **from_one_sided(qp, v),
+                iterations=r.iters, message=r.status,
+                counts={"refinement_steps": r.ir_iters},
+                reported={
+                    "linear_solver": "qdldl",
+                    "setup_seconds": r.setup_time_sec,
+                    "solve_seconds": r.solve_time_sec,
+                },
+            )  # fmt: skip
+
+        def update(new: QP) -> None:
+            rhs = one_sided(new)[1]
+            solver.update_vector_data(
+                new.q * scale, rhs[:m] if m else None, rhs[m:] if k else None
+            )
+
+        return Session(solve, update)

@@ -1,0 +1,129 @@
+"""QPALM, a proximal augmented Lagrangian method.
+
+Reference: B. Hermans, A. Themelis, P. Patrinos, QPALM: a proximal augmented Lagrangian
+method for nonconvex quadratic programs, Math. Program. Comput. 14 (2022) 497-541.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from harness import QP, About, Solution, Status, Vector
+from solvers.common.conversion import (
+    NEGLIGIBLE,
+    csc,
+    from_two_sided,
+    needs_matrices,
+    positive,
+    to_two_sided,
+    two_sided,
+)
+from solvers.common.sequence import Session, in_sequence
+
+CLAIMS = {
+    "SOLVED": Status.SOLVED,
+    "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
+    "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
+    "PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    "DUAL_INFEASIBLE": Status.INFEASIBLE,
+}  #: anything else is FAILED
+INFINITE = 1e20  #: QPALM's own infinity
+
+
+@dataclass(frozen=True)
+class QPALM:
+    """https://kul-optec.github.io/QPALM.
+
+    QPALM stops when the max norms of the primal and dual residuals are below eps_abs +
+    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. It has
+    no test of the duality gap. Bounds become rows of the identity.
+    """
+
+    max_iter: int = 10_000
+
+    about: ClassVar[About] = About(
+        title="QPALM",
+        method="proximal augmented Lagrangian, semismooth Newton inside",
+        licence="LGPL-3.0-or-later",
+        package="qpalm",
+        linear_solver="LADEL (sparse LDLᵀ, updated as rows become active)",
+        phases="preparing scales; solving does all factorisations",
+        sequence="`update` of vectors; starts from the last point",
+        limits=(
+            "No duality-gap test: it may stop early where primal and dual residuals "
+            "are small and the gap is not.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
+        import qpalm
+
+        rows, low, high = _rows(qp)
+        data = qpalm.Data(qp.q.size, low.size)
+        data.Q, data.q, data.A = csc(qp.P), qp.q, rows
+        data.bmin, data.bmax = low, high
+        settings = qpalm.Settings()
+        settings.eps_abs, settings.eps_rel = NEGLIGIBLE, tol
+        settings.eps_rel_in = min(1.0, settings.eps_rel_in)
+        settings.max_iter, settings.verbose = self.max_iter, 0
+        solver = qpalm.Solver(data, settings)
+        warm: list[tuple[Vector, Vector]] = []
+
+        def solve() -> Solution:
+            if warm:
+                solver.warm_start(*warm.pop())
+            solver.solve(asynchronous=False)
+            info = solver.info
+            status = CLAIMS.get(_name(qpalm, info.status_val), Status.FAILED)
+            if status is Status.INFEASIBLE:
+                return Solution.without_point(qp, status, info.status)
+            x, y = np.array(solver.solution.x), np.array(solver.solution.y)
+            return Solution(
+                status=status, x=x, **from_two_sided(qp, y),
+                iterations=info.iter, message=info.status,
+                counts={"outer": info.iter_out},
+                reported={
+                    "linear_solver": "ladel",
+                    "setup_seconds": info.setup_time,
+                    "solve_seconds": info.solve_time,
+                },
+            )  # fmt: skip
+
+        def update(new: QP) -> None:
+            _, low, high = _rows(new)
+            solver.update_q(new.q)
+            solver.update_bounds(low, high)
+            if np.isfinite(solver.solution.x).all():
+                warm.append((np.array(solver.solution.x), np.array(solver.solution.y)))
+
+        def start(s: Solution) -> None:
+            warm.append((s.x, to_two_sided(qp, s)))
+
+        return Session(solve, update, start)
+
+
+def _rows(qp: QP) -> tuple[object, Vector, Vector]:
+    rows, low, high = two_sided(qp)
+    return rows, np.maximum(low, -INFINITE), np.minimum(high, INFINITE)
+
+
+def _name(qpalm: object, status_val: int) -> str:
+    info = qpalm.Info  # type: ignore[attr-defined]
+    names = (*CLAIMS, "USER_CANCELLATION", "ERROR", "UNSOLVED")
+    return next((n for n in names if getattr(info, n) == status_val), "")

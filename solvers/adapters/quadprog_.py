@@ -1,0 +1,97 @@
+"""quadprog, the dual active-set method of Goldfarb and Idnani.
+
+Reference: D. Goldfarb, A. Idnani, A numerically stable dual method for solving strictly
+convex quadratic programs, Math. Program. 27 (1983) 1-33.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.linalg import LinAlgError, cholesky, solve_triangular
+
+from harness import QP, About, Solution, Status
+from solvers.common.conversion import (
+    dense,
+    from_one_sided,
+    needs_dense,
+    needs_independent_rows,
+    objective_factor,
+    one_sided,
+)
+
+SINGULAR = 1e-12  #: smallest pivot relative to the largest of a definite Hessian
+
+
+@dataclass(frozen=True)
+class Quadprog:
+    """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
+
+    quadprog has no tolerance: it ends, after finitely many changes of the active set,
+    where the KKT conditions hold to rounding. tol is not used.
+
+    A Hessian that is not positive definite, or whose smallest Cholesky pivot is below
+    1e-12 of the largest, is declined once the factorisation has shown it. So are
+    equality rows that depend on each other, beforehand: quadprog calls them
+    inconsistent.
+    """
+
+    about: ClassVar[About] = About(
+        title="quadprog",
+        method="dual active set (Goldfarb-Idnani)",
+        licence="GPL-2.0-or-later",
+        package="quadprog",
+        linear_solver="dense Cholesky (LAPACK), QR of the active rows updated",
+        phases="preparing factorises P and inverts the factor; solving iterates",
+        limits=(
+            "Strictly convex QPs only: the dual with Dirichlet rows, whose F is "
+            "singular, is declined.",
+            "Consistent equality rows of which one is the sum of others are claimed "
+            "infeasible (conformance, shape 'redundant'): declined.",
+        ),
+    )
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_dense(qp, 4) or needs_independent_rows(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        import quadprog
+
+        scale = objective_factor(qp, 1.0)
+        try:
+            L = cholesky(dense(qp.P) * scale, lower=True)
+        except LinAlgError:
+            return lambda: _declined(qp, "P is not positive definite")
+        pivots = np.diag(L) ** 2
+        if pivots.min() < SINGULAR * pivots.max():
+            return lambda: _declined(qp, "P is singular to working precision")
+        inverse = solve_triangular(L, np.eye(len(L)), lower=True).T
+        rows, rhs = one_sided(qp)
+        C = -rows.toarray().T
+        a = -qp.q * scale
+
+        def solve() -> Solution:
+            constraints = (C, -rhs, qp.b.size) if rhs.size else (None, None, 0)
+            try:
+                x, _, _, iterations, multipliers, _ = quadprog.solve_qp(
+                    inverse, a, *constraints, factorized=True
+                )
+            except ValueError as e:
+                infeasible = "inconsistent" in str(e)
+                status = Status.INFEASIBLE if infeasible else Status.FAILED
+                return Solution.without_point(qp, status, str(e))
+            return Solution(
+                status=Status.SOLVED, x=x, **from_one_sided(qp, multipliers / scale),
+                iterations=int(iterations[0]), message="solved",
+                counts={"dropped_rows": int(iterations[1])},
+                reported={"linear_solver": "dense cholesky, updated qr"},
+            )  # fmt: skip
+
+        return solve
+
+
+def _declined(qp: QP, reason: str) -> Solution:
+    return Solution.without_point(qp, Status.DECLINED, reason)

@@ -1,0 +1,122 @@
+"""SCS, an operator-splitting method for conic programs.
+
+Reference: B. O'Donoghue, Operator splitting for a homogeneous embedding of the linear
+complementarity problem, SIAM J. Optim. 31 (2021) 1999-2023.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from scipy.sparse import triu
+
+from harness import QP, About, Solution, Status
+from solvers.common.conversion import (
+    NEGLIGIBLE,
+    csc,
+    from_one_sided,
+    needs_matrices,
+    one_of,
+    one_sided,
+    positive,
+    to_one_sided,
+)
+from solvers.common.sequence import Session, in_sequence
+
+CLAIMS = {
+    1: Status.SOLVED,
+    2: Status.ITERATION_LIMIT,  # inaccurate, as at the limit
+    -1: Status.INFEASIBLE,  # unbounded
+    -2: Status.INFEASIBLE,
+}  #: anything else is FAILED
+CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
+
+
+@dataclass(frozen=True)
+class SCS:
+    """https://www.cvxgrp.org/scs.
+
+    SCS stops when the max norms of the primal and dual residuals and the duality gap
+    are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
+    negligible eps_abs. It looks every 25 iterations only. Equalities go to the zero
+    cone; inequalities and finite bounds, one row each, to the nonnegative cone.
+    """
+
+    linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
+    max_iter: int = 1_000_000
+
+    about: ClassVar[About] = About(
+        title="SCS",
+        method="operator splitting (homogeneous embedding, Anderson acceleration)",
+        licence="MIT; bundles Intel MKL",
+        package="scs",
+        linear_solver="MKL Pardiso, bundled (or QDLDL), one factorisation per change "
+        "of scale",
+        phases="preparing equilibrates and factorises; solving iterates",
+        sequence="`update` of vectors keeps the factor; starts from the last point",
+        limits=("Needs a row or a bound: it has no cone for none.",),
+    )
+
+    def __post_init__(self) -> None:
+        positive(max_iter=self.max_iter)
+        one_of("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
+
+    def declines(self, qp: QP) -> str | None:
+        if not any(qp.sizes[k] for k in ("equalities", "inequalities", "bounds")):
+            return "needs a constraint: it has no cone for none"
+        return needs_matrices(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        return self._begin(qp, tol).solve
+
+    def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        return in_sequence(lambda qp: self._begin(qp, tol))
+
+    def _begin(self, qp: QP, tol: float) -> Session:
+        import scs
+
+        m = qp.b.size
+        rows, rhs = one_sided(qp)
+        solver = scs.SCS(
+            dict(P=csc(triu(csc(qp.P))), A=rows, b=rhs, c=qp.q.copy()),
+            dict(z=m, l=rhs.size - m),
+            linear_solver=scs.LinearSolver(self.linear_solver),
+            eps_abs=NEGLIGIBLE, eps_rel=tol, eps_infeas=CERTIFICATE,
+            max_iters=self.max_iter, verbose=False,
+        )  # fmt: skip
+        warm: list[Solution] = []
+
+        def solve() -> Solution:
+            point = warm.pop() if warm else None
+            x, y, s = _start(qp, point) if point else (None, None, None)
+            r = solver.solve(warm_start=True, x=x, y=y, s=s)
+            info = r["info"]
+            status = CLAIMS.get(info["status_val"], Status.FAILED)
+            if status is Status.INFEASIBLE:
+                return Solution.without_point(qp, status, info["status"])
+            return Solution(
+                status=status, x=r["x"], **from_one_sided(qp, r["y"]),
+                iterations=info["iter"], message=info["status"],
+                counts={
+                    "scale_updates": info["scale_updates"],
+                    "accelerated_steps": info["accepted_accel_steps"],
+                },
+                reported={
+                    "linear_solver": info["lin_sys_solver"],
+                    "setup_seconds": info["setup_time"] / 1000,
+                    "solve_seconds": info["solve_time"] / 1000,
+                },
+            )  # fmt: skip
+
+        def update(new: QP) -> None:
+            solver.update(b=one_sided(new)[1], c=new.q.copy())
+
+        return Session(solve, update, warm.append)
+
+
+def _start(qp: QP, s: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows, rhs = one_sided(qp)
+    return s.x.copy(), to_one_sided(qp, s), np.maximum(rhs - rows @ s.x, 0.0)

@@ -1,0 +1,1 @@
+"""In-house solvers to compare with: active sets, projected gradients, least squares."""

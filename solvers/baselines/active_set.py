@@ -1,0 +1,176 @@
+"""The inner iterations of `pdas`: semismooth Newton for a fixed centre."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import diags_array
+
+from harness import QP, Matrix, Vector
+from solvers.baselines.face import Faces, Solve, faces
+from solvers.common.conversion import csc, dense
+
+DELTA = 1e-9  #: δᵢ/Pᵢᵢ
+KAPPA = 1e4  #: ρ·aD⁻¹aᵀ
+PATIENCE = 10  #: changes of the active set that need not lessen what is wrong
+LEAST_SLACK = 1e-13  #: errors of signs and bounds below this are rounding
+
+
+class Active(NamedTuple):
+    """Which constraints are taken for equalities."""
+
+    side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 free
+    rows: NDArray[np.bool_]  #: (p,) of G
+
+
+class Point(NamedTuple):
+    """A point with the multipliers of its rows."""
+
+    x: Vector
+    y: Vector
+    z: Vector
+
+
+class Run(NamedTuple):
+    """The end of the inner iterations."""
+
+    active: Active
+    solve: Solve
+    at: Point
+    gradient: Vector
+    settled: bool  #: False at the iteration limit
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A QP with the weights of its proximal terms."""
+
+    qp: QP
+    A: Matrix
+    G: Matrix
+    D: Vector  #: (n,) size of the curvature of each variable
+    rho: Vector  #: (m,) of A
+    sigma: Vector  #: (p,) of G
+    faces: Faces
+    counts: Counter[str]
+
+    def gradient(self, at: Point, centre: Point) -> Vector:
+        """P x + δ(x − x_k) + q + Aᵀy + Gᵀz."""
+        self.counts["P_products"] += 1
+        force = self.qp.P @ at.x + self.A.T @ at.y + self.G.T @ at.z
+        return np.asarray(force + self.qp.q + DELTA * self.D * (at.x - centre.x))
+
+
+def penalised(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
+    """Weigh the rows, ρ = κ/(a D⁻¹aᵀ); factorise what all faces share.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
+        When P is not positive semidefinite, and that shows already.
+
+    """
+    store = dense if isinstance(qp.P, np.ndarray) else csc
+    P, A, G = store(qp.P), store(qp.A), store(qp.G)
+    D = np.array(P.diagonal())
+    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
+    D = np.where(D > 1e-12 * usual, D, usual)
+    rho, sigma = kappa / row_norms(A, D) ** 2, kappa / row_norms(G, D) ** 2
+    M = P + (A.T * rho) @ A if store is dense else P + A.T @ diags_array(rho) @ A
+    M += np.diag(DELTA * D) if store is dense else diags_array(DELTA * D)
+    unbounded = np.isinf(qp.lb) & np.isinf(qp.ub)
+    if store is dense and unbounded.any() and not qp.h.size:
+        counts["factorisations"] += 1
+    return Problem(qp, A, G, D, rho, sigma, faces(M, G, sigma, unbounded), counts)
+
+
+def row_norms(M: Matrix, D: Vector) -> Vector:
+    """Return √(a D⁻¹aᵀ) of each row a, 1 of a zero row."""
+    squares = np.asarray((M * M if isinstance(M, np.ndarray) else M.power(2)) @ (1 / D))
+    return np.asarray(np.sqrt(np.where(squares > 0, squares, 1.0)))
+
+
+def settled(
+    problem: Problem,
+    start: tuple[Active, Solve | None],
+    centre: Point,
+    slack: float,
+    max_iter: int,
+) -> Run:
+    """Change the active set until nothing is wrong with it (steps 1 and 2)."""
+    active, solve = start
+    fewest, patience = np.inf, PATIENCE
+    while True:
+        if solve is None:
+            problem.counts["factorisations"] += 1
+            solve = problem.faces(active.side == 0, active.rows)
+        at, g, trial = _newton(problem, active, centre, solve)
+        problem.counts["solves"] += 1
+        new = _predicted(
+            problem, active, Point(at.x, g, trial), max(slack, LEAST_SLACK)
+        )
+        changed = np.flatnonzero(
+            np.concatenate([new.side != active.side, new.rows != active.rows])
+        )
+        if not changed.size or problem.counts["solves"] >= max_iter:
+            return Run(active, solve, at, g, not changed.size)
+        better = changed.size < fewest
+        patience = PATIENCE if better else patience - 1
+        fewest = min(fewest, changed.size)
+        if patience < 0:
+            problem.counts["exchanges"] += 1
+            new, changed = _exchanged(active, new, changed[-1]), changed[-1:]
+        problem.counts["set_changes"] += changed.size
+        active, solve = new, None
+
+
+def _newton(
+    problem: Problem, active: Active, centre: Point, solve: Solve
+) -> tuple[Point, Vector, Vector]:
+    """Solve in the face; also return the gradient and z_k + σ(Gx − h) of all rows."""
+    qp = problem.qp
+
+    def evaluate(x: Vector) -> tuple[Point, Vector, Vector]:
+        trial = centre.z + problem.sigma * (problem.G @ x - qp.h)
+        y = centre.y + problem.rho * (problem.A @ x - qp.b)
+        at = Point(x, y, np.where(active.rows, trial, 0.0))
+        return at, problem.gradient(at, centre), trial
+
+    x = np.where(active.side < 0, qp.lb, np.where(active.side > 0, qp.ub, centre.x))
+    _, g, _ = evaluate(x)
+    return evaluate(x - solve(g))
+
+
+def _predicted(problem: Problem, active: Active, at: Point, slack: float) -> Active:
+    """Drop what has a multiplier of the wrong sign, add what is violated.
+
+    at : x, the gradient without the multipliers of bounds, and the trial multipliers of
+    all inequality rows; errors are measured in the unit √energy of √D·x
+    """
+    qp, size = problem.qp, np.sqrt(problem.D)
+    x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)
+    scale = max(x_scale, slack * np.abs(qp.q / size).max(initial=0.0))
+    below = size * (qp.lb - at.x) > x_scale
+    above = size * (at.x - qp.ub) > x_scale
+    pull = at.y / size
+    side = active.side
+    release = ((side < 0) & (pull < -scale)) | ((side > 0) & (pull > scale))
+    new = np.where(release & (qp.lb < qp.ub), 0, side)
+    new = np.where(side == 0, 1 * above - 1 * below, new).astype(np.int8)
+    push = at.z * row_norms(problem.G, problem.D)
+    rows = np.where(active.rows, push >= -scale, push > scale)
+    return Active(new, rows)
+
+
+def _exchanged(active: Active, new: Active, index: int) -> Active:
+    """Change one constraint only."""
+    side, rows = active.side.copy(), active.rows.copy()
+    if index < side.size:
+        side[index] = new.side[index]
+    else:
+        rows[index - side.size] = new.rows[index - side.size]
+    return Active(side, rows)

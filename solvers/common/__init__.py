@@ -1,0 +1,1 @@
+"""What solvers share: conversion of QPs, sequences of them, and lists of backends."""

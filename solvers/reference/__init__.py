@@ -1,0 +1,1 @@
+"""The reference solve, which shares no code with the solvers under test."""

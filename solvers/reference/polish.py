@@ -1,0 +1,159 @@
+"""The last digits: the active constraints as equations, refined in extended precision.
+
+Given which bounds and rows are active, the KKT conditions are linear. They are solved
+by Newton steps with residuals evaluated in `numpy.longdouble` (iterative refinement,
+Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) and one factor of
+
+    [P_FF + δ  B_Fᵀ]     F: variables off their bounds,
+    [B_F       −δ  ]     B: A and the active rows of G.
+
+δ makes it regular whatever P and B. What the steps converge to does not know of it:
+they are the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1), and
+end, where the solutions or the multipliers are many, near those that they start from.
+Then constraints that are violated enter the active set, those with a multiplier of the
+wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13), until
+nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import vstack
+
+from harness import QP, Matrix, Solution, Status
+from solvers.reference.saddle import saddle
+
+Extended = NDArray[np.longdouble]
+DELTA = 1e-10  #: of a QP whose largest entries are about one
+STEPS = 40  #: of refinement
+SHRINK = 0.9  #: of a step to the one before
+CHANGES = 30  #: of the active set
+ALL_AT_ONCE = 10  #: changes after which only the worst constraint changes
+ROUNDING = 4 * float(np.finfo(float).eps)  #: of signs and slacks
+
+
+class _Active(NamedTuple):
+    side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 between
+    rows: NDArray[np.bool_]  #: (p,) of G
+
+
+class _Point(NamedTuple):
+    x: Extended
+    y: Extended
+    z: Extended
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A QP with its matrices in both precisions."""
+
+    qp: QP
+    P: Matrix
+    A: Matrix
+    G: Matrix
+
+    def gradient(self, at: _Point) -> Extended:
+        """Px + q + Aᵀy + Gᵀz."""
+        g = self.P @ at.x + self.qp.q + self.A.T @ at.y + self.G.T @ at.z
+        return np.asarray(g, dtype=np.longdouble)
+
+
+@np.errstate(all="ignore")  # what diverges is not finite, and is seen
+def polished(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
+    """Give refined points, each with a better guess of the active set; few, often one.
+
+    qp : with the largest entries about one; P, A and G all dense or all sparse
+    start : near a solution, mostly of an interior-point method
+    delta : with a smaller one the steps see weaker curvature and rows nearer to others,
+        but the factor is that of a matrix nearer to singular
+    """
+    problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
+    at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
+    slack = qp.h - qp.G @ start.x
+    side = 1 * (start.z_box > qp.ub - start.x) - 1 * (-start.z_box > start.x - qp.lb)
+    side = np.where(qp.lb == qp.ub, -1, side).astype(np.int8)
+    active = _Active(side, start.z > slack)
+    for k in range(CHANGES):
+        try:
+            at = _refined(problem, active, at, delta)
+        except ArithmeticError:
+            return
+        yield replace(_rounded(problem, active, at), iterations=start.iterations)
+        new = _corrected(problem, active, at, one=k >= ALL_AT_ONCE)
+        if not any((a != b).any() for a, b in zip(new, active, strict=True)):
+            return
+        active = new
+
+
+def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _Point:
+    """Solve the KKT equations of an active set, in steps until they hardly shrink."""
+    qp, m = problem.qp, problem.qp.b.size
+    free, rows = np.flatnonzero(active.side == 0), np.flatnonzero(active.rows)
+    x = np.where(active.side < 0, qp.lb, np.where(active.side > 0, qp.ub, at.x))
+    y, z = at.y.copy(), np.where(active.rows, at.z, 0)
+    P, A, G = qp.P[free][:, free], qp.A[:, free], qp.G[rows][:, free]
+    B = np.vstack([A, G]) if isinstance(P, np.ndarray) else vstack([A, G])
+    solve = saddle(P, B, np.full(free.size, delta), np.full(B.shape[0], delta))
+    size = np.inf
+    for _ in range(STEPS):
+        r = problem.gradient(_Point(x, y, z))[free]
+        t = np.append(problem.A @ x - qp.b, (problem.G @ x - qp.h)[rows])
+        dx, rest = solve(-r.astype(float), -t.astype(float))
+        last, size = size, _sup(dx, rest)
+        if not size < SHRINK * last:
+            break
+        x[free] += dx
+        y += rest[:m]
+        z[rows] += rest[m:]
+    return _Point(x, y, z)
+
+
+def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> _Active:
+    """Let violated constraints enter and multipliers of the wrong sign leave.
+
+    Active rows that are almost dependent cannot all be met, short of huge multipliers;
+    when all else is right, those that keep a slack leave.
+
+    one : only that which is most wrong, relative to x or to the gradient
+    """
+    qp, side = problem.qp, active.side
+    g = problem.gradient(at)
+    X, S = _sup(at.x) or 1.0, _sup(g, qp.q, at.z) or 1.0
+    outside = np.maximum(qp.lb - at.x, at.x - qp.ub) / X
+    pulled = np.where(qp.lb == qp.ub, 0.0, side * g) / S
+    wrong_side = np.where(side == 0, outside, pulled)
+    violated = (problem.G @ at.x - qp.h) / X
+    wrong_rows = np.where(active.rows, -at.z / S, violated)
+    if max(wrong_side.max(initial=0), wrong_rows.max(initial=0)) < ROUNDING:
+        wrong_rows = np.where(active.rows, -violated, 0.0)
+    least = ROUNDING
+    if one:
+        least = max(
+            ROUNDING, _sup(*(np.maximum(w, 0) for w in (wrong_side, wrong_rows)))
+        )
+    change_side, change_rows = wrong_side >= least, wrong_rows >= least
+    entering = np.where(at.x < qp.lb, -1, 1)
+    new = np.where(change_side, np.where(side == 0, entering, 0), side)
+    return _Active(new.astype(np.int8), active.rows ^ change_rows)
+
+
+def _rounded(problem: _Problem, active: _Active, at: _Point) -> Solution:
+    """Round to double precision; multipliers of the bounds by stationarity."""
+    qp, side = problem.qp, active.side
+    x = np.clip(at.x.astype(float), qp.lb, qp.ub)
+    y, z = at.y.astype(float), np.maximum(at.z.astype(float), 0)
+    rounded = _Point(*(v.astype(np.longdouble) for v in (x, y, z)))
+    force = -problem.gradient(rounded).astype(float)
+    z_box = np.where(side < 0, np.minimum(force, 0), 0.0)
+    z_box = np.where(side > 0, np.maximum(force, 0), z_box)
+    z_box = np.where(qp.lb == qp.ub, force, z_box)
+    return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+
+
+def _sup(*vectors: NDArray[Any]) -> float:
+    return float(max(np.abs(v).max(initial=0.0) for v in vectors))

@@ -1,0 +1,242 @@
+"""One run of SMALBE on a QP: transformed, solved, brought back, and checked there."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from harness import QP, Solution, Status, Vector, kkt_residuals
+from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
+from solvers.smalbe.face_run import face_run
+from solvers.smalbe.history import History
+from solvers.smalbe.mprgp import FaceRun, Rules
+from solvers.smalbe.options import Options
+from solvers.smalbe.outer_loop import (
+    Constants,
+    Inner,
+    Iterate,
+    Until,
+    first_iterate,
+    smalbe,
+)
+from solvers.smalbe.preconditioner import face_preconditioner
+from solvers.smalbe.products import dense_rows
+from solvers.smalbe.projected import (
+    Projected,
+    Rows,
+    Spectrum,
+    by_lanczos,
+    by_power,
+    projected_problem,
+)
+from solvers.smalbe.spectrum import random_start
+
+STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
+CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+EPS = float(np.finfo(float).eps)
+PATIENCE = 3  #: tightenings in a row that need not halve the residuals
+WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
+
+
+class Carry(NamedTuple):
+    """What one problem of a sequence leaves for the next."""
+
+    x: Vector  #: (n,)
+    force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
+    spectrum: Spectrum
+    block: FreeBlock | None
+
+
+Solve = Callable[[], tuple[Solution, Carry | None]]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Task:
+    qp: QP
+    inner: QP  #: without the variables that were eliminated
+    eliminated: Eliminated | None
+    problem: Projected
+    options: Options
+    means: Inner
+    history: History | None
+    start: Iterate
+
+
+def prepared(
+    qp: QP, tol: float, options: Options, carry: Carry | None, *, eliminate: bool
+) -> Solve:
+    """Eliminate the free variables where asked and possible; project; look at F."""
+    history = History() if options.history else None
+    eliminated = None
+    if eliminate and options.preconditioner in WITHOUT_P:
+        eliminated = eliminate_free(qp, carry and carry.block)
+    inner = qp if eliminated is None else eliminated.qp
+    if carry is not None and carry.x.size != inner.q.size:
+        carry = None
+    problem = projected_problem(inner, partial(_find, options, carry))
+    if not problem.rows.consistent:
+        message = "the equality rows contradict each other"
+        nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
+        return lambda: (nowhere, None)
+    if eliminated is not None and eliminated.columns:
+        problem.counts["P_products"] += eliminated.columns
+        problem.counts["factorised_columns"] += eliminated.columns
+    task = _Task(
+        qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
+        means=_means(problem, inner, options, history), history=history,
+        start=_start(problem, options, carry, tol),
+    )  # fmt: skip
+    return lambda: _certified(task, tol)
+
+
+def _find(
+    options: Options,
+    carry: Carry | None,
+    PFP: Callable[[Vector], Vector],
+    rows: Rows,
+) -> Spectrum:
+    """Look at the spectrum, or take over that of the problem before.
+
+    That serves where a product with the start vector of the Lanczos process, which is
+    always the same, shows about the same quotient; and only for steps by the model,
+    which notice where it is wrong.
+    """
+    if options.norm == "power":
+        return by_power(PFP, rows)
+    if carry is not None and options.expansion == "model":
+        known = carry.spectrum.ritz
+        v = rows.project(random_start(rows.x_tilde.size))
+        now = float(v @ PFP(v)) / float(v @ v or 1.0)
+        if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
+            return carry.spectrum.orthogonal_to(rows)
+    return by_lanczos(PFP, rows, steps=options.lanczos_steps)
+
+
+def _start(
+    problem: Projected, options: Options, carry: Carry | None, tol: float
+) -> Iterate:
+    """Start from zero, or from where the problem before ended."""
+    C = problem.rows.C
+    x, mu = np.zeros(problem.b.size), np.zeros(len(C))
+    if carry is not None:
+        x, mu = carry.x, C @ carry.force / problem.spectrum.norm
+    return first_iterate(problem, x, mu, M=options.M, rho=_penalty(options, tol))
+
+
+def _penalty(options: Options, tol: float) -> float:
+    """Keep ρ, but below where the rounding of ρQν is seen in the gradient."""
+    return min(options.rho, max(1.0, tol / (10 * EPS)))
+
+
+def _means(
+    problem: Projected, qp: QP, options: Options, history: History | None
+) -> Inner:
+    """Choose what the inner problems are solved with."""
+    rules = Rules(
+        options.Gamma, options.expansion, options.proportioning, options.reduced
+    )
+    plain = partial(problem.plain_model, alpha=options.alpha)
+    return Inner(
+        rules=rules,
+        model=problem.model if options.expansion == "model" else plain,
+        precondition=face_preconditioner(problem, qp, options.preconditioner),
+        watch=None if history is None else partial(history.watch, problem),
+        run=None if history is not None else _compiled(problem, qp, options, rules),
+    )
+
+
+def _compiled(
+    problem: Projected, qp: QP, options: Options, rules: Rules
+) -> Callable[[float, Until], FaceRun] | None:
+    """Take CG steps compiled where F is dense and the preconditioner allows it."""
+    F = dense_rows(qp.P)
+    if F is None or options.preconditioner not in WITHOUT_P:
+        return None
+    with_model = options.preconditioner == "model"
+    return face_run(F, problem, rules, problem.model if with_model else None)
+
+
+def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
+    """Tighten the tolerance until the original problem's KKT residuals agree."""
+    options, problem, at = task.options, task.problem, task.start
+    constants = Constants(
+        options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
+        options.energy,
+    )  # fmt: skip
+    tighter, best, waited = 1.0, np.inf, 0
+    while True:
+        at = smalbe(problem, constants, task.means, tighter * tol, at)
+        if at.status is Status.INFEASIBLE:
+            message = "no point within the bounds meets the equality rows"
+            return Solution.without_point(task.qp, at.status, message), None
+        if not np.isfinite(at.nu).all():
+            message = "the iterates diverged"
+            return Solution.without_point(task.qp, Status.FAILED, message), None
+        point = _point(task, at)
+        worst = kkt_residuals(task.qp, point).worst
+        if worst <= CLAIM * tol:
+            return point, _carry(task, at)
+        waited = 0 if worst < best / 2 else waited + 1
+        best = min(best, worst)
+        if at.status is not Status.SOLVED or waited == PATIENCE:
+            break
+        tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
+        at = _refreshed(problem, at, _penalty(options, tighter * tol))
+    message = "no further progress: rounding, or the cost is unbounded"
+    if len(at.steps) + len(at.outer) >= options.max_steps:
+        message = "step limit"
+    return replace(point, status=Status.ITERATION_LIMIT, message=message), None
+
+
+def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
+    """Compute the gradient anew, which the steps only carried along; one product."""
+    x = problem.rows.x_tilde + at.nu
+    fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
+    return fresh._replace(outer=at.outer)
+
+
+def _carry(task: _Task, at: Iterate) -> Carry:
+    problem, eliminated = task.problem, task.eliminated
+    return Carry(
+        x=problem.rows.x_tilde + at.nu,
+        force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
+        spectrum=problem.spectrum,
+        block=eliminated and eliminated.block,
+    )
+
+
+def _point(task: _Task, at: Iterate) -> Solution:
+    """Return to the original problem, with multipliers of its rows and bounds.
+
+    Fx − d + Cᵀa is the gradient of the projected problem for a = ‖𝒫F𝒫‖μ − C(Fx − d), up
+    to rounding and ‖Cν‖; a least-squares correction on the free components, where it
+    must vanish, removes what is left.
+    """
+    qp, problem = task.inner, task.problem
+    C, y_of = problem.rows.C, problem.rows.multipliers
+    at_lower, at_upper = at.nu <= problem.bounds[0], at.nu >= problem.bounds[1]
+    x = np.where(
+        at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
+    )
+    x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
+    r = problem.F(x) + qp.q
+    free = ~(at_lower | at_upper)
+    a = problem.spectrum.norm * at.mu - C @ r
+    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free])[0]
+    r = r + C.T @ a
+    z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
+    z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)
+    problem.counts["P_products"] += 1  # of the residuals that follow
+    steps = Counter(STEPS[letter] for letter in at.steps)
+    point = Solution(
+        status=Status.SOLVED, x=x, y=y_of(a), z=np.zeros(0), z_box=z_box,
+        iterations=len(at.steps),
+        counts={**problem.counts, "outer": len(at.outer), **steps},
+        message="converged", history=task.history.columns if task.history else {},
+    )  # fmt: skip
+    return point if task.eliminated is None else task.eliminated.recover(point)

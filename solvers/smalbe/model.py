@@ -1,0 +1,138 @@
+"""A quadratic model of the operator, minimised over a box without products with it.
+
+    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
+
+U holds the directions in which H is large, with w + τ their eigenvalues, and τ stands
+for H on all others. Where B is above H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimum
+of the right side over the box is a gradient projection step in the metric of B. Without
+U it is the ordinary one, x ← P(x − g/τ), whose length is dictated by ‖H‖; with a few
+directions taken out, by the rest of the spectrum. That B is above H is tested by the
+product that each step needs anyway: where it is not, τ is raised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Vector
+from solvers.smalbe import kernels
+from solvers.smalbe.kernels import Mask
+
+NEWTON_STEPS = 100
+SEARCH_STEPS = 60
+
+
+class _Tilted(NamedTuple):
+    """What s(y) is at some y."""
+
+    s: Vector
+    piece: NDArray[np.int8]  #: at which bounds x + s is
+    slope: Vector  #: of the function of y
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """B = τI + Uᵀdiag(w)U."""
+
+    tau: float
+    U: NDArray[np.float64]  #: (k, n) orthonormal rows
+    w: Vector  #: (k,) positive
+
+    @classmethod
+    def of_norm(cls, norm: float, n: int) -> Model:
+        """B = norm·I: what is known of an H (n, n) of which only the norm is known."""
+        return cls(norm, np.zeros((0, n)), np.zeros(0))
+
+    def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
+        """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
+
+        With y = WUs as multiplier, s(y) = P(x − (g + Uᵀy)/τ) − x, and y maximises a
+        concave, piecewise quadratic function of k variables whose gradient is
+        Us(y) − W⁻¹y: Newton's method with a line search ends on the right piece.
+        """
+        U, tau, w = self.U, self.tau, self.w
+        root = np.sqrt(w)
+
+        def at(y: Vector) -> _Tilted:
+            s, piece = kernels.tilted_step(x, g + y @ U, tau, *bounds)
+            return _Tilted(s, piece, U @ s - y / w)
+
+        y: Vector = np.zeros(w.size)
+        here = at(y)
+        for _ in range(NEWTON_STEPS if w.size else 0):
+            U_f = U[:, here.piece == 0]
+            dy = root * np.linalg.solve(_core(U_f, root, tau), root * here.slope) * tau
+            there = at(y + dy)
+            if (there.piece == here.piece).all():  # where Newton's method is exact
+                return there.s
+            t, here = _searched(at, y, dy, (here, there))
+            y = y + t * dy
+        if not w.size:
+            return here.s
+        return Model.of_norm(tau + float(w.max()), x.size).step(x, g, bounds)
+
+    def raised(self, s: Vector, sHs: float) -> Model:
+        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
+        Us = self.U @ s
+        rest = float(s @ s - Us @ Us)
+        missing = sHs - self.tau * float(s @ s) - float((self.w * Us) @ Us)
+        tau = self.tau + missing / rest if rest > 0 else np.inf
+        return self.with_tail(min(max(tau, self.tau), 10 * self.tau))
+
+    def with_tail(self, tau: float) -> Model:
+        """Change τ and leave w + τ as it is, where that is above τ."""
+        w = self.w + self.tau - tau
+        return Model(tau, self.U[w > 0], w[w > 0])
+
+    def core_in(self, free: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return U_F, zero off the face F, and N with B_FF⁻¹ = (I − U_FᵀNU_F)/τ.
+
+        N = (τW⁻¹ + U_F U_Fᵀ)⁻¹ by Sherman, Morrison and Woodbury.
+        """
+        U_f, root = self.U * free, np.sqrt(self.w)
+        return U_f, root[:, None] * np.linalg.inv(_core(U_f, root, self.tau)) * root
+
+    def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
+        """Return v → B_FF⁻¹v_F, zero off the face F."""
+        U_f, core = self.core_in(free)
+
+        def apply(v: Vector) -> Vector:
+            v = np.where(free, v, 0.0)
+            return np.asarray(v - U_f.T @ (core @ (U_f @ v))) / self.tau
+
+        return apply
+
+
+def _core(U_f: NDArray[np.float64], root: Vector, tau: float) -> NDArray[np.float64]:
+    """Return τI + W¹ᐟ²U_F U_FᵀW¹ᐟ²: not below τI, however large W is."""
+    S = root[:, None] * U_f
+    return np.asarray(S @ S.T + tau * np.eye(root.size))
+
+
+def _searched(
+    at: Callable[[Vector], _Tilted],
+    y: Vector,
+    dy: Vector,
+    ends: tuple[_Tilted, _Tilted],
+) -> tuple[float, _Tilted]:
+    """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0."""
+    there = ends[1]
+    first, slope = float(ends[0].slope @ dy), float(there.slope @ dy)
+    low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
+    for _ in range(SEARCH_STEPS):
+        if abs(slope) <= 0.1 * first or (slope > 0 and t == 1) or at_low <= at_high:
+            break
+        share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+        t = low + (high - low) * min(max(share, 0.05), 0.95)
+        there = at(y + t * dy)
+        slope = float(there.slope @ dy)
+        if slope > 0:
+            low, at_low = t, slope
+        else:
+            high, at_high = t, slope
+    return t, there

@@ -1,0 +1,258 @@
+"""MPRGP: modified proportioning with reduced gradient projections.
+
+Minimises ½xᵀHx − bᵀx over l ≤ x ≤ u (Dostál 2009, the paper's reference [3], Chapter 5;
+Dostál and Schöberl 2005). With the gradient g = Hx − b, the free gradient φ (g where x
+is off its bounds), the chopped gradient β (the part of g on the bounds that leads
+inside) and the projected gradient g^P = φ + β, each step is one of
+
+* c, conjugate gradient: minimise along p on the face, if that stays feasible
+* e, expansion of the active set, by one of the `EXPANSIONS`
+* f, fallback: an expansion that raised the cost, done anew in the safe way
+* p, proportioning: free components, by one of the `PROPORTIONINGS`
+
+Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
+length ᾱ takes beyond a bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+
+from harness import Vector
+from solvers.smalbe import kernels
+from solvers.smalbe.kernels import Mask
+from solvers.smalbe.model import Model
+
+Operator = Callable[[Vector], Vector]
+Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner
+
+#: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
+#: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
+#: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
+#: model: the CG step as far as it is feasible, then a `Model.step`, its length by
+#: an exact line search (ours; 2 products, 1 where the first step was all)
+Expansion = Literal["std", "projcg", "mixed", "model"]
+#: cg: minimise along −β, as far as feasible (the book's; 1 product)
+#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product)
+Proportioning = Literal["cg", "model"]
+EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How MPRGP moves between faces."""
+
+    Gamma: float = 1.0  #: proportioning constant Γ > 0
+    expansion: Expansion = "model"
+    proportioning: Proportioning = "model"
+    reduced: bool = True  #: compare β with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
+
+
+class Point(NamedTuple):
+    """A feasible x with its gradient."""
+
+    x: Vector
+    g: Vector  #: Hx − b
+
+
+class Face(NamedTuple):
+    """The gradient split by the face on which x lies."""
+
+    free: Mask  #: components off their bounds
+    phi: Vector  #: free gradient
+    beta: Vector  #: chopped gradient
+    phi_square: float  #: ‖φ‖²
+    beta_square: float  #: ‖β‖²
+
+    @property
+    def projected_norm(self) -> float:
+        """‖g^P‖₂, zero exactly at the minimiser."""
+        return math.sqrt(self.phi_square + self.beta_square)
+
+
+class Minimum(NamedTuple):
+    """Where MPRGP stopped."""
+
+    x: Vector
+    g: Vector  #: Hx − b
+    face: Face
+    stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
+    trace: str  #: one letter per step: c, e, f, p
+
+
+Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, where
+#: letter, where, model; None where the cost falls without end
+Step = tuple[str, Point, Model] | None
+
+
+class FaceRun(Protocol):
+    """Takes CG steps in a face, as many as `mprgp` would take one after the other.
+
+    alpha : ᾱ of the reduced free gradient
+    most : steps to take
+    """
+
+    def __call__(
+        self, at: Point, p: Vector, face: Face, alpha: float, most: int
+    ) -> tuple[Point, Vector, Vector | None, int]:
+        """Return where it ended, the next direction, and the number of steps.
+
+        Third is Hp if the next CG step would leave the box, None if it is to be asked
+        again whether to stop or to proportion. Then at least one step was taken.
+        """
+
+
+class _Task(NamedTuple):
+    H: Operator
+    b: Vector
+    bounds: tuple[Vector, Vector]
+    rules: Rules
+
+
+def mprgp(
+    H: Operator,
+    b: Vector,
+    bounds: tuple[Vector, Vector],
+    start: tuple[Vector, Vector],
+    *,
+    B: Model,
+    stop: Callable[[Point, Face], bool],
+    rules: Rules,
+    precondition: Precondition | None = None,
+    watch: Watch | None = None,
+    run: FaceRun | None = None,
+    max_steps: int = 10_000,
+) -> Minimum:
+    """Minimise ½xᵀHx − bᵀx over l ≤ x ≤ u.
+
+    Parameters
+    ----------
+    H : symmetric positive semidefinite (n, n) as a function v → Hv
+    bounds : l and u (n,), possibly infinite
+    start : a feasible x (n,) and its gradient Hx − b
+    B : a model of H; ᾱ = 1/τ is the length of plain gradient projection steps
+    stop : says from the point and its face whether to stop; asked before every step
+    precondition : makes the preconditioner of the CG steps in a face
+    watch : told the letter of each step, the new point and its face
+    run : takes the CG steps, faster than one by one; `watch` is not told of them
+
+    """
+    task = _Task(H, b, bounds, rules)
+    precondition = precondition or _none
+    at, trace = Point(*start), ""
+    face = split(at, bounds)
+    z_of = precondition(face.free)
+    p = z_of(face.phi)
+    Hp: Vector | None
+    while not (done := stop(at, face)) and len(trace) < max_steps:
+        if _disproportional(task, at, face, B):
+            step = _proportion(task, at, face, B)
+        else:
+            if run is None:
+                Hp = H(p)
+            else:
+                at, p, Hp, steps = run(at, p, face, 1 / B.tau, max_steps - len(trace))
+                face, trace = split(at, bounds), trace + "c" * steps
+                if Hp is None:
+                    continue
+            step = _minimise_or_expand(task, at, p, Hp, B)
+        if step is None:
+            break
+        letter, at, B = step
+        face = split(at, bounds)
+        if letter == "c":
+            p = kernels.conjugate(z_of(face.phi), p, Hp)
+        else:
+            z_of = precondition(face.free)
+            p = z_of(face.phi)
+        trace += letter
+        if watch is not None:
+            watch(letter, at, face)
+    return Minimum(at.x, at.g, face, done, trace)
+
+
+def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
+    """Split the gradient into its free and its chopped part."""
+    return Face(*kernels.split(*at, *bounds))
+
+
+def _disproportional(task: _Task, at: Point, face: Face, B: Model) -> bool:
+    """Whether more is to be gained on the bounds than in the face."""
+    if face.beta_square == 0:
+        return False
+    free_square = face.phi_square
+    if task.rules.reduced:
+        cut = kernels.reduced(at.x, face.phi, 1 / B.tau, *task.bounds)
+        free_square = float(cut @ face.phi)
+    return face.beta_square > task.rules.Gamma**2 * free_square
+
+
+def _proportion(task: _Task, at: Point, face: Face, B: Model) -> Step:
+    """Take a step that frees components; never beyond an opposite bound."""
+    if task.rules.proportioning == "model":
+        return _model_step(task, at, B, "p")
+    p = face.beta
+    Hp = task.H(p)
+    length = min(kernels.lengths(*at, p, Hp, *task.bounds))
+    return None if math.isinf(length) else ("p", _moved(task, at, length, p, Hp), B)
+
+
+def _minimise_or_expand(
+    task: _Task, at: Point, p: Vector, Hp: Vector, B: Model
+) -> Step:
+    """Take the CG step where it is feasible, else expand the active set."""
+    H, b, bounds, rules = task
+    cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
+    if math.isinf(min(cg, feasible)):
+        return None
+    if cg <= feasible:
+        return "c", _moved(task, at, cg, p, Hp), B
+    if rules.expansion in ("projcg", "mixed") and math.isfinite(cg):
+        x = np.clip(at.x - cg * p, *bounds)
+        new = Point(x, H(x) - b)
+        if rules.expansion == "projcg" or _cost(new, b) <= _cost(at, b):
+            return "e", new, B
+    half = _moved(task, at, feasible, p, Hp)
+    if rules.expansion == "model":
+        stay = ("e", half, B) if feasible > 0 else None
+        return _model_step(task, half, B, "e") or stay
+    x = np.clip(half.x - split(half, bounds).phi / B.tau, *bounds)  # cuts φ to φ̃
+    letter = "f" if rules.expansion == "mixed" else "e"
+    return letter, Point(x, H(x) - b), B
+
+
+def _model_step(task: _Task, at: Point, B: Model, letter: str) -> Step:
+    """Minimise the model over the box, then the cost along that step.
+
+    Above H, the model makes the minimising length at least 1. Where the product shows
+    that it is not above, it is raised; the line search lessens the cost anyway.
+    """
+    s = B.step(at.x, at.g, task.bounds)
+    if not s.any():  # in rounding, nothing is left to gain
+        return None
+    Hs = task.H(s)
+    cost, feasible = kernels.lengths(*at, -s, -Hs, *task.bounds)
+    length = min(cost, max(1.0, feasible))
+    if math.isinf(length):
+        return None
+    B = B if cost >= 1 else B.raised(s, float(s @ Hs))
+    return letter, _moved(task, at, -length, s, Hs), B
+
+
+def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:
+    """Go to x − αp; the gradient follows without a product."""
+    return Point(*kernels.moved(*at, alpha, p, Hp, *task.bounds))
+
+
+def _cost(at: Point, b: Vector) -> float:
+    """Return xᵀHx − 2bᵀx, twice the cost, from the gradient."""
+    return float(at.x @ (at.g - b))
+
+
+def _none(free: Mask) -> Operator:
+    return lambda v: v

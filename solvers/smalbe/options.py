@@ -1,0 +1,68 @@
+"""The options of SMALBE."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from solvers.common.conversion import positive
+from solvers.smalbe.mprgp import EXPANSIONS, PROPORTIONINGS, Expansion, Proportioning
+from solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
+
+Norm = Literal["lanczos", "power"]
+Eliminate = Literal["never", "sequences", "always"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What one can choose."""
+
+    expansion: Expansion = "model"  #: see `solvers.smalbe.mprgp`
+    proportioning: Proportioning = "model"
+    preconditioner: Preconditioner = "model"  #: see `solvers.smalbe.preconditioner`
+    rho: float = 1e4  #: penalty ρ, relative to ‖𝒫F𝒫‖
+    rho_growth: float = 1.0  #: factor of ρ where the Lagrangian grew too little
+    M: float = 1.0  #: precision of the inner runs at the start, relative to ‖𝒫F𝒫‖
+    beta: float = 0.5  #: factor of M where the Lagrangian grew too little
+    eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
+    Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
+    reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
+    alpha: float = 1.9  #: ᾱ‖H‖ of plain gradient projection steps
+    norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖
+    lanczos_steps: int = 12  #: products spent on it
+    # only with the preconditioners model and none: the others need all of P
+    eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
+    energy: float = 50.0  #: estimated energy error/tol to reach, too; 0: whatever
+    history: bool = False  #: keep a row per step
+    max_steps: int = 20_000  #: of MPRGP and outer iterations, in total
+
+    def __post_init__(self) -> None:
+        positive(
+            rho=self.rho, M=self.M, eta=self.eta, Gamma=self.Gamma, alpha=self.alpha,
+            lanczos_steps=self.lanczos_steps, max_steps=self.max_steps,
+        )  # fmt: skip
+        if not 0 < self.beta < 1:
+            raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
+        if not 0 <= self.energy < np.inf:
+            raise ValueError(
+                f"energy = {self.energy}; expected 0, or a positive number"
+            )
+        if not self.rho_growth >= 1:
+            raise ValueError(f"rho_growth = {self.rho_growth}; expected at least 1")
+        if not self.alpha <= 2:
+            raise ValueError(f"alpha = {self.alpha}; expected at most 2")
+        choices = {
+            "expansion": EXPANSIONS, "proportioning": PROPORTIONINGS,
+            "preconditioner": PRECONDITIONERS, "norm": get_args(Norm),
+            "eliminate": get_args(Eliminate),
+        }  # fmt: skip
+        for name, known in choices.items():
+            if (value := getattr(self, name)) not in known:
+                raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")
+        if self.norm == "power" and "model" in (self.expansion, self.preconditioner):
+            raise ValueError(
+                "norm = 'power' finds no Ritz vectors; expected 'lanczos', or "
+                "expansion and preconditioner other than 'model'"
+            )

@@ -1,0 +1,218 @@
+"""The outer loop of SMALBE: multipliers of the equality rows, and how precise to be.
+
+Minimises ½νᵀHν − bᵀν subject to Cν = 0 and bounds, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
+Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
+Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …:
+
+1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
+2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖² since the
+   last k: M ← βM, and ρ ← ρ·growth.
+3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed.
+
+until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
+is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
+What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
+‖b‖ may be the gap of supports, beside which contact is small.
+
+Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
+MOST_RHO; and CᵀCν is tried as proof that there is no feasible point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from harness import Status, Vector
+from solvers.smalbe.model import Model
+from solvers.smalbe.mprgp import (
+    Face,
+    FaceRun,
+    Minimum,
+    Point,
+    Precondition,
+    Rules,
+    Watch,
+    mprgp,
+)
+from solvers.smalbe.projected import Projected
+
+REACH = 1e6  #: how far to look for feasible points where there is no bound
+NOISE = 1e-12  #: what rounding may leave in sums of products
+MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The constants of the outer loop, relative to ‖𝒫F𝒫‖."""
+
+    M: float
+    beta: float
+    eta: float
+    rho_growth: float
+    max_steps: int
+    energy: float = 0.0  #: estimated energy error/tol to reach; 0: none
+
+
+class Until(NamedTuple):
+    """When an inner run may end."""
+
+    small: float  #: ‖g^P‖ ≤ small
+    coarse: float  #: … or ‖g^P‖ < coarse and ‖g^P‖ < M‖Cν‖
+    M: float
+
+
+@dataclass(frozen=True, eq=False)
+class Inner:
+    """How the inner problems are solved, for each ρ."""
+
+    rules: Rules
+    model: Callable[[float], Model]
+    precondition: Callable[[float], Precondition | None]
+    watch: Callable[[int, Vector], Watch] | None = None
+    """Makes the observer of outer iteration k with that right-hand side."""
+    run: Callable[[float, Until], FaceRun] | None = None  #: compiled CG steps
+
+
+class Outer(NamedTuple):
+    """One outer iteration, as it ended."""
+
+    trace: str  #: the steps of its inner run
+    M: float  #: with which that ran
+    rho: float  #: with which that ran
+    infeasibility: float  #: ‖Cν‖
+    lagrangian: float  #: L(ν, μ), μ as in the inner run
+
+
+class Iterate(NamedTuple):
+    """The state of the outer loop."""
+
+    nu: Vector  #: (n,)
+    g: Vector  #: Hν − b + Cᵀμ
+    mu: Vector  #: (r,) multipliers of Cν = 0, relative to ‖𝒫F𝒫‖
+    M: float
+    rho: float
+    outer: tuple[Outer, ...] = ()
+    status: Status = Status.ITERATION_LIMIT
+
+    @property
+    def steps(self) -> str:
+        """All inner steps so far, one letter each."""
+        return "".join(o.trace for o in self.outer)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether neither of the last two outer iterations halved ‖Cν‖."""
+        errors = [o.infeasibility for o in self.outer[-3:]]
+        return len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
+
+
+def first_iterate(
+    problem: Projected, x: Vector, mu: Vector, *, M: float, rho: float
+) -> Iterate:
+    """Start from x, moved into the bounds, and μ; one product."""
+    nu = np.clip(x - problem.rows.x_tilde, *problem.bounds)
+    g = problem.H(nu, rho) - problem.b + problem.rows.C.T @ mu
+    return Iterate(nu, g, mu, M, rho)
+
+
+def smalbe(
+    problem: Projected, constants: Constants, inner: Inner, tol: float, at: Iterate
+) -> Iterate:
+    """Run the outer loop on from `at`."""
+    C, b = problem.rows.C, problem.b
+    b_size = _norm(b) or _norm(at.g)
+    left = constants.max_steps - len(at.steps) - len(at.outer)
+    lagrangian = -np.inf
+    until = Until(tol * b_size, constants.eta * b_size, at.M)
+
+    def accurate(here: Point, face: Face) -> bool:
+        error = problem.energy_error(here.x, face.phi + face.beta)
+        return error <= constants.energy * tol
+
+    def small(here: Point, face: Face) -> bool:
+        return (
+            face.projected_norm <= until.small
+            and problem.rows.met(here.x, tol, b_size)
+            and (not constants.energy or accurate(here, face))
+        )
+
+    def precise(here: Point, face: Face) -> bool:
+        size = face.projected_norm
+        if len(C) and size < until.coarse and size < at.M * _norm(C @ here.x):
+            return True
+        return small(here, face)
+
+    while True:
+        rhs = b - C.T @ at.mu
+        run = mprgp(
+            partial(problem.H, rho=at.rho), rhs, problem.bounds, (at.nu, at.g),
+            B=inner.model(at.rho), stop=precise, rules=inner.rules,
+            precondition=inner.precondition(at.rho),
+            watch=inner.watch and inner.watch(len(at.outer), rhs),
+            run=inner.run and inner.run(at.rho, until._replace(M=at.M)),
+            max_steps=max(left, 0),
+        )  # fmt: skip
+        left -= len(run.trace) + 1
+        at = _updated(problem, constants, at, run, lagrangian)
+        lagrangian = at.outer[-1].lagrangian
+        if small(Point(run.x, run.g), run.face):
+            return at._replace(status=Status.SOLVED)
+        if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
+            return at._replace(status=Status.INFEASIBLE)
+        if not run.stopped or left < 0 or (at.stalled and at.rho >= MOST_RHO):
+            return at
+        if at.stalled:
+            at = _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
+
+
+def _updated(
+    problem: Projected, constants: Constants, at: Iterate, run: Minimum, before: float
+) -> Iterate:
+    """Do steps 2 and 3 after an inner run; `before` is the Lagrangian of the last."""
+    C, rho = problem.rows.C, at.rho
+    Cnu = C @ run.x
+    lagrangian = float(0.5 * run.x @ (run.g - problem.b + C.T @ at.mu))
+    enough = lagrangian >= before + rho / 2 * (Cnu @ Cnu)
+    done = Outer(run.trace, at.M, rho, _norm(Cnu), lagrangian)
+    new = at._replace(
+        nu=run.x,
+        g=run.g + rho * (C.T @ Cnu),
+        mu=at.mu + rho * Cnu,
+        M=at.M if enough else constants.beta * at.M,
+        outer=(*at.outer, done),
+    )
+    if enough or constants.rho_growth == 1:
+        return new
+    return _with_penalty(problem, new, constants.rho_growth * rho)
+
+
+def _infeasible(problem: Projected, nu: Vector) -> bool:
+    """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
+
+    By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum
+    of rᵀν' over the box is positive.
+    """
+    rows, (lower, upper) = problem.rows, problem.bounds
+    Cnu = rows.C @ nu
+    r = rows.C.T @ Cnu
+    size = _norm(rows.x_tilde) + _norm(nu)
+    far = REACH * size
+    ends = np.where(r > 0, lower, upper)
+    box = np.where(np.isinf(ends), np.copysign(far, ends), ends)
+    noise = NOISE / rows.least_pivot * (_norm(Cnu) * size + float(np.abs(r * nu).sum()))
+    return float(r @ box) > noise
+
+
+def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:
+    """Change ρ; the gradient follows without a product."""
+    Qnu = problem.rows.C.T @ (problem.rows.C @ at.nu)
+    return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu)
+
+
+def _norm(v: Vector) -> float:
+    return float(np.linalg.norm(v))

@@ -1,0 +1,105 @@
+"""Preconditioners of the CG steps in a face F of the box.
+
+All are masked: z_F = (M φ_F)_F with one M for every face, but for `model`, which is
+inverted in the face. The structural ones, for a dual with F = BK⁺Bᵀ, are
+
+    lumped      M = B_D K_bb B_Dᵀ
+    dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
+
+where b are the components that B touches, i the others, and B_D = (BWBᵀ)⁻¹BW with the
+compliances W = diag(K_bb)⁻¹ as weights, so that where bodies meet the softer one takes
+more of a jump (Rixen and Farhat 1999). Inside SMALBE they work between the projectors:
+‖𝒫F𝒫‖ 𝒫M𝒫 + Q/ρ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, get_args
+
+import numpy as np
+from scipy.sparse import csc_matrix, diags_array
+from sksparse.cholmod import cholesky
+
+from harness import QP, Structure, Vector
+from solvers.smalbe.kernels import Mask
+from solvers.smalbe.mprgp import Operator, Precondition
+from solvers.smalbe.projected import Projected
+
+Preconditioner = Literal["model", "diagonal", "lumped", "dirichlet", "none"]
+PRECONDITIONERS = get_args(Preconditioner)
+DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
+
+
+def lacking(qp: QP, kind: Preconditioner) -> str | None:
+    """Say what `qp` lacks for this preconditioner, or None."""
+    if kind == "diagonal" and not qp.is_explicit:
+        return "preconditioner 'diagonal' needs an explicit P"
+    if kind in ("lumped", "dirichlet") and qp.structure is None:
+        return f"preconditioner {kind!r} needs a QP with structure; 'diagonal' does not"
+    return None
+
+
+def face_preconditioner(
+    problem: Projected, qp: QP, kind: Preconditioner
+) -> Callable[[float], Precondition | None]:
+    """Set up once; the result makes, for each ρ, what `mprgp` takes."""
+    if kind == "none":
+        return lambda rho: None
+    if kind == "model":
+        return lambda rho: problem.model(rho).inverse_in
+    M = _whole(qp, kind)
+
+    def between_projectors(v: Vector, rho: float) -> Vector:
+        problem.counts["preconditioner_applies"] += 1
+        Pv = problem.rows.project(v)
+        return problem.spectrum.norm * problem.rows.project(M(Pv)) + (v - Pv) / rho
+
+    def in_face(free: Mask, rho: float) -> Operator:
+        return lambda v: np.where(
+            free, between_projectors(np.where(free, v, 0), rho), 0
+        )
+
+    return lambda rho: partial(in_face, rho=rho)
+
+
+def _whole(qp: QP, kind: Preconditioner) -> Operator:
+    """Return M as a function."""
+    if kind == "diagonal":
+        diagonal = qp.P.diagonal()
+        inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
+        return lambda v: inverse * v
+    if qp.structure is None:
+        raise ValueError(lacking(qp, kind))
+    return _structural(qp.structure, _lumped if kind == "lumped" else _schur)
+
+
+def _structural(
+    structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
+) -> Operator:
+    """Return B_D S B_Dᵀ with the stiffness S of the interface."""
+    acting = np.ones(structure.K.shape[0], dtype=bool)
+    acting[structure.fixed] = False
+    K = csc_matrix(structure.K)[acting][:, acting]
+    B = csc_matrix(csc_matrix(structure.B)[:, acting])
+    touched = np.diff(B.indptr) > 0
+    stiffness = of_interface(K, touched)
+    B = B[:, touched]
+    BW = B @ diags_array(1 / K.diagonal()[touched])
+    jump = csc_matrix(BW @ B.T)
+    jump += csc_matrix(diags_array(DEPENDENT * jump.diagonal()))
+    solve = cholesky(jump)
+    return lambda v: solve(BW @ stiffness(BW.T @ solve(v)))
+
+
+def _lumped(K: csc_matrix, touched: Mask) -> Operator:
+    K_bb = K[touched][:, touched]
+    return lambda u: K_bb @ u
+
+
+def _schur(K: csc_matrix, touched: Mask) -> Operator:
+    """Apply S_bb: one solve with K_ii."""
+    K_bb, K_ib = K[touched][:, touched], csc_matrix(K[~touched][:, touched])
+    solve = cholesky(csc_matrix(K[~touched][:, ~touched]))
+    return lambda u: K_bb @ u - K_ib.T @ solve(K_ib @ u)
