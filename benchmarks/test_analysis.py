@@ -9,11 +9,11 @@ from time import perf_counter
 
 import pytest
 
-from problems.beam_ring import model
-from problems.bodies import clamped, floating
-from problems.contact import node_to_segment
-from problems.dual import dual_bounds, dualise
-from problems.stepping import LoadPath
+from problems.contact.bodies import clamped, floating
+from problems.contact.node_to_segment import node_to_segment
+from problems.duality.dualisation import dual_bounds, dualise
+from problems.duality.stepping import LoadPath
+from problems.families.beam_ring import model
 from solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}

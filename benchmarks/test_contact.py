@@ -5,11 +5,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from problems.beam_ring import model
-from problems.contact import node_to_segment
-from problems.mortar import mortar
-from problems.polyline import polyline
-from problems.search import nearest
+from problems.contact.mortar import mortar
+from problems.contact.node_to_segment import node_to_segment
+from problems.contact.polyline import polyline
+from problems.contact.segment_search import nearest
+from problems.families.beam_ring import model
 
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])

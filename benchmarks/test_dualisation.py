@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from problems.beam_ring import BeamRing, model
-from problems.bodies import floating
-from problems.dual import dualise
+from problems.contact.bodies import floating
+from problems.duality.dualisation import dualise
+from problems.families.beam_ring import BeamRing, model
 from solvers.reference.solve import reference_solution
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from problems.beam_ring import BEAM, BeamRing, model
-from problems.bodies import clamped, floating
-from problems.contact import node_to_segment
-from problems.dual import dualise
-from problems.elasticity import elasticity_matrix, stiffness
+from problems.contact.bodies import clamped, floating
+from problems.contact.node_to_segment import node_to_segment
+from problems.duality.dualisation import dualise
+from problems.families.beam_ring import BEAM, BeamRing, model
+from problems.fem.elasticity import elasticity_matrix, stiffness
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 

@@ -1,12 +1,12 @@
 """Families of problems: each emits the same contact problem as several QPs."""
 
 from harness import Family
-from problems.beam_ring import BeamRing
-from problems.files import FromFile
-from problems.gmsh_bodies import GmshBodies
-from problems.hertz import HertzCylinder, HertzPlane
-from problems.obstacle import Obstacle
-from problems.patch import ContactPatch
+from problems.families.beam_ring import BeamRing
+from problems.families.gmsh_bodies import GmshBodies
+from problems.families.hertz import HertzCylinder, HertzPlane
+from problems.families.obstacle import Obstacle
+from problems.families.patch import ContactPatch
+from problems.files.from_file import FromFile
 
 FAMILIES: tuple[Family, ...] = (
     BeamRing(),

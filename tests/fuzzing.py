@@ -16,7 +16,7 @@ from harness.matfile import save_mat
 from harness.parquetfile import save_parquet
 from harness.qpfile import save_qp
 from problems import PROBLEMS
-from problems.msh import read_msh
+from problems.fem.gmsh_mesh import read_msh
 
 EXTREMES = (
     0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from harness import Case, Mechanics
 from harness.mechanics import Extended, Real
-from problems.bodies import ContactPair, assemble, clamped, floating, supported
-from problems.elasticity import Material
-from problems.emit import contact_case
-from problems.linearise import linearisation
-from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.results import quantities
-from problems.stepping import primal_qp
+from problems.contact.bodies import ContactPair, assemble, clamped, floating, supported
+from problems.contact.linearise import linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import primal_qp
+from problems.fem.elasticity import Material
+from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 
 PRESSURE = 1e7  #: Pa
 

@@ -8,11 +8,11 @@ import pytest
 from harness import InputError, kkt_residuals
 from harness.suite import load_suite
 from harness.workbench import SUITES
-from problems.beam_ring import BeamRing, _path, model
-from problems.bodies import clamped, floating
-from problems.contact import node_to_segment
-from problems.dual import dual_bounds, dualise
-from problems.stepping import primal_qp
+from problems.contact.bodies import clamped, floating
+from problems.contact.node_to_segment import node_to_segment
+from problems.duality.dualisation import dual_bounds, dualise
+from problems.duality.stepping import primal_qp
+from problems.families.beam_ring import BeamRing, _path, model
 from solvers import SOLVERS
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP

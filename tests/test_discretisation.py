@@ -24,8 +24,8 @@ from harness.halving import prolongation
 from harness.names import completed, parse
 from harness.references import reference_point
 from problems import PROBLEMS
-from problems.hertz import halved
-from problems.obstacle import exact_energy, exact_height, obstacle_problem
+from problems.families.hertz import halved
+from problems.families.obstacle import exact_energy, exact_height, obstacle_problem
 from solvers.reference.solve import reference_solution
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from harness import kkt_residuals
 from harness.describe import about, solvers_page
 from harness.registry import load_plugin
-from problems.beam_ring import BeamRing
+from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 

@@ -8,12 +8,12 @@ from scipy.sparse import csc_array, csr_array
 
 from harness import QP, Solution, Status, kkt_residuals, no_rows
 from problems import PROBLEMS
-from problems.beam_ring import _clamped, _floating
-from problems.dual import dual_bounds, dualise
-from problems.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.fixing import fixing_nodes, spectral_fixing_nodes
-from problems.inverse import floating_inverse, regular_inverse
-from problems.mesh import dofs_of, half_ring, join, rectangle
+from problems.duality.dualisation import dual_bounds, dualise
+from problems.families.beam_ring import _clamped, _floating
+from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
+from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
+from problems.fem.inverse import floating_inverse, regular_inverse
+from problems.fem.mesh import dofs_of, half_ring, join, rectangle
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 

@@ -16,8 +16,8 @@ from harness.qpfile import load_qp, save_qp
 from harness.registry import SolverSpec, resolve
 from harness.workbench import Workbench
 from problems import PROBLEMS
-from problems.qps import parse_qps
-from problems.twosided import one_sided
+from problems.files.qps import parse_qps
+from problems.files.two_sided import one_sided
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 

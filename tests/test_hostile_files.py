@@ -25,7 +25,7 @@ from harness.qpfile import load_qp, save_qp
 from harness.recipe import Recipe
 from harness.workbench import Workbench
 from problems import PROBLEMS
-from problems.msh import read_msh
+from problems.fem.gmsh_mesh import read_msh
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.fuzzing import MSH_41, QPS, fuzz, msh_22, tiny_qp

@@ -18,7 +18,7 @@ from harness import (
     verdict,
 )
 from harness.planted import planted
-from problems.beam_ring import BeamRing
+from problems.families.beam_ring import BeamRing
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP
 from solvers.adapters.proxqp_ import ProxQP

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from problems.beam_ring import model
-from problems.mesh import (
+from problems.families.beam_ring import model
+from problems.fem.mesh import (
     half_disc,
     half_ring,
     join,

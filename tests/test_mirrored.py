@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.sparse import diags_array
 
-from problems.beam_ring import model
-from problems.bodies import ContactPair, assemble, clamped, floating
-from problems.emit import contact_case
-from problems.linearise import linearisation
-from problems.results import quantities
-from problems.stepping import LoadPath
+from problems.contact.bodies import ContactPair, assemble, clamped, floating
+from problems.contact.linearise import linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import LoadPath
+from problems.families.beam_ring import model
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from harness import InputError
-from problems import mortar as module
-from problems.beam_ring import model
-from problems.mortar import cast_rays, integrate, mortar, overlaps, project
-from problems.polyline import polyline
-from problems.search import Reach
+from problems.contact import mortar as module
+from problems.contact.mortar import cast_rays, integrate, mortar, overlaps, project
+from problems.contact.polyline import polyline
+from problems.contact.segment_search import Reach
+from problems.families.beam_ring import model
 
 BASES = ["dual", "standard"]
 ANY_ANGLE = Reach(cosine=1.0)

@@ -15,15 +15,15 @@ from matplotlib import image
 from harness import InputError, Record, Verdict
 from harness.experiment import Experiment, load_experiment, save_experiment
 from harness.journal import Journal
-from problems.beam_ring import BEAM
-from problems.elasticity import elasticity_matrix, stiffness
 from problems.experiments import QUICK, paper_experiment
 from problems.experiments.analysis import WAYS, analyse
 from problems.experiments.clock import Rounds, Stopwatch, race, whole
 from problems.experiments.physics import stepping
-from problems.inverse import Factorised
-from problems.mesh import half_ring
-from problems.triplets import stiffness_by_triplets
+from problems.families.beam_ring import BEAM
+from problems.fem.elasticity import elasticity_matrix, stiffness
+from problems.fem.inverse import Factorised
+from problems.fem.mesh import half_ring
+from problems.fem.triplets import stiffness_by_triplets
 from reports.data import Evidence, arrange, read_evidence
 from reports.figures import save_all
 from reports.paper import write_paper

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from harness import InputError, kkt_residuals
-from problems.mesh import as_vectors
-from problems.patch import ContactPatch, model
+from problems.families.patch import ContactPatch, model
+from problems.fem.mesh import as_vectors
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE

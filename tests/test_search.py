@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from harness import InputError
-from problems import search
-from problems.polyline import polyline
-from problems.search import Reach, facing, nearest
+from problems.contact import segment_search as search
+from problems.contact.polyline import polyline
+from problems.contact.segment_search import Reach, facing, nearest
 
 
 def all_pairs(x, chain):

@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 from harness import QP, Status, kkt_residuals
 from harness.planted import infeasible, one_of_each, unbounded
 from harness.registry import options_of
-from problems.beam_ring import BeamRing
+from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.adapters.cvxpy_ import REFUSED
 from solvers.common.conversion import csc, on_present_bounds

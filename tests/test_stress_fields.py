@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from harness import Solution, Status
-from problems.beam_ring import model
-from problems.contact import node_to_segment
-from problems.elasticity import elasticity_matrix
-from problems.results import fields, nodal_stresses
-from problems.stepping import primal_qp
+from problems.contact.node_to_segment import node_to_segment
+from problems.contact.results import fields, nodal_stresses
+from problems.duality.stepping import primal_qp
+from problems.families.beam_ring import model
+from problems.fem.elasticity import elasticity_matrix
 
 STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
 

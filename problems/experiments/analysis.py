@@ -12,16 +12,16 @@ from dataclasses import dataclass
 from functools import partial
 
 from harness import QP, Fields, Reference, Solution, Status, Vector
-from problems.beam_ring import model
-from problems.bodies import Bodies, floating
-from problems.contact import ContactRows
-from problems.dual import dualise
+from problems.contact.bodies import Bodies, floating
+from problems.contact.linearise import linearisation
+from problems.contact.node_to_segment import ContactRows
+from problems.contact.results import fields
+from problems.duality.dualisation import dualise
+from problems.duality.stepping import LoadPath
 from problems.experiments.clock import Laps, Stopwatch, race
 from problems.experiments.parts import Rows
 from problems.experiments.plan import Plan
-from problems.linearise import linearisation
-from problems.results import fields
-from problems.stepping import LoadPath
+from problems.families.beam_ring import model
 
 WAYS = {"per-row": False, "condensed": True}  #: condense?
 

@@ -10,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Value
-from problems.beam_ring import BEAM, LENGTH, LOAD, model
-from problems.contact import node_to_segment
-from problems.elasticity import elasticity_matrix, rigid_modes, sparsity, stiffness
+from problems.contact.mortar import mortar
+from problems.contact.node_to_segment import node_to_segment
 from problems.experiments.clock import Laps, Stopwatch, race, whole
 from problems.experiments.plan import Plan
-from problems.fixing import fixing_nodes, spectral_fixing_nodes
-from problems.inverse import floating_inverse
-from problems.mesh import Mesh, Nodes, rectangle
-from problems.mortar import mortar
-from problems.triplets import stiffness_by_triplets
+from problems.families.beam_ring import BEAM, LENGTH, LOAD, model
+from problems.fem.elasticity import elasticity_matrix, rigid_modes, sparsity, stiffness
+from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
+from problems.fem.inverse import floating_inverse
+from problems.fem.mesh import Mesh, Nodes, rectangle
+from problems.fem.triplets import stiffness_by_triplets
 
 Rows = Iterator[dict[str, Value]]
 

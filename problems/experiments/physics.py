@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from harness import Reference, Value
-from problems.beam_ring import LENGTH, model
-from problems.bodies import Bodies, clamped
+from problems.contact.bodies import Bodies, clamped
+from problems.contact.linearise import linearisation
+from problems.contact.results import quantities
+from problems.duality.stepping import LoadPath
 from problems.experiments.parts import Rows
 from problems.experiments.plan import Plan
-from problems.hertz import HertzCylinder
-from problems.linearise import linearisation
-from problems.mesh import dofs_of, nodal_lengths
-from problems.patch import ContactPatch
-from problems.results import quantities
-from problems.stepping import LoadPath
+from problems.families.beam_ring import LENGTH, model
+from problems.families.hertz import HertzCylinder
+from problems.families.patch import ContactPatch
+from problems.fem.mesh import dofs_of, nodal_lengths
 
 SETTLED = (2, 8)  #: steps, linearisations of each: further ones change nothing
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from harness import Vector
-from problems.mesh import Mesh, dofs_of
+from problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
 
@@ -95,7 +95,8 @@ def stiffness(
     pattern : of the mesh, where it is known
 
     """
-    from problems.kernels import add_stiffness  # late: importing numba takes a while
+    # late: importing numba takes a while
+    from problems.fem.kernels import add_stiffness
 
     pattern = pattern or sparsity(mesh)
     if material is None:
@@ -121,7 +122,7 @@ class Pattern:
 
 def sparsity(mesh: Mesh) -> Pattern:
     """Find the pattern of K, once for all values."""
-    from problems.kernels import dof_pattern, node_pattern, slots
+    from problems.fem.kernels import dof_pattern, node_pattern, slots
 
     cells = mesh.cells.astype(np.int32)
     ptr, idx = node_pattern(cells, len(mesh.points))

@@ -21,15 +21,22 @@ from typing import Any
 import numpy as np
 
 from harness import Case, InputError, Reference, Value
-from problems.bodies import Bodies, ContactPair, assemble, clamped, floating
-from problems.elasticity import Material, Plane
-from problems.emit import FORMS, contact_case
-from problems.inverse import GeneralisedInverse
-from problems.linearise import METHODS, linearisation
-from problems.mesh import dofs_of, half_ring, join, rectangle
-from problems.ranges import MOST_STEPS, at_least, at_most, doubled, fits, one_of
-from problems.results import quantities
-from problems.stepping import LoadPath
+from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.contact.linearise import METHODS, linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import FORMS, contact_case
+from problems.duality.stepping import LoadPath
+from problems.families.ranges import (
+    MOST_STEPS,
+    at_least,
+    at_most,
+    doubled,
+    fits,
+    one_of,
+)
+from problems.fem.elasticity import Material, Plane
+from problems.fem.inverse import GeneralisedInverse
+from problems.fem.mesh import dofs_of, half_ring, join, rectangle
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m

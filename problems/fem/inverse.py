@@ -30,7 +30,7 @@ from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze
 
 from harness import Matrix, Vector
-from problems.mesh import Nodes, dofs_of
+from problems.fem.mesh import Nodes, dofs_of
 
 
 class GeneralisedInverse(Protocol):

@@ -46,12 +46,12 @@ from harness import InputError, Value, checked
 from harness.checked import located
 from harness.errors import shown, unknown
 from harness.reading import read_toml
-from problems.bodies import Bodies, ContactPair, assemble
-from problems.elasticity import Material
-from problems.linearise import METHODS
-from problems.mesh import Mesh, Nodes
-from problems.msh import NamedMesh, read_msh
-from problems.ranges import MOST_STEPS
+from problems.contact.bodies import Bodies, ContactPair, assemble
+from problems.contact.linearise import METHODS
+from problems.families.ranges import MOST_STEPS
+from problems.fem.elasticity import Material
+from problems.fem.gmsh_mesh import NamedMesh, read_msh
+from problems.fem.mesh import Mesh, Nodes
 
 #: what a case name may set, too, with the value where the file says nothing
 SETTINGS: Mapping[str, Value] = {

@@ -32,15 +32,22 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Reference, Solution, Value, Vector
-from problems.bodies import Bodies, ContactPair, assemble, clamped, floating, supported
-from problems.contact import ContactRows
-from problems.elasticity import Material, Plane
-from problems.emit import contact_case
-from problems.linearise import METHODS, linearisation
-from problems.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
-from problems.ranges import at_least, at_most, fits, one_of, positive
-from problems.results import contact_forces, quantities
-from problems.stepping import primal_qp
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
+from problems.contact.linearise import METHODS, linearisation
+from problems.contact.node_to_segment import ContactRows
+from problems.contact.results import contact_forces, quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import primal_qp
+from problems.families.ranges import at_least, at_most, fits, one_of, positive
+from problems.fem.elasticity import Material, Plane
+from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
 
 RADIUS = 8e-3  #: m
 MATERIAL = Material(E=200e9, nu=0.3)

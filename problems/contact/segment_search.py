@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import InputError, Vector
-from problems.mesh import Nodes
-from problems.polyline import Points, Polyline, cross
+from problems.contact.polyline import Points, Polyline, cross
+from problems.fem.mesh import Nodes
 
 BRANCHES = 4
 ROOTS = 16  #: levels with fewer sub-chains than this are not worth a visit

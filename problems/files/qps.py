@@ -28,7 +28,7 @@ from scipy.sparse import coo_array
 
 from harness import InputError
 from harness.errors import shortened, unknown
-from problems.twosided import TwoSided
+from problems.files.two_sided import TwoSided
 
 _NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",

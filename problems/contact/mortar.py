@@ -48,10 +48,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from harness import Vector
-from problems.contact import ContactRows
-from problems.mesh import Nodes
-from problems.polyline import Points, Polyline, cross, current_polyline, unit
-from problems.search import Reach, facing
+from problems.contact.node_to_segment import ContactRows
+from problems.contact.polyline import Points, Polyline, cross, current_polyline, unit
+from problems.contact.segment_search import Reach, facing
+from problems.fem.mesh import Nodes
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
 NEGLIGIBLE = 1e-8

@@ -8,7 +8,7 @@ order in the total displacement u, with slave and parameters held,
     (x_s − x_c)·n ≥ 0    ⟺    B u ≤ c,    B = [−n at s, +N_a n at a],  c = g + B u^k
 
 (the paper's B_M u ≤ c_M; its "Mortar" is this pointwise condition, which fails the
-contact patch test; problems.mortar passes it). The normal is
+contact patch test; problems.contact.mortar passes it). The normal is
 
 * "segment": of the segment that holds the closest point, and where that is a vertex the
   averaged normal of the segments that meet. Where the closest point is inside a
@@ -29,8 +29,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness import Vector
-from problems.mesh import Nodes
-from problems.polyline import (
+from problems.contact.polyline import (
     Points,
     Polyline,
     current_polyline,
@@ -38,7 +37,8 @@ from problems.polyline import (
     polyline,
     unit,
 )
-from problems.search import Reach, nearest
+from problems.contact.segment_search import Reach, nearest
+from problems.fem.mesh import Nodes
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 

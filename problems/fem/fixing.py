@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import eigsh
 
 from harness import Matrix
-from problems.mesh import Nodes
+from problems.fem.mesh import Nodes
 
 PARTS = 4  #: per body; fewer condition worse, more fill the factor
 

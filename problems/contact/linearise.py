@@ -10,9 +10,9 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from harness import InputError, Vector
-from problems.bodies import Bodies
-from problems.contact import ContactRows, node_to_segment
-from problems.mortar import mortar
+from problems.contact.bodies import Bodies
+from problems.contact.mortar import mortar
+from problems.contact.node_to_segment import ContactRows, node_to_segment
 
 #: values of the keys that choose the method; node-to-segment takes no notice of basis
 METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from harness import QP, Case, Grid, Mechanics, Solution
-from problems.bodies import Bodies
-from problems.dual import Transformed, dual_bounds, dualise
-from problems.inverse import GeneralisedInverse
-from problems.results import fields
+from problems.contact.bodies import Bodies
+from problems.contact.results import fields
+from problems.duality.dualisation import Transformed, dual_bounds, dualise
+from problems.fem.inverse import GeneralisedInverse
 
 FORMS = ("primal", "dual", "dual-bounds")
 

@@ -1,6 +1,6 @@
 """A user's own bodies: ``bodies:PATH.toml/key=value/…/FORM``.
 
-The TOML file is described in `problems.description`.
+The TOML file is described in `problems.families.description`.
 """
 
 from __future__ import annotations
@@ -15,15 +15,20 @@ from typing import Any
 import numpy as np
 
 from harness import QP, Case, InputError, Reference, Value
-from problems.bodies import Bodies, clamped, floating, supported
-from problems.content import check_digest, digest
-from problems.description import CHOICES, SETTINGS, described_bodies, read_description
-from problems.emit import FORMS, contact_case
-from problems.inverse import GeneralisedInverse
-from problems.linearise import linearisation
-from problems.ranges import MOST_STEPS, at_least, at_most, one_of
-from problems.results import quantities
-from problems.stepping import LoadPath, primal_qp
+from problems.contact.bodies import Bodies, clamped, floating, supported
+from problems.contact.linearise import linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import FORMS, contact_case
+from problems.duality.stepping import LoadPath, primal_qp
+from problems.families.description import (
+    CHOICES,
+    SETTINGS,
+    described_bodies,
+    read_description,
+)
+from problems.families.ranges import MOST_STEPS, at_least, at_most, one_of
+from problems.fem.inverse import GeneralisedInverse
+from problems.files.file_digest import check_digest, digest
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,10 @@ from harness import (
     Vector,
     no_rows,
 )
-from problems.dual import Transformed, dual_bounds
-from problems.inverse import GeneralisedInverse, regular_inverse
-from problems.ranges import at_least, doubled, fits, one_of
-from problems.results import ACTIVE
+from problems.contact.results import ACTIVE
+from problems.duality.dualisation import Transformed, dual_bounds
+from problems.families.ranges import at_least, doubled, fits, one_of
+from problems.fem.inverse import GeneralisedInverse, regular_inverse
 
 HALF = 1.5  #: half the width of Ω, m
 LOAD = 2.0  #: q, 1/m

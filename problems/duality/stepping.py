@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 
 from harness import QP, Reference, Solution, Vector, kkt_residuals
-from problems.bodies import Bodies
-from problems.contact import ContactRows
-from problems.dual import Transformed, dual_bounds
-from problems.inverse import GeneralisedInverse
+from problems.contact.bodies import Bodies
+from problems.contact.node_to_segment import ContactRows
+from problems.duality.dualisation import Transformed, dual_bounds
+from problems.fem.inverse import GeneralisedInverse
 
 Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
 Transform = Callable[[QP, GeneralisedInverse, Vector], Transformed]

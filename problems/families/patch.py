@@ -22,15 +22,22 @@ from typing import Any
 import numpy as np
 
 from harness import Case, Reference, Solution, Value
-from problems.bodies import Bodies, ContactPair, assemble, clamped, floating, supported
-from problems.elasticity import Material
-from problems.emit import contact_case
-from problems.linearise import METHODS, linearisation
-from problems.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.ranges import at_least, doubled, fits, one_of, positive
-from problems.results import quantities
-from problems.stepping import primal_qp
-from problems.stress import gauss_stress
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
+from problems.contact.linearise import METHODS, linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import primal_qp
+from problems.families.ranges import at_least, doubled, fits, one_of, positive
+from problems.fem.elasticity import Material
+from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from problems.fem.stress import gauss_stress
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 PRESSURE = 1e6  #: p, Pa

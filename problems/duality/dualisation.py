@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from harness import QP, Solution, Structure, Vector, no_rows
-from problems.inverse import GeneralisedInverse
+from problems.fem.inverse import GeneralisedInverse
 
 
 class Transformed(NamedTuple):

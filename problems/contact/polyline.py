@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import InputError, Vector
-from problems.mesh import Nodes, as_vectors
+from problems.fem.mesh import Nodes, as_vectors
 
 Points = NDArray[np.float64]  #: (…, 2), m or dimensionless
 

@@ -1,7 +1,7 @@
 """The stiffness by triplets: the vectorised way of the paper's library [6].
 
 All element matrices at once, then one sort into a sparse matrix. Ours is compared with
-it; see `problems.elasticity.stiffness`.
+it; see `problems.fem.elasticity.stiffness`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
-from problems.elasticity import GAUSS, cell_dofs, shape_gradients, strain_matrix
-from problems.mesh import Mesh
+from problems.fem.elasticity import GAUSS, cell_dofs, shape_gradients, strain_matrix
+from problems.fem.mesh import Mesh
 
 
 def stiffness_by_triplets(mesh: Mesh, D: NDArray[np.float64]) -> csc_array:

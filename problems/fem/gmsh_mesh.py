@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from harness import InputError
 from harness.datafile import check_size, opened, parsing
-from problems.mesh import Nodes
+from problems.fem.mesh import Nodes
 
 _COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
-from problems.elasticity import (
+from problems.fem.elasticity import (
     GAUSS,
     Plane,
     cell_dofs,
     shape_gradients,
     strain_matrix,
 )
-from problems.mesh import Mesh
+from problems.fem.mesh import Mesh
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

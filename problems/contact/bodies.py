@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
 from harness import InputError, Vector
-from problems.elasticity import (
+from problems.fem.elasticity import (
     Material,
     Plane,
     elasticity_matrix,
     rigid_modes,
     stiffness,
 )
-from problems.fixing import fixing_nodes
-from problems.inverse import (
+from problems.fem.fixing import fixing_nodes
+from problems.fem.inverse import (
     GeneralisedInverse,
     floating_inverse,
     regular_inverse,
     supported_inverse,
 )
-from problems.mesh import Mesh, Nodes, dofs_of
+from problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Fields, Solution, Vector
-from problems.bodies import Bodies
-from problems.mesh import as_vectors
-from problems.stress import centre_stress, recover, von_mises
+from problems.contact.bodies import Bodies
+from problems.fem.mesh import as_vectors
+from problems.fem.stress import centre_stress, recover, von_mises
 
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 

@@ -20,9 +20,9 @@ from harness.errors import unknown
 from harness.matfile import matrix, read_mat, to_qp, vector
 from harness.parquetfile import load_parquet
 from harness.qpfile import load_qp
-from problems.content import check_digest, digest
-from problems.qps import parse_qps
-from problems.twosided import TwoSided, one_sided
+from problems.files.file_digest import check_digest, digest
+from problems.files.qps import parse_qps
+from problems.files.two_sided import TwoSided, one_sided
 
 #: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
 Loaded = tuple[QP, float, float]

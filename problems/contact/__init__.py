@@ -1,0 +1,1 @@
+"""Contact of elastic bodies: which sides may touch, and the rows that say so."""

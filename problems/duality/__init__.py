@@ -1,0 +1,1 @@
+"""The QPs of a contact problem: its primal, its duals, and its load steps."""

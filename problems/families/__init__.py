@@ -1,0 +1,1 @@
+"""Families of contact problems, one per module, and what only they share."""

@@ -1,0 +1,1 @@
+"""Finite elements: meshes, stiffness, its generalised inverses, and stresses."""

@@ -1,0 +1,1 @@
+"""QPs from files: formats, content by digest, two-sided rows."""
