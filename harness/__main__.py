@@ -64,25 +64,25 @@ def _compare(
 def _validation(
     folder: Path, data: Mapping[str, Any], meshes: Sequence[Discretisation]
 ) -> list[Path]:
-    from reports.validation import write_validation
+    from reports.validation.report import write_validation
 
     return write_validation(folder, data, meshes)
 
 
 def _plot(fields: Fields, path: Path) -> None:
-    from reports.mechanics import draw_deformed
+    from reports.figures.deformed import draw_deformed
 
     draw_deformed(fields, path)
 
 
 def _series(states: Sequence[tuple[float, Fields]], path: Path) -> None:
-    from reports.vtu import write_series
+    from reports.export.vtu import write_series
 
     write_series(states, path)
 
 
 def _vtu(fields: Fields, path: Path) -> None:
-    from reports.vtu import write_vtu
+    from reports.export.vtu import write_vtu
 
     write_vtu(fields, path)
 
@@ -92,7 +92,7 @@ def _paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
     from harness.environment import capture
     from harness.experiment import save_experiment
     from problems.experiments import PAPER, QUICK, paper_experiment
-    from reports.paper import write_paper
+    from reports.paper.report import write_paper
 
     plan = QUICK if quick else PAPER
     data = out / "data"

@@ -2,42 +2,41 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from harness import Fields, InputError
 from harness.errors import unknown
 from harness.kkt import VERIFIED_FACTOR
-from harness.store import load_fields
-from reports.cases import cases
-from reports.contests import contests
-from reports.conventions import standing
-from reports.courses import convergence
-from reports.data import Evidence, Outcome, read_evidence
-from reports.figures import accuracy_figure, scaling_figure
-from reports.growth import growth
-from reports.layout import Page, Picture, Section
-from reports.means import means
-from reports.mechanics import PERCENTILE, SCALE, clipped_at, deformed_figure
-from reports.parquet import write_records
-from reports.performance import profiles
-from reports.physics import agreement, physics
-from reports.precision import precision
-from reports.ranking import ranking
-from reports.ratios import ratios
-from reports.results import claims, errors, iterations
-from reports.scaling import Ladder, ladders, scaling
-from reports.setting import definitions, environment
-from reports.sheets import sheets
-from reports.summary import dateline, summary
-from reports.sweeps import accuracy
-from reports.tally import tally
-from reports.times import times
-from reports.wording import TIMED, clean, tolerance
-from reports.worth import worth
-from reports.writing import RENDERED, write_page, write_text
+from reports.data.aggregation import standing
+from reports.data.comparison_groups import contests
+from reports.data.evidence import Evidence, read_evidence
+from reports.data.size_series import Ladder, ladders
+from reports.document.formatting import TIMED, clean
+from reports.document.layout import Page, Picture, Section
+from reports.export.csv_tables import sheets
+from reports.export.parquet import write_records
+from reports.figures.accuracy import accuracy_figure
+from reports.figures.scaling import scaling_figure
+from reports.render.writing import RENDERED, write_page, write_text
+from reports.sections.cases import cases
+from reports.sections.claim_counts import tally
+from reports.sections.convergence import convergence
+from reports.sections.deformed import deformed
+from reports.sections.growth import growth
+from reports.sections.means import means
+from reports.sections.performance import profiles
+from reports.sections.physics import agreement, physics
+from reports.sections.precision import precision
+from reports.sections.ranking import ranking
+from reports.sections.ratios import ratios
+from reports.sections.results import claims, errors, iterations
+from reports.sections.scaling import scaling
+from reports.sections.settings import definitions, environment
+from reports.sections.summary import dateline, summary
+from reports.sections.sweeps import accuracy
+from reports.sections.times import times
+from reports.sections.value_of_accuracy import worth
 
 MOST_LADDERS = 6  #: that are drawn; all are tabulated
 FORMATS = ("html", "md", "tex", "csv", "parquet")
@@ -145,46 +144,3 @@ def _grown(found: Sequence[Ladder], evidence: Evidence) -> Section | None:
         for i, ladder in enumerate((one for one in found if one in drawn), 1)
     )
     return replace(section, pictures=pictures)
-
-
-def deformed(evidence: Evidence) -> Section | None:
-    """Draw the largest verified case; None where no deformed state was stored."""
-    drawable = [o for o in evidence.flat if o.verified and o.first.fields]
-    if not drawable:
-        return None
-    chosen = max(drawable, key=_importance)
-    try:
-        fields = load_fields(evidence.directory, chosen.first.fields or "")
-        figure = deformed_figure(fields)
-    except InputError as e:  # the journal alone must do
-        missing = str(e).removeprefix(f"{evidence.directory}{os.sep}")
-        why = f"There is no picture of {clean(chosen.case)}: {clean(missing, 200)}."
-        return Section(name="deformed", title="Deformed bodies", prose=(why,))
-    picture = Picture(name="deformed", caption=_caption(chosen, fields), figure=figure)
-    return Section(name="deformed", title="Deformed bodies", pictures=(picture,))
-
-
-def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
-    """Order by size, then load step, then accuracy; names break ties."""
-    step = outcome.first.params.get("step", 0)
-    size = outcome.size("dofs") or 0
-    last = float(step) if isinstance(step, int | float) else 0.0
-    return (size, last, -outcome.tol, outcome.first.form, outcome.solver)
-
-
-def _caption(outcome: Outcome, fields: Fields) -> str:
-    caption = (
-        f"{clean(outcome.case)}: the largest verified case, as answered by "
-        f"{clean(outcome.solver, 40)} at tol {tolerance(outcome.tol)} (run "
-        f"{clean(outcome.run_ids[0], 40)}). Displacements are drawn to scale "
-        f"(factor {SCALE:g})."
-    )
-    limits = clipped_at(fields)
-    if limits is None:
-        return caption
-    return (
-        f"{caption} Colours: patch-recovered von Mises stress, one scale for all "
-        f"bodies, clipped at the {PERCENTILE:g} % quantile of the nodal values "
-        f"({limits[0] / 1e9:.3g} GPa), since stresses may be singular at clamped and "
-        f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
-    )

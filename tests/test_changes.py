@@ -11,11 +11,18 @@ import pytest
 from harness import InputError, Record, Verdict
 from harness.journal import Journal
 from reports import write_comparison
-from reports.changes import Mean, compare, mean_of, mean_ratio, relative_ratio, side
-from reports.comparison import compose
-from reports.comparison_words import change_word, verdict_lines
-from reports.data import Evidence, arrange
-from reports.markdown import markdown
+from reports.compare.changes import (
+    Mean,
+    compare,
+    mean_of,
+    mean_ratio,
+    relative_ratio,
+    side,
+)
+from reports.compare.conclusions import change_word, verdict_lines
+from reports.compare.page import compose
+from reports.data.evidence import Evidence, arrange
+from reports.render.markdown import markdown
 
 SOLVERS = ("one", "two", "three")
 

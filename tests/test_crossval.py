@@ -27,7 +27,7 @@ from harness.store import save_solution, write_point
 from harness.truth import Given, truth_of
 from harness.workbench import Workbench
 from problems import PROBLEMS
-from reports.validation import write_validation
+from reports.validation.report import write_validation
 from solvers.reference.solve import reference_solution
 
 LIARS = Path(__file__).with_name("liars.py")

@@ -17,7 +17,7 @@ from harness.names import canonical, parse
 from harness.suite import load_suite
 from problems import PROBLEMS
 from problems.families.description import described_bodies
-from reports.data import read_evidence
+from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
 from solvers import SOLVERS
 

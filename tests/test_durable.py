@@ -28,8 +28,8 @@ from harness.faults import FAULTS, Fault, in_words, left, read_faults
 from harness.folder import Held, refuse_foreign
 from harness.registry import load_plugin
 from harness.workbench import Workbench
-from reports.data import read_evidence
-from reports.summary import summary
+from reports.data.evidence import read_evidence
+from reports.sections.summary import summary
 
 
 @contextmanager

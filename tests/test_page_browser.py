@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 
 from harness import Record, Verdict
 from harness.journal import Journal
-from reports.changes import compare
-from reports.comparison import compose as comparison
-from reports.data import read_evidence
+from reports.compare.changes import compare
+from reports.compare.page import compose as comparison
+from reports.data.evidence import read_evidence
+from reports.document.layout import Page, Picture, Section
 from reports.folder import compose
-from reports.layout import Page, Picture, Section
-from reports.page import html
+from reports.render.html_page import html
 
 try:
     from playwright import sync_api

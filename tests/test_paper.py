@@ -24,18 +24,13 @@ from problems.fem.elasticity import elasticity_matrix, stiffness
 from problems.fem.inverse import Factorised
 from problems.fem.mesh import half_ring
 from problems.fem.triplets import stiffness_by_triplets
-from reports.data import Evidence, arrange, read_evidence
-from reports.figures import save_all
-from reports.paper import write_paper
+from reports.data.evidence import Evidence, arrange, read_evidence
+from reports.figures.saving import save_all
 from reports.paper.contact import active
-from reports.paper.fleet import (
-    certified_table,
-    fleet_figure,
-    fleet_table,
-    totals_table,
-)
+from reports.paper.fleet import certified_table, fleet_figure, fleet_table, totals_table
 from reports.paper.geometry import dimensions
 from reports.paper.page import compose
+from reports.paper.report import write_paper
 from reports.paper.samples import curve, fit, medians
 from reports.paper.stepping import errors, order
 from reports.paper.stress import extent

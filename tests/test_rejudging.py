@@ -15,7 +15,7 @@ from harness.journal import Journal, read_journal
 from harness.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
 from harness.workbench import Workbench
 from problems import PROBLEMS
-from reports.data import read_evidence
+from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

@@ -11,17 +11,17 @@ from harness import Fields, InputError, Record, Verdict
 from harness.journal import Journal
 from harness.store import save_fields
 from reports import write_report
-from reports.data import Evidence, arrange
+from reports.data.evidence import Evidence, arrange
+from reports.data.size_series import ladders
+from reports.document.formatting import clean, exponent, seconds, significant
 from reports.folder import compose
-from reports.intervals import power_law
-from reports.latex import escaped, latex
-from reports.markdown import escaped as md_escaped
-from reports.markdown import markdown
-from reports.page import breakable
-from reports.physics import spreads
-from reports.scaling import ladders
-from reports.summary import sentences
-from reports.wording import clean, exponent, seconds, significant
+from reports.render.html_page import breakable
+from reports.render.latex import escaped, latex
+from reports.render.markdown import escaped as md_escaped
+from reports.render.markdown import markdown
+from reports.sections.physics import spreads
+from reports.sections.summary import sentences
+from reports.statistics.intervals import power_law
 
 HOSTILE = (
     '<script>alert(1)</script>"><img src=http://evil.example/x onerror=alert(1)>',
@@ -132,7 +132,7 @@ def test_no_time_is_printed_without_its_uncertainty(measured, evidence):
 
 
 def test_times_read_as_a_physicist_would_write_them():
-    from reports.intervals import median_interval
+    from reports.statistics.intervals import median_interval
 
     assert seconds(median_interval([0.0119, 0.0123, 0.0140])) == "12.3 ms [11.9, 14.0]"
     assert seconds(median_interval([1.5, 1.25, 100.0])) == "1.50 s [1.25, 100.00]"

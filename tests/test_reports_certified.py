@@ -12,11 +12,11 @@ import pytest
 
 from harness import InputError, Record, Verdict
 from harness.discretisation import FILE, Discretisation, Level
-from reports.certified import certified_picture, certified_sweeps
-from reports.data import Evidence, arrange
+from reports.data.evidence import Evidence, arrange
+from reports.data.time_at_accuracy import matched, time_at
 from reports.folder import compose
-from reports.markdown import markdown
-from reports.matched import matched, time_at
+from reports.render.markdown import markdown
+from reports.sections.certified import certified_picture, certified_sweeps
 
 TOLS = (1e-2, 1e-4, 1e-6, 1e-8)
 

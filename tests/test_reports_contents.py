@@ -7,15 +7,15 @@ import pytest
 from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
-from reports.data import Evidence, arrange
-from reports.figures import scaling_figure
+from reports.data.evidence import Evidence, arrange
+from reports.data.size_series import ladders
+from reports.document.formatting import TIMED, exponent, power, seconds, significant
+from reports.document.layout import Cell, Table
+from reports.figures.scaling import scaling_figure
 from reports.folder import compose
-from reports.intervals import PowerLaw, median_interval
-from reports.latex import latex
-from reports.layout import Cell, Table
-from reports.markdown import markdown
-from reports.scaling import ladders
-from reports.wording import TIMED, exponent, power, seconds, significant
+from reports.render.latex import latex
+from reports.render.markdown import markdown
+from reports.statistics.intervals import PowerLaw, median_interval
 
 ELASTIC = {
     "dofs": 20, "equality_rows": 4, "contact_rows": 10, "active": 5,

@@ -8,15 +8,14 @@ import pytest
 from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
-from reports.contest_sheets import contest_sheets
-from reports.contests import contests
-from reports.conventions import standing
-from reports.data import Evidence, arrange
-from reports.figures import look
+from reports.data.aggregation import standing
+from reports.data.comparison_groups import contests
+from reports.data.evidence import Evidence, arrange
+from reports.export.csv_tables import contest_sheets, sheets
+from reports.figures.profiles import ROW, pairwise_figure, profile_figure, rows_of
+from reports.figures.style import look
 from reports.folder import compose
-from reports.markdown import markdown
-from reports.profile_figures import ROW, pairwise_figure, profile_figure, rows_of
-from reports.sheets import sheets
+from reports.render.markdown import markdown
 
 LIMIT = 20.0
 

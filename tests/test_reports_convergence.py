@@ -13,10 +13,10 @@ from harness import Record, Solution, Status, Verdict
 from harness.journal import Journal
 from harness.store import save_solution
 from reports import write_report
-from reports.convergence import active_set_figure, convergence_figure
-from reports.data import read_evidence
+from reports.data.evidence import read_evidence
+from reports.data.histories import MOST, chosen
+from reports.figures.convergence import active_set_figure, convergence_figure
 from reports.folder import compose
-from reports.histories import MOST, chosen
 
 KNOWN = {
     "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],

@@ -9,9 +9,9 @@ import pytest
 from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
-from reports.latex import escaped as tex
-from reports.markdown import escaped as md
-from reports.wording import clean
+from reports.document.formatting import clean
+from reports.render.latex import escaped as tex
+from reports.render.markdown import escaped as md
 
 NAMES = (
     "<b onmouseover=a()>&amp;</b><!--",

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from harness import Fields, InputError
-from reports.figures import inline_svg, look, save_all
-from reports.layout import Page, Picture, Section
-from reports.mechanics import deformed_figure, draw_deformed, outlines
-from reports.writing import ENDINGS, write_page
+from reports.document.layout import Page, Picture, Section
+from reports.figures.deformed import deformed_figure, draw_deformed, outlines
+from reports.figures.saving import inline_svg, save_all
+from reports.figures.style import look
+from reports.render.writing import ENDINGS, write_page
 
 LOWER, UPPER = 3, 6  # columns of cells
 

@@ -8,13 +8,13 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from harness import Record, Verdict
-from reports.artists import MOST
-from reports.embedded import cell, rows_of, script, spans, table
-from reports.figures import legible, look
-from reports.layout import Cell, Table, named
-from reports.mathtext import plain
-from reports.plots import read_back
-from reports.traces import behind
+from reports.document.layout import Cell, Table, named
+from reports.figures.provenance import behind
+from reports.figures.style import legible, look
+from reports.render.artists import MOST
+from reports.render.embedded import cell, rows_of, script, spans, table
+from reports.render.mathtext import plain
+from reports.render.plots import read_back
 
 LABELS = {"a $b": legible("a $b"), "b": "b", "b2": "b2"}
 

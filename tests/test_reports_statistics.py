@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from reports.censoring import restricted_mean
-from reports.contests import Contest
-from reports.conventions import (
+from reports.data.aggregation import (
     EVERY,
     USUAL,
     Convention,
@@ -14,10 +12,12 @@ from reports.conventions import (
     geometric_means,
     standing,
 )
-from reports.growth import growth_of
-from reports.profiles import curve, performance_ratios, share, solved_within
-from reports.ranking import panel, ranks
-from reports.resampling import firsts, limits, told_apart, weights
+from reports.data.comparison_groups import Contest
+from reports.sections.growth import growth_of
+from reports.sections.ranking import panel, ranks
+from reports.statistics.censoring import restricted_mean
+from reports.statistics.profiles import curve, performance_ratios, share, solved_within
+from reports.statistics.resampling import firsts, limits, told_apart, weights
 
 INF = np.inf
 

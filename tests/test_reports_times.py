@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from harness import Record, Verdict
-from reports.data import Evidence, arrange
+from reports.data.evidence import Evidence, arrange
 from reports.folder import compose
 
 

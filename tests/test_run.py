@@ -25,8 +25,8 @@ from harness.registry import SolverSpec, load_plugin, resolve
 from harness.run import run
 from harness.store import load_fields, load_solution
 from harness.suite import Suite
-from reports.data import read_evidence
-from reports.scaling import ladders
+from reports.data.evidence import read_evidence
+from reports.data.size_series import ladders
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
 SIZES = (10, 20, 40, 80)

@@ -11,7 +11,7 @@ from harness.cli import main
 from harness.qpfile import save_qp
 from harness.workbench import Workbench
 from problems import PROBLEMS
-from reports.vtu import write_series, write_vtu
+from reports.export.vtu import write_series, write_vtu
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 

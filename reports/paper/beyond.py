@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness.experiment import Experiment
-from reports.data import Evidence
-from reports.layout import Picture, Section
+from reports.data.evidence import Evidence
+from reports.document.formatting import TIMED, plural
+from reports.document.layout import Picture, Section
 from reports.paper.contact import (
     CONTACTS,
     active,
@@ -25,7 +26,6 @@ from reports.paper.fleet import (
     totals_table,
 )
 from reports.paper.stepping import SINCE, orders, stepping_figure
-from reports.wording import TIMED, plural
 
 REPEATED = (
     "Medians of interleaved, randomised repeats in worker processes of their own, with "

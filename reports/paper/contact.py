@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator
 
 from harness import Fields
 from harness.experiment import Row
-from reports.figures import COLOURS, INK, STYLE, log_log, look
-from reports.mechanics import edges, outlines
+from reports.figures.deformed import edges, outlines
+from reports.figures.style import COLOURS, INK, STYLE, log_log, look
 from reports.paper.geometry import FILLS
 
 ACTIVE = 1e-6  #: a node is in contact if its force exceeds this times the largest

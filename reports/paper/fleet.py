@@ -11,11 +11,19 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness import Verdict
-from reports.data import Evidence, Outcome
-from reports.figures import INK, LEGEND_LINE, STYLE, legible, log_log, look
-from reports.intervals import Interval, power_law
-from reports.layout import Cell, Table, source, verdict_cell
-from reports.wording import TIMED, clean, exponent, seconds, significant, tolerance
+from reports.data.evidence import Evidence, Outcome
+from reports.document.formatting import (
+    TIMED,
+    clean,
+    exponent,
+    seconds,
+    significant,
+    tolerance,
+)
+from reports.document.layout import Cell, Table
+from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
+from reports.sections.cells import source, verdict_cell
+from reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")
 TARGETS = (1e-2, 1e-4, 1e-6)  #: certified relative errors in the energy norm

@@ -15,8 +15,8 @@ from matplotlib.patches import Rectangle, Wedge
 from numpy.typing import NDArray
 
 from harness import Fields
-from reports.figures import COLOURS, INK, STYLE
-from reports.mechanics import SCALE, edges, outlines
+from reports.figures.deformed import SCALE, edges, outlines
+from reports.figures.style import COLOURS, INK, STYLE
 
 #: of beam and ring: transparent, so that ink stays readable on any page
 FILLS = (to_rgba(COLOURS[0], 0.18), to_rgba(COLOURS[1], 0.22))

@@ -7,9 +7,10 @@ from types import MappingProxyType
 from typing import Any
 
 from harness.experiment import Experiment, Row
-from reports.data import Evidence
-from reports.layout import Page, Picture, Section
-from reports.mechanics import PERCENTILE, SCALE
+from reports.data.evidence import Evidence
+from reports.document.formatting import clean, seconds, significant
+from reports.document.layout import Page, Picture, Section
+from reports.figures.deformed import PERCENTILE, SCALE
 from reports.paper import beyond, published
 from reports.paper.geometry import geometry_figure, mesh_figure
 from reports.paper.samples import curve
@@ -22,7 +23,6 @@ from reports.paper.timings import (
     pinv_fit,
     scaling_figure,
 )
-from reports.wording import clean, seconds, significant
 
 
 def compose(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from harness.experiment import Row
-from reports.intervals import Interval, median_interval
+from reports.statistics.intervals import Interval, median_interval
 
 Key = tuple[Any, ...]
 

@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from harness.experiment import Row
-from reports.figures import INK, STYLE, log_log, look
-from reports.intervals import PowerLaw, power_law
-from reports.layout import Cell, Table
-from reports.wording import exponent, significant
+from reports.document.formatting import exponent, significant
+from reports.document.layout import Cell, Table
+from reports.figures.style import INK, STYLE, log_log, look
+from reports.statistics.intervals import PowerLaw, power_law
 
 QUANTITIES = {  #: of the figure → the columns that make a vector
     "tip displacement": ("tip_x", "tip_y"),

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
 from harness import Fields
-from reports.figures import INK, STYLE
-from reports.mechanics import PERCENTILE, SCALE, outlines
+from reports.figures.deformed import PERCENTILE, SCALE, outlines
+from reports.figures.style import INK, STYLE
 
 STRESSES = {
     "sxx": r"normal stress $\sigma_x$",

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from harness.experiment import Experiment, Row
-from reports.layout import Cell, Table
+from reports.document.formatting import clean, seconds, significant
+from reports.document.layout import Cell, Table
 from reports.paper import published
 from reports.paper.samples import curve
-from reports.wording import clean, seconds, significant
 
 LINES = {  #: of the table of times → the parts of an analysis
     "mesh and assembly": ("assembly",),

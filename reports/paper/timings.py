@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from harness.experiment import Row
-from reports.figures import COLOURS, INK, STYLE, log_log, look
+from reports.figures.style import COLOURS, INK, STYLE, log_log, look
 from reports.paper import published
 from reports.paper.samples import Fit, Point, curve, fit
 

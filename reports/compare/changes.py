@@ -1,0 +1,273 @@
+"""What changed between two result folders, cell by cell and solver by solver.
+
+A cell is one solver, driven in one mode, on one case at one tolerance. Its repeats are
+paired by their numbers: the same place in the same order of the same suite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+from zlib import crc32
+
+import numpy as np
+from scipy.stats import norm, t
+
+from harness.pairs import Ratio, paired_ratio
+from reports.compare.conditions import hardware
+from reports.data.evidence import SEVERITY, Evidence, Outcome
+from reports.statistics.intervals import COVERAGE
+
+DRAWS = 2000
+ALIKE = 1.5  #: an interval that excludes such a factor either way can tell "no change"
+FEWEST = 3  #: cells that an interval over cells needs
+_NEGLIGIBLE = 1e-12  #: energies below, of QPs with data of order one, are rounding
+
+Key = tuple[str, float, str]  #: case, tolerance, solver with its mode
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pair:
+    """A cell that both folders hold."""
+
+    before: Outcome
+    after: Outcome
+    same_machine: bool  #: times may be compared
+
+    @property
+    def same_sizes(self) -> bool:
+        """Whether the QPs have equal numbers of variables and constraints."""
+        return self.before.first.sizes == self.after.first.sizes
+
+    @property
+    def same_qp(self) -> bool:
+        """Whether the QPs are equal bit for bit, as far as the journals say."""
+        digests = {r.qp for o in (self.before, self.after) for r in o.records}
+        return self.same_sizes and len(digests - {None}) < 2
+
+    @property
+    def both_verified(self) -> bool:
+        """Whether both answers are right, so that anything of them is comparable."""
+        return self.before.verified and self.after.verified and self.same_sizes
+
+    @cached_property
+    def logs(self) -> tuple[float, ...]:
+        """Logarithms of time after over time before, one per repeat that both have."""
+        if not (self.both_verified and self.same_machine):
+            return ()
+        a, b = _seconds(self.after), _seconds(self.before)
+        return tuple(float(np.log(a[i] / b[i])) for i in sorted(a.keys() & b.keys()))
+
+    @cached_property
+    def ratio(self) -> Ratio | None:
+        """Time after over time before, Student's interval; None below two repeats.
+
+        Student's and not a bootstrap: resampling three to ten repeats finds a change
+        that is not there three to five times as often as one in twenty.
+        """
+        if len(self.logs) < 2:
+            return None
+        return paired_ratio(_seconds(self.after), _seconds(self.before))
+
+    @property
+    def change(self) -> int:
+        """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
+        return side(self.ratio)
+
+    @property
+    def turn(self) -> int:
+        """1: the verdict became worse, -1: better, 0: it did not change."""
+        a, b = (SEVERITY.index(o.verdict) for o in (self.after, self.before))
+        return (a < b) - (a > b)
+
+    @property
+    def other_iterations(self) -> bool:
+        """Whether no repeat after took as many iterations as one before."""
+        a, b = self.before.iterations, self.after.iterations
+        return a is not None and b is not None and (a[1] < b[0] or b[1] < a[0])
+
+    @cached_property
+    def answers(self) -> tuple[float, float, float] | None:
+        """Energy (objective, if there is none) before and after, and their difference.
+
+        The difference is relative to the larger. None where one answer is not verified,
+        or has no such value.
+        """
+        pairs = (
+            (self.before.energy, self.after.energy),
+            (self.before.first.objective, self.after.first.objective),
+        )
+        known = [(a, b) for a, b in pairs if a is not None and b is not None]
+        if not (known and self.both_verified):
+            return None
+        a, b = known[0]
+        apart, size = abs(a - b), max(abs(a), abs(b))
+        return a, b, 0.0 if apart <= _NEGLIGIBLE else apart / size
+
+    @property
+    def may_differ(self) -> float:
+        """How far two verified energies may be apart: twice what both gaps allow.
+
+        A gap is relative to the largest energy, about twice the potential energy.
+        """
+        return 2 * (self.before.allowed + self.after.allowed)
+
+    @property
+    def other_answer(self) -> bool:
+        """Whether both answers are verified and yet differ."""
+        return self.answers is not None and self.answers[2] > self.may_differ
+
+
+class Mean(NamedTuple):
+    """A geometric mean of ratios over cells, with its interval if there is one."""
+
+    value: float
+    low: float
+    high: float
+    cells: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison:
+    """Two result folders, and the cells that they share."""
+
+    before: Evidence
+    after: Evidence
+    pairs: tuple[Pair, ...]
+    only_before: tuple[Outcome, ...]
+    only_after: tuple[Outcome, ...]
+
+    @property
+    def solvers(self) -> tuple[str, ...]:
+        """Labels of the solvers that both folders hold, in the order of the later."""
+        present = {p.after.solver for p in self.pairs}
+        return tuple(s for s in self.after.solvers if s in present)
+
+    @property
+    def timed(self) -> tuple[Pair, ...]:
+        """Pairs whose ratio of times has an interval."""
+        return tuple(p for p in self.pairs if p.ratio is not None)
+
+    def of(self, solver: str) -> tuple[Pair, ...]:
+        """All pairs of one solver."""
+        return tuple(p for p in self.pairs if p.after.solver == solver)
+
+
+def compare(before: Evidence, after: Evidence) -> Comparison:
+    """Pair the cells of two folders, in the order of the later one."""
+    a, b = _cells(before), _cells(after)
+    machines = hardware(before) | hardware(after)
+
+    def same(key: Key) -> bool:
+        records = (*a[key].records, *b[key].records)
+        return len({machines[r.environment] for r in records}) == 1
+
+    return Comparison(
+        before=before,
+        after=after,
+        pairs=tuple(
+            Pair(before=a[key], after=b[key], same_machine=same(key))
+            for key in b
+            if key in a
+        ),
+        only_before=tuple(o for key, o in a.items() if key not in b),
+        only_after=tuple(o for key, o in b.items() if key not in a),
+    )
+
+
+def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
+    """Average the ratios of times over cells; see `mean_of`. None without any time."""
+    timed = [p for p in pairs if p.logs]
+    logs = [float(np.mean(p.logs)) for p in timed]
+    return mean_of(logs, [str(_key(p.after)) for p in timed])
+
+
+def relative_ratio(c: Comparison, solver: str) -> Mean | None:
+    """Average how much more a solver's time changed than that of the others.
+
+    Per case and tolerance its ratio is divided by the geometric mean of theirs: what
+    slows a whole run down cancels. None where no other solver has times on its cells.
+    """
+    others: dict[tuple[str, float], list[float]] = {}
+    for p in c.pairs:
+        if p.logs and p.after.solver != solver and not p.after.first.arm:
+            key = (p.after.case, p.after.tol)
+            others.setdefault(key, []).append(float(np.mean(p.logs)))
+    logs, names = [], []
+    for p in c.of(solver):
+        rivals = others.get((p.after.case, p.after.tol))
+        if p.logs and rivals:
+            logs.append(float(np.mean(p.logs)) - float(np.mean(rivals)))
+            names.append(str(_key(p.after)))
+    return mean_of(logs, names)
+
+
+def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:
+    """Average the same of the canary, which is no solver: what the machine did."""
+    logs, names = [], []
+    for p in pairs:
+        a, b = _canaries(p.after), _canaries(p.before)
+        if p.same_machine and a and b:
+            logs.append(float(np.mean(np.log(a)) - np.mean(np.log(b))))
+            names.append(str(_key(p.after)))
+    return mean_of(logs, names)
+
+
+def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
+    """Average logarithms of ratios over cells, with a bootstrap interval over cells.
+
+    A cell is resampled as a pair, before with after. Percentiles of n values lie too
+    near to the mean, by √((n−1)/n) and by normal instead of Student's tails; their
+    distances from it are multiplied by what is missing [1]_. The seed comes from the
+    names of the cells. Below three cells the interval is unbounded.
+
+    References
+    ----------
+    .. [1] T. C. Hesterberg, What Teachers Should Know About the Bootstrap, The American
+       Statistician 69 (2015) 371-386, §4.2
+
+    """
+    n = len(logs)
+    if not n:
+        return None
+    x = np.asarray(logs)
+    mean = float(x.mean())
+    if n < FEWEST:
+        return Mean(float(np.exp(mean)), 0.0, np.inf, n)
+    rng = np.random.default_rng(crc32("\n".join(names).encode()))
+    draws = x[rng.integers(0, n, (DRAWS, n))].mean(axis=1)
+    quantile = 0.5 + COVERAGE / 2
+    wider = np.sqrt(n / (n - 1)) * t.ppf(quantile, n - 1) / norm.ppf(quantile)
+    low, high = np.quantile(draws, (1 - quantile, quantile)) - mean
+    value, low, high = np.exp(mean + wider * np.array([0.0, low, high]))
+    return Mean(float(value), float(low), float(high), n)
+
+
+def side(interval: Ratio | Mean | None) -> int:
+    """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
+    if interval is None:
+        return 0
+    return int(interval.low > 1) - int(interval.high < 1)
+
+
+def resolved(interval: Ratio | Mean) -> bool:
+    """Whether a change by a factor `ALIKE`, either way, would have been seen."""
+    return side(interval) != 0 or 1 / ALIKE < interval.low <= interval.high < ALIKE
+
+
+def _cells(evidence: Evidence) -> dict[Key, Outcome]:
+    return {_key(o): o for o in evidence.flat}
+
+
+def _key(outcome: Outcome) -> Key:
+    return outcome.case, outcome.tol, outcome.solver
+
+
+def _seconds(outcome: Outcome) -> dict[int, float]:
+    return {r.repeat: r.total_seconds for r in outcome.records if r.total_seconds}
+
+
+def _canaries(outcome: Outcome) -> list[float]:
+    return [r.canary_seconds for r in outcome.records if r.canary_seconds]

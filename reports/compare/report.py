@@ -1,0 +1,115 @@
+"""Write what changed between two result folders."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from harness.kkt import VERIFIED_FACTOR
+from reports.compare.changes import Comparison, Pair, compare
+from reports.compare.conclusions import verdict_lines
+from reports.compare.page import compose
+from reports.data.evidence import Outcome, read_evidence
+from reports.render.writing import RENDERED, write_page, write_text
+
+
+def write_comparison(
+    before: Path, after: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
+) -> tuple[list[str], list[Path]]:
+    """Write AFTER/report/against-NAME, NAME being that of the folder `before`.
+
+    html: index.html. md: report.md. tex: tables/. csv, parquet: tables/changes, a row
+    per cell. The same journals give the same bytes.
+
+    factor : verdicts are those at factor·tol, in both folders
+
+    Returns
+    -------
+    the verdict in a few lines of text, and the files
+
+    Raises
+    ------
+    InputError
+        When one is no result folder, or holds no measurements.
+
+    """
+    comparison = compare(read_evidence(before, factor), read_evidence(after, factor))
+    target = after / "report" / f"against-{before.resolve().name}"
+    written: list[Path] = []
+    if RENDERED & set(formats):
+        written = write_page(compose(comparison), target, formats)
+    tables, frame = target / "tables", changes_frame(comparison)
+    if "csv" in formats:
+        text = frame.to_csv(index=False)
+        written.append(write_text(tables / "changes.csv", text))
+    if "parquet" in formats:
+        tables.mkdir(parents=True, exist_ok=True)
+        frame.to_parquet(tables / "changes.parquet", index=False)
+        written.append(tables / "changes.parquet")
+    return verdict_lines(comparison), written
+
+
+def changes_frame(c: Comparison) -> pd.DataFrame:
+    """Make a row per cell of either folder, at full precision."""
+    rows = [_paired(p) for p in c.pairs]
+    rows += [
+        {**_cell(o), **_side(o, where)}
+        for where, alone in (("before", c.only_before), ("after", c.only_after))
+        for o in alone
+    ]
+    frame = pd.DataFrame(rows, columns=list(_COLUMNS))
+    return frame.astype(_COLUMNS)
+
+
+def _paired(p: Pair) -> dict[str, Any]:
+    ratio, answers = p.ratio, p.answers
+    return {
+        **_cell(p.after),
+        **_side(p.before, "before"),
+        **_side(p.after, "after"),
+        "ratio": ratio.value if ratio else None,
+        "ratio_low": ratio.low if ratio else None,
+        "ratio_high": ratio.high if ratio else None,
+        "pairs": ratio.pairs if ratio else None,
+        "change": {1: "slower", 0: "none", -1: "faster"}[p.change] if ratio else None,
+        "answers_apart": answers[2] if answers else None,
+        "same_machine": p.same_machine,
+        "same_qp": p.same_qp,
+    }
+
+
+def _cell(o: Outcome) -> dict[str, Any]:
+    return {"case": o.case, "solver": o.solver, "tol": o.tol}
+
+
+def _side(o: Outcome, where: str) -> dict[str, Any]:
+    time = o.seconds("total")
+    least, most = o.iterations or (None, None)
+    return {
+        f"verdict_{where}": o.verdict.value,
+        f"seconds_{where}": time.value if time else None,
+        f"iterations_min_{where}": least,
+        f"iterations_max_{where}": most,
+        f"energy_{where}": o.energy,
+        f"objective_{where}": o.first.objective,
+    }
+
+
+_COLUMNS: dict[str, str] = {
+    "case": "string", "solver": "string", "tol": "float64",
+    **{
+        f"{name}_{where}": kind
+        for name, kind in (
+            ("verdict", "string"), ("seconds", "float64"),
+            ("iterations_min", "Int64"), ("iterations_max", "Int64"),
+            ("energy", "float64"), ("objective", "float64"),
+        )
+        for where in ("before", "after")
+    },
+    "ratio": "float64", "ratio_low": "float64", "ratio_high": "float64",
+    "pairs": "Int64", "change": "string", "answers_apart": "float64",
+    "same_machine": "boolean", "same_qp": "boolean",
+}  # fmt: skip

@@ -1,0 +1,173 @@
+"""Shifted geometric means of times, and the conventions that they depend on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reports.data.comparison_groups import CASES, Contest
+from reports.statistics import resampling
+
+Array = NDArray[np.float64]
+
+SHIFTS = (0.01, 1.0, 10.0)
+PENALTIES = (1.0, 3.0, 10.0)
+GATES = ("verified", "claimed")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Convention:
+    """What has to be agreed before times over cases become one number."""
+
+    shift: float = 1.0  #: times that of the contest
+    penalty: float = 3.0  #: an unsolved case is charged this many limits
+    gate: str = "verified"  #: or "claimed": the solver's word is taken
+    common: bool = False  #: only cases that all solved, see `common_cases`
+
+
+USUAL = Convention()  #: what tiers and ratios are made with
+
+#: One thing changed at a time, by the name of its column.
+SINGLE = {
+    "shift × 0.01": replace(USUAL, shift=0.01),
+    "shift × 10": replace(USUAL, shift=10.0),
+    "1 limit": replace(USUAL, penalty=1.0),
+    "10 limits": replace(USUAL, penalty=10.0),
+    "claimed": replace(USUAL, gate="claimed"),
+    "common": replace(USUAL, common=True),
+}
+
+#: Every combination of shift, penalty and gate.
+EVERY = tuple(
+    Convention(shift=s, penalty=p, gate=g)
+    for s, p, g in product(SHIFTS, PENALTIES, GATES)
+)
+
+
+def geometric_means(contest: Contest, convention: Convention) -> Array:
+    """Shifted geometric means exp(mean log(t + s)) − s over the cases, by solver; s.
+
+    An unsolved case counts as `penalty` times the limit. In `common` mode there is none
+    to charge, and solvers outside of the comparison have NaN.
+    """
+    logs, shift = _logs(contest, convention)
+    if not convention.common:
+        return np.asarray(np.exp(logs.mean(axis=0)) - shift)
+    rows, columns = common_cases(contest)
+    means = np.full(len(contest.solvers), np.nan)
+    if rows.sum() >= CASES:
+        means[columns] = np.exp(logs[rows][:, columns].mean(axis=0)) - shift
+    return means
+
+
+def common_cases(contest: Contest) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Find the cases solved by every solver that solved at least half of them.
+
+    One solver that solves next to nothing would leave no case to compare the others on.
+
+    Returns
+    -------
+    cases, solvers : which of them
+
+    """
+    solvers = contest.solved.mean(axis=0) >= 0.5
+    cases = np.logical_and.reduce(contest.solved[:, solvers], axis=1)
+    return np.asarray(cases), np.asarray(solvers)
+
+
+def _logs(contest: Contest, convention: Convention) -> tuple[Array, float]:
+    """Logarithms of t + s, (cases, solvers), and s in seconds."""
+    times = contest.times if convention.gate == "verified" else contest.claimed
+    shift = convention.shift * contest.shift
+    charged = np.where(np.isinf(times), convention.penalty * contest.horizon, times)
+    return np.log(charged + shift), shift
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Standing:
+    """What one contest says under the usual convention, and how surely."""
+
+    contest: Contest
+    draws: Array  #: (draws, solvers) means over resampled cases, s
+
+    @cached_property
+    def means(self) -> Array:
+        """(solvers,) shifted geometric means, s."""
+        return geometric_means(self.contest, USUAL)
+
+    @cached_property
+    def order(self) -> NDArray[np.int64]:
+        """Solvers from the smallest mean to the largest; equals as in the suite."""
+        return np.argsort(self.means, kind="stable")
+
+    @property
+    def leader(self) -> int:
+        """The solver with the smallest mean."""
+        return int(self.order[0])
+
+    @cached_property
+    def intervals(self) -> tuple[Array, Array]:
+        """95 % intervals of the means, s."""
+        return resampling.limits(self.draws, len(self.contest.cases))
+
+    @cached_property
+    def ratios(self) -> tuple[Array, Array, Array]:
+        """Mean over that of the leader, on the same cases, and its 95 % interval."""
+        draws = self.draws / self.draws[:, [self.leader]]
+        low, high = resampling.limits(draws, len(self.contest.cases))
+        return self.means / self.means[self.leader], low, high
+
+    @cached_property
+    def first(self) -> Array:
+        """(solvers,) share of the resamples in which the solver has the least mean."""
+        return resampling.firsts(np.log(self.draws))
+
+    @cached_property
+    def faster(self) -> NDArray[np.bool_]:
+        """(solvers, solvers) whether row is told to be faster than column."""
+        logs, _ = _logs(self.contest, USUAL)
+        return resampling.told_apart(logs, self.contest.cases)
+
+    @cached_property
+    def spans(self) -> list[tuple[int, int]]:
+        """Ranks that a solver may have: after all told faster, before all told slower.
+
+        Together these hold the true ranks with 95 % [1]_.
+
+        References
+        ----------
+        .. [1] M. Mogstad, J. P. Romano, A. M. Shaikh, D. Wilhelm, Inference for Ranks,
+           Review of Economic Studies 91 (2024) 476-518
+
+        """
+        behind, ahead = self.faster.sum(axis=0), self.faster.sum(axis=1)
+        last = len(self.contest.solvers)
+        return [(1 + int(b), last - int(a)) for b, a in zip(behind, ahead, strict=True)]
+
+    @cached_property
+    def tiers(self) -> NDArray[np.int64]:
+        """(solvers,) tier from 1: the first whose head is not told to be faster.
+
+        The leader heads the first tier, and who fits into none heads the next. A mean
+        that is known badly, as it is with failures, may be in an earlier tier than a
+        smaller one.
+        """
+        tiers = np.zeros(len(self.contest.solvers), dtype=np.int64)
+        heads: list[int] = []
+        for solver in self.order:
+            fits = [n for n, head in enumerate(heads) if not self.faster[head, solver]]
+            if not fits:
+                heads.append(int(solver))
+            tiers[solver] = 1 + (fits[0] if fits else len(heads) - 1)
+        return tiers
+
+
+def standing(contest: Contest) -> Standing:
+    """Resample the cases of a contest."""
+    logs, shift = _logs(contest, USUAL)
+    draws = np.exp(resampling.weights(contest.cases) @ logs) - shift
+    return Standing(contest=contest, draws=draws)

@@ -1,0 +1,219 @@
+"""Who solved which case in what time: what means, ranks and profiles are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from harness import Record, Verdict
+from reports.data.evidence import Evidence
+from reports.document.formatting import clean, listing, plural, tolerance
+
+#: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
+CASES = 6
+LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
+
+_CELL = ["kind", "case", "solver"]
+
+Times = NDArray[np.float64]
+Name = TypeVar("Name")
+
+
+class _Kind(NamedTuple):
+    """What the cases of one contest share."""
+
+    sweep: bool
+    mode: str
+    form: str
+    at: float  #: accuracy that answers are judged at
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Contest:
+    """Cases of one form at one accuracy, and the solvers that were measured on each.
+
+    Null arms take no part. Times are medians of prepare + solve over the repeats; in a
+    sweep of tolerances, those of the cheapest answer that counts.
+    """
+
+    title: str
+    cases: tuple[str, ...]
+    solvers: tuple[str, ...]
+    times: Times  #: (cases, solvers) s; inf unless every repeat was verified
+    claimed: Times  #: the same; inf unless every repeat was claimed to be solved
+    stopped: Times  #: s after which time ran out; NaN where that was not the end
+    limit: float  #: s per measurement; the longest one, where the suite has no limit
+    notes: tuple[str, ...] = ()  #: what takes no part, and why
+
+    @cached_property
+    def solved(self) -> NDArray[np.bool_]:
+        """(cases, solvers) whether verified."""
+        return np.isfinite(self.times)
+
+    @cached_property
+    def shift(self) -> float:
+        """Shift of geometric means: the median over cases of the best time, ≤ 10 s."""
+        best = self.times.min(axis=1)
+        return float(min(LARGEST_SHIFT, np.median(best[np.isfinite(best)])))
+
+    @cached_property
+    def horizon(self) -> float:
+        """The limit, or the longest time of an answer if that is longer; s."""
+        both = np.concatenate([self.times, self.claimed])
+        return float(max(self.limit, both[np.isfinite(both)].max()))
+
+
+def contests(evidence: Evidence) -> tuple[Contest, ...]:
+    """Group what was measured by form and accuracy; groups of few cases are left out.
+
+    Forms are apart, since the primal and the dual QP of one problem are two problems to
+    a solver; so are cold solves and sequences. At least `CASES` cases, two solvers and
+    one verified answer make a contest.
+    """
+    records = [r for r in evidence.records if not r.arm]
+    if not records:
+        return ()
+    kinds = _numbered(map(_kind, records))
+    cases = _numbered(r.case for r in records)
+    solvers = _numbered(evidence.solvers)
+    rows = [
+        {"kind": kinds[_kind(r)], "case": cases[r.case], "solver": solvers[r.solver]}
+        | _row(r)
+        for r in records
+    ]
+    outcomes = _outcomes(pd.DataFrame(rows))
+    limit = _limit(evidence, outcomes)
+    groups = zip(kinds, outcomes.groupby("kind"), strict=True)
+    found = [
+        _contest(_title(kind), group, [*cases], evidence.solvers, limit)
+        for kind, (_, group) in groups
+    ]
+    return tuple(contest for contest in found if contest is not None)
+
+
+def _kind(r: Record) -> _Kind:
+    swept = r.accuracy is not None
+    return _Kind(swept, r.mode, r.form, r.tol if r.accuracy is None else r.accuracy)
+
+
+def _numbered(names: Iterable[Name]) -> dict[Name, int]:
+    """Give a number to each, in the order of occurrence: pandas takes not any name."""
+    return {name: number for number, name in enumerate(dict.fromkeys(names))}
+
+
+def _row(r: Record) -> dict[str, float]:
+    """Take of a record what a contest asks for."""
+    return {
+        "tol": r.tol,
+        "seconds": np.nan if r.total_seconds is None else r.total_seconds,
+        "verified": r.status is Verdict.VERIFIED,
+        "claimed": r.claimed == "solved",
+        "late": r.status is Verdict.TIME_LIMIT,
+        "declined": r.status is Verdict.DECLINED,
+    }
+
+
+def _outcomes(records: pd.DataFrame) -> pd.DataFrame:
+    """Put repeats together, then the tolerances of a sweep: one row per cell."""
+    records["late"] |= records["verified"]  # one repeat in time is no answer yet
+    repeats = records.groupby([*_CELL, "tol"], sort=False).agg(
+        seconds=("seconds", "median"),
+        verified=("verified", "all"),
+        claimed=("claimed", "all"),
+        late=("late", "all"),
+        declined=("declined", "all"),
+    )
+    time = repeats["seconds"]
+    timed = time > 0
+    late = repeats["late"] & ~repeats["verified"]
+    columns = pd.DataFrame(
+        {
+            "times": time.where(repeats["verified"] & timed, np.inf),
+            "claimed": time.where(repeats["claimed"] & timed, np.inf),
+            "stopped": time.fillna(np.inf).where(late, np.nan),  # inf: at the limit
+            "declined": repeats["declined"].astype(float),
+            "longest": time,
+        }
+    )
+    return (
+        columns.groupby(level=_CELL, sort=False)
+        .agg(
+            times=("times", "min"),
+            claimed=("claimed", "min"),
+            stopped=("stopped", "max"),
+            declined=("declined", "min"),
+            longest=("longest", "max"),
+        )
+        .reset_index()
+    )
+
+
+def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
+    """Take the suite's limit of time, or else the longest measurement."""
+    asked = evidence.suite.get("time_limit")
+    if isinstance(asked, int | float) and asked > 0:
+        return float(asked)
+    longest = float(outcomes["longest"].max())
+    return longest if longest > 0 else 1.0
+
+
+def _contest(
+    title: str,
+    group: pd.DataFrame,
+    cases: Sequence[str],
+    solvers: Sequence[str],
+    limit: float,
+) -> Contest | None:
+    """Keep the solvers with at least half of the cases, and cases that they all had."""
+    wide = group.pivot(index="case", columns="solver")
+    present = np.array([cases[i] for i in wide.index], dtype=object)
+    met = np.array([solvers[i] for i in wide["times"].columns], dtype=object)
+
+    def matrix(name: str) -> Times:
+        return wide[name].to_numpy(dtype=float)
+
+    times, declined = matrix("times"), matrix("declined")
+    seen = ~np.isnan(times)
+    refused = (declined == 1).sum(axis=0) == seen.sum(axis=0)
+    rare = ~refused & (2 * seen.sum(axis=0) < len(present))
+    taken = ~(refused | rare)
+    complete = seen[:, taken].all(axis=1)
+    part = np.ix_(complete, taken)
+    if complete.sum() < CASES or taken.sum() < 2 or not np.isfinite(times[part]).any():
+        return None
+    stopped = matrix("stopped")[part]
+    return Contest(
+        title=title,
+        cases=tuple(present[complete]),
+        solvers=tuple(met[taken]),
+        times=times[part],
+        claimed=matrix("claimed")[part],
+        stopped=np.where(np.isinf(stopped), limit, stopped),
+        limit=limit,
+        notes=_left_out([*met[refused]], [*met[rare]], int((~complete).sum())),
+    )
+
+
+def _left_out(refused: list[str], rare: list[str], cases: int) -> tuple[str, ...]:
+    """Say what takes no part."""
+    notes = []
+    if refused:
+        notes.append(f"Declined all of them: {listing(refused, 6)}.")
+    if rare:
+        notes.append(f"Measured on fewer than half of them: {listing(rare, 6)}.")
+    if cases:
+        notes.append(f"Not measured by all, left out: {plural(cases, 'case')}.")
+    return tuple(notes)
+
+
+def _title(kind: _Kind) -> str:
+    parts = [clean(kind.form, 24)] * bool(kind.form)
+    parts += [kind.mode] * (kind.mode != "cold")
+    accuracy = f"{'accuracy' if kind.sweep else 'tol'} {tolerance(kind.at)}"
+    return ", ".join([*parts, accuracy])

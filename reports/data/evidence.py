@@ -1,0 +1,287 @@
+"""What a result folder holds, grouped the way the report asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from harness import InputError, Record, Verdict
+from harness.faults import Fault, left, read_faults
+from harness.journal import read_journal
+from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
+from harness.reading import read_json, read_toml
+from harness.show import say
+from reports.statistics.intervals import Interval, median_interval
+
+RESIDUALS = ("primal", "dual", "complementarity", "gap")
+
+_AS_WRITTEN = "the file that the run wrote; restore it"
+
+#: Worst first: the verdict on several repeats is the worst of theirs.
+SEVERITY = (
+    Verdict.WRONG,
+    Verdict.INACCURATE,
+    Verdict.INFEASIBLE_CLAIM,
+    Verdict.CRASHED,
+    Verdict.FAILED,
+    Verdict.MEMORY_LIMIT,
+    Verdict.TIME_LIMIT,
+    Verdict.ITERATION_LIMIT,
+    Verdict.DECLINED,
+    Verdict.VERIFIED,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """All repeats of one solver on one case at one tolerance."""
+
+    records: tuple[Record, ...]  #: at least one
+    factor: float = VERIFIED_FACTOR  #: verified: every residual ≤ this times tol
+
+    @property
+    def first(self) -> Record:
+        """The record that speaks for what the repeats share."""
+        return self.records[0]
+
+    @property
+    def case(self) -> str:
+        """Canonical name."""
+        return self.first.case
+
+    @property
+    def physical(self) -> str:
+        """The case without its form: primal and dual are one physical case."""
+        return self.case.removesuffix(f"/{self.first.form}")
+
+    @property
+    def tol(self) -> float:
+        """The accuracy asked for."""
+        return self.first.tol
+
+    @property
+    def allowed(self) -> float:
+        """The largest residual that verification allows, as `harness.kkt.verdict`."""
+        at = self.first.tol if self.first.accuracy is None else self.first.accuracy
+        return allowed(at, self.factor)
+
+    @property
+    def solver(self) -> str:
+        """Its label in the suite."""
+        return self.first.solver
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The worst verdict among the repeats."""
+        return min((r.status for r in self.records), key=SEVERITY.index)
+
+    @property
+    def verified(self) -> bool:
+        """Whether every repeat was verified."""
+        return self.verdict is Verdict.VERIFIED
+
+    @cached_property
+    def claims(self) -> tuple[str, ...]:
+        """What the solver said of itself, without repetition."""
+        return tuple(dict.fromkeys(r.claimed for r in self.records if r.claimed))
+
+    @property
+    def run_ids(self) -> tuple[str, ...]:
+        """The measurements behind every number of this outcome."""
+        return tuple(r.run_id for r in self.records)
+
+    def largest(self, name: str) -> float | None:
+        """Worst value of a residual or bound over the repeats; None if one lacks it."""
+        values = [getattr(r, name) for r in self.records]
+        return None if None in values else float(max(values))
+
+    @cached_property
+    def worst(self) -> float | None:
+        """The largest of the four residuals; None if there is no finite one."""
+        values = [self.largest(name) for name in RESIDUALS]
+        return max((v for v in values if v is not None), default=None) if all(
+            v is not None for v in values
+        ) else None  # fmt: skip
+
+    def seconds(self, phase: str) -> Interval | None:
+        """Median of prepare, solve or total time over the repeats that have one."""
+        return self._intervals[phase]
+
+    @cached_property
+    def _intervals(self) -> dict[str, Interval | None]:
+        found: dict[str, Interval | None] = {}
+        for phase in ("prepare", "solve", "total"):
+            values = [getattr(r, f"{phase}_seconds") for r in self.records]
+            times = [float(v) for v in values if v is not None]
+            found[phase] = median_interval(times) if times else None
+        return found
+
+    @cached_property
+    def dualising(self) -> Interval | None:
+        """Median time of dualising over the builds of the case; None for primal ones.
+
+        All measurements of one build have the same.
+        """
+        values = {r.dualise_seconds for r in self.records if r.dualise_seconds}
+        return median_interval(sorted(values)) if values else None
+
+    @cached_property
+    def with_dualising(self) -> Interval | None:
+        """Median total time, that of dualising included; None for primal forms."""
+        times = [
+            r.total_seconds + r.dualise_seconds
+            for r in self.records
+            if r.total_seconds is not None and r.dualise_seconds
+        ]
+        return median_interval(times) if times else None
+
+    @cached_property
+    def iterations(self) -> tuple[int, int] | None:
+        """Fewest and most iterations over the repeats."""
+        its = [r.iterations for r in self.records if r.iterations is not None]
+        return (min(its), max(its)) if its else None
+
+    @cached_property
+    def quantities(self) -> Mapping[str, Any]:
+        """Physical results of the first repeat that has any."""
+        return next((r.quantities for r in self.records if r.quantities), {})
+
+    def size(self, *names: str) -> int | None:
+        """Sum of integer quantities, such as the rows of two kinds; None if absent."""
+        values = [self.quantities.get(name) for name in names]
+        return sum(values) if all(isinstance(v, int) for v in values) else None  # type: ignore[arg-type]
+
+    @property
+    def energy(self) -> float | None:
+        """Potential energy of the recovered answer, where the case has one."""
+        value = self.quantities.get("energy")
+        return float(value) if isinstance(value, int | float) else None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """Everything that a report is made from."""
+
+    directory: Path
+    records: tuple[Record, ...]  #: in the order of the report
+    journal: tuple[Record, ...] = ()  #: as read, each line
+    environment: Mapping[str, Any] = field(default_factory=dict)
+    suite: Mapping[str, Any] = field(default_factory=dict)
+    factor: float = VERIFIED_FACTOR  #: at which the records are judged
+    faults: tuple[
+        Fault, ...
+    ] = ()  #: why measurements are missing, by no solver's fault
+
+    @property
+    def name(self) -> str:
+        """The suite's name, or else the folder's."""
+        return str(self.suite.get("name", self.directory.resolve().name))
+
+    @cached_property
+    def solvers(self) -> tuple[str, ...]:
+        """Labels: the suite's order first, then the alphabet."""
+        present = {r.solver for r in self.records}
+        listed = [_label(entry) for entry in self.suite.get("solvers", ())]
+        ordered = [*dict.fromkeys(listed), *sorted(present - set(listed))]
+        return tuple(s for s in ordered if s in present)
+
+    @cached_property
+    def outcomes(self) -> dict[tuple[str, float], dict[str, Outcome]]:
+        """(case, tol) → solver → outcome, in the order of the report."""
+        grouped: dict[tuple[str, float], dict[str, list[Record]]] = {}
+        for r in self.records:
+            row = grouped.setdefault((r.case, r.tol), {})
+            row.setdefault(r.solver, []).append(r)
+        return {
+            key: {
+                s: Outcome(records=tuple(row[s]), factor=self.factor)
+                for s in self.solvers
+                if s in row
+            }
+            for key, row in grouped.items()
+        }
+
+    @cached_property
+    def flat(self) -> tuple[Outcome, ...]:
+        """Every outcome, row by row."""
+        return tuple(o for row in self.outcomes.values() for o in row.values())
+
+
+def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
+    """Read a result folder: journal, environment.json and suite.toml.
+
+    factor : verdicts are those at factor·tol; at 10 they are those of the journal
+
+    Raises
+    ------
+    InputError
+        When the folder or its measurements are missing, or a file is malformed.
+
+    """
+    records = read_journal(directory, say)
+    if not records:
+        raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
+    return Evidence(
+        directory=directory,
+        journal=tuple(records),
+        records=arrange(_apart(_judged(r, factor)) for r in records),
+        environment=_read(directory / "environment.json", read_json),
+        suite=_read(directory / "suite.toml", read_toml),
+        factor=factor,
+        faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
+    )
+
+
+def _read(path: Path, read: Callable[[Path, str], Any]) -> dict[str, Any]:
+    """Read a table that a run wrote beside its journal; empty without a file."""
+    if not path.exists():
+        return {}
+    table = read(path, _AS_WRITTEN)
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: no JSON object; expected {_AS_WRITTEN}")
+    return table
+
+
+def _judged(record: Record, factor: float) -> Record:
+    if factor == VERIFIED_FACTOR:
+        return record
+    return record.but(status=rejudged(record, factor))
+
+
+def _apart(record: Record) -> Record:
+    """Call a solver that drove a sequence by another name than one that began cold."""
+    if record.mode == "cold":
+        return record
+    return record.but(solver=f"{record.solver} ({record.mode})")
+
+
+def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
+    """Order by case, tolerance and repeat; of equal run_ids the last one counts.
+
+    Those of a journal are distinct, those of several folders may not be.
+    """
+    latest = {r.run_id: r for r in records}
+    return tuple(sorted(latest.values(), key=_position))
+
+
+def _position(r: Record) -> tuple[Any, ...]:
+    params = [
+        (k, (0, v, "") if isinstance(v, int | float) else (1, 0, str(v)))
+        for k, v in r.params.items()
+    ]
+    return (r.family, params, r.case, -r.tol, r.solver, r.repeat, r.run_id)
+
+
+def _label(entry: Any) -> str:
+    """Label of one entry of the suite's list of solvers."""
+    if isinstance(entry, Mapping):
+        return str(entry.get("label", entry.get("name", "")))
+    return str(entry)
+
+
+def energies(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Keep the verified answers that have a potential energy."""
+    return [o for o in outcomes if o.verified and o.energy is not None]

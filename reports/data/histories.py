@@ -1,0 +1,167 @@
+"""Which histories a report shows, and what they say in numbers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import InputError, Record, Vector
+from harness.history import History
+from harness.store import load_history
+from reports.data.evidence import Evidence, Outcome
+
+MOST = 4  #: cases that are drawn
+
+#: in words; the rule of `chosen`
+RULE = (
+    "Of each family and form, the case with most variables for which a history was "
+    "kept is drawn, at its last load step and tightest tolerance, with all solvers "
+    f"that kept one; of more than {MOST} such cases, the {MOST} largest."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Course:
+    """How one solver went through one case, by its own account; rows from its start."""
+
+    outcome: Outcome
+    record: Record  #: the repeat that this is the history of
+    history: History  #: at least one row
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return int(next(iter(self.history.values())).size)
+
+    @cached_property
+    def products(self) -> Vector | None:
+        """(rows,) products with P so far; None unless all are known."""
+        values = self._numbers("products")
+        return values if values is not None and np.isfinite(values).all() else None
+
+    @property
+    def iterations(self) -> Vector:
+        """(rows,) counted from one."""
+        return np.arange(1.0, self.rows + 1)
+
+    @cached_property
+    def gradient(self) -> Vector | None:
+        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
+        phi, beta = self._numbers("free_gradient"), self._numbers("chopped_gradient")
+        if phi is None or beta is None:
+            return None
+        norm = np.hypot(phi, beta)
+        positive = norm[norm > 0]
+        return norm / positive[0] if positive.size else None
+
+    @cached_property
+    def infeasibility(self) -> Vector | None:
+        """(rows,) relative norm of Ax − b; None if it is never positive."""
+        values = self._numbers("infeasibility")
+        return values if values is not None and (values > 0).any() else None
+
+    @cached_property
+    def active(self) -> Vector | None:
+        """(rows,) number of active bounds."""
+        return self._numbers("active")
+
+    def steps(self, kind: str) -> NDArray[np.bool_]:
+        """(rows,) whether a step was of that kind."""
+        kinds = self.history.get("step", np.full(self.rows, ""))
+        return np.asarray(kinds.astype(str) == kind, dtype=bool)
+
+    @cached_property
+    def outer_ends(self) -> NDArray[np.bool_]:
+        """(rows,) whether an outer iteration ends there; nowhere if there is one."""
+        outer = self._numbers("outer")
+        if outer is None or np.all(outer == outer[0]):
+            return np.zeros(self.rows, dtype=bool)
+        return np.append(outer[1:] != outer[:-1], True)
+
+    def _numbers(self, name: str) -> Vector | None:
+        """(rows,) with NaN for what is not finite; None if no number is."""
+        values = self.history.get(name, np.zeros(0))
+        if values.dtype.kind not in "if" or not np.isfinite(values).any():
+            return None
+        return np.where(np.isfinite(values), values, np.nan)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison:
+    """The courses through one case at one tolerance, drawn over one axis of work."""
+
+    courses: tuple[Course, ...]  #: at least one, in the order of the suite
+    solvers: tuple[str, ...]  #: all of the report: each looks the same in all figures
+
+    @property
+    def counted(self) -> bool:
+        """Whether all courses can be drawn over products; over iterations if not."""
+        return all(c.products is not None for c in self.courses)
+
+    def work(self, course: Course) -> Vector:
+        """(rows,) products or iterations."""
+        products = course.products if self.counted else None
+        return course.iterations if products is None else products
+
+    def taken(self, kind: str) -> bool:
+        """Whether any course has a step of that kind."""
+        return any(c.steps(kind).any() for c in self.courses)
+
+
+def chosen(evidence: Evidence) -> list[Comparison]:
+    """Choose the cases to draw by `RULE`."""
+    ordered = sorted(evidence.outcomes.values(), key=_importance, reverse=True)
+    found: dict[tuple[str, str], Comparison] = {}
+    for row in ordered:
+        one = next(iter(row.values())).first
+        key = (one.family, one.form)
+        if len(found) == MOST:
+            break
+        if key not in found and (told := tuple(_courses(evidence, row))):
+            found[key] = Comparison(courses=told, solvers=evidence.solvers)
+    return list(found.values())
+
+
+def unread(evidence: Evidence) -> list[str]:
+    """Name the files that should hold a history, but cannot be read."""
+    lost = []
+    for outcome in evidence.flat:
+        for record in outcome.records:
+            if record.vectors and record.options.get("history") is True:
+                try:
+                    load_history(evidence.directory, record.vectors)
+                except InputError as e:
+                    lost.append(str(e).removeprefix(f"{evidence.directory}{os.sep}"))
+    return lost
+
+
+def _courses(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[Course]:
+    for outcome in row.values():
+        for record in outcome.records:
+            history = _history(evidence, record)
+            if history and next(iter(history.values())).size:
+                yield Course(outcome=outcome, record=record, history=history)
+                break
+
+
+def _history(evidence: Evidence, record: Record) -> History:
+    if record.vectors is None:
+        return {}
+    try:
+        return load_history(evidence.directory, record.vectors)
+    except InputError:  # the journal alone must do
+        return {}
+
+
+def _importance(row: Mapping[str, Outcome]) -> tuple[float, float, float, str]:
+    """Order by size, then load step, then accuracy; the name breaks ties."""
+    one = next(iter(row.values())).first
+    step = one.params.get("step", 0)
+    size = max(float(o.first.sizes.get("variables", 0)) for o in row.values())
+    last = float(step) if isinstance(step, int | float) else 0.0
+    return (size, last, -one.tol, one.case)

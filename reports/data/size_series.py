@@ -1,0 +1,109 @@
+"""Cases that differ in size only, and how time and iterations grow along them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from reports.data.evidence import Evidence, Outcome
+from reports.document.formatting import clean, tolerance
+from reports.statistics.intervals import PowerLaw, power_law
+
+SIZES = 3  #: fewer different sizes make no table
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ladder:
+    """Cases that differ in size only, and the verified answers on each."""
+
+    title: str  #: family, the parameters held, form, tolerance
+    solvers: tuple[str, ...]
+    rungs: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+
+    @property
+    def answers(self) -> int:
+        """How many verified answers it rests on."""
+        return sum(len(row) for _, _, row in self.rungs)
+
+    def curve(self, solver: str) -> list[tuple[int, Outcome]]:
+        """Sizes n and verified answers of one solver, smallest first."""
+        return [(n, row[solver]) for n, _, row in self.rungs if solver in row]
+
+    def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
+        """Fit median total time ~ nᵖ or mᵖ; None with fewer than three sizes."""
+        timed = [(s, o.seconds("total")) for s, o in self._sized(solver, against)]
+        return _law([(s, t.value) for s, t in timed if t is not None])
+
+    def iteration_law(self, solver: str, against: str = "n") -> PowerLaw | None:
+        """Fit iterations ~ nᵖ or mᵖ, repeats averaged; None below three sizes."""
+        counted = [(s, o.iterations) for s, o in self._sized(solver, against)]
+        return _law([(s, sum(i) / 2) for s, i in counted if i is not None])
+
+    def _sized(self, solver: str, against: str) -> list[tuple[int, Outcome]]:
+        """Sizes n or m and the answers of one solver; those without are left out."""
+        return [
+            (size, row[solver])
+            for n, m, row in self.rungs
+            if solver in row and (size := n if against == "n" else m) is not None
+        ]
+
+
+def _law(points: list[tuple[int, float]]) -> PowerLaw | None:
+    kept = [(n, v) for n, v in points if n > 0 and v > 0]
+    if len({n for n, _ in kept}) < SIZES:
+        return None
+    return power_law(*zip(*kept, strict=True))
+
+
+def ladders(evidence: Evidence) -> list[Ladder]:
+    """Find the cases that form a ladder of at least three sizes.
+
+    n is the number of dofs, m the rows of equalities and contact. A key of the case
+    name is held fixed within a ladder if cases of equal n differ in it (the load step,
+    say); the others are what makes a case larger.
+    """
+    sized = [(o, n) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
+    held = _held(sized)
+    groups: dict[tuple[Any, ...], dict[int, dict[str, Outcome]]] = {}
+    for o, n in sized:
+        kept = tuple((k, o.first.params.get(k)) for k in held[o.first.family])
+        key = (o.first.family, kept, o.first.form, o.tol)
+        groups.setdefault(key, {}).setdefault(n, {})[o.solver] = o
+    return [
+        _ladder(key, rungs, evidence.solvers)
+        for key, rungs in groups.items()
+        if len(rungs) >= SIZES
+    ]
+
+
+def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
+    """Name, per family, the keys in which cases of equal size differ."""
+    seen: dict[tuple[str, int, str], set[Any]] = {}
+    for o, n in sized:
+        for key, value in o.first.params.items():
+            seen.setdefault((o.first.family, n, key), set()).add(value)
+    held: dict[str, dict[str, None]] = {o.first.family: {} for o, _ in sized}
+    for (family, _, key), values in seen.items():
+        if len(values) > 1:
+            held[family][key] = None
+    return {family: tuple(keys) for family, keys in held.items()}
+
+
+def _ladder(
+    key: tuple[Any, ...],
+    rungs: dict[int, dict[str, Outcome]],
+    solvers: tuple[str, ...],
+) -> Ladder:
+    family, kept, form, tol = key
+    names = [family, *(f"{k}={v}" for k, v in kept), *([form] if form else [])]
+    present = {s for row in rungs.values() for s in row}
+    rows = []
+    for n, row in sorted(rungs.items()):
+        m = next(iter(row.values())).size("equality_rows", "contact_rows")
+        rows.append((n, m, row))
+    return Ladder(
+        title=f"{clean('/'.join(names))}, tol {tolerance(tol)}",
+        solvers=tuple(s for s in solvers if s in present),
+        rungs=tuple(rows),
+    )

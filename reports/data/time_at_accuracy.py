@@ -1,0 +1,111 @@
+"""Time at matched error: what a solver needs for an answer that is proven so good.
+
+A sweep of its tolerance gives a solver's points (certified error, time). Between them
+the time is interpolated linearly in the logarithms, after isotonic regression: a better
+answer does not take less time [1]_. Nothing is extrapolated.
+
+A point counts if the solver itself handed the answer over as solved, and a certificate
+bounds its error. The claim is not believed; it tells what ended the solve, the solver's
+own test at this tolerance and no limit of ours. Residuals that refute the claim at the
+tolerance do not matter here: the error is a fact.
+
+References
+----------
+.. [1] R. E. Barlow, D. J. Bartholomew, J. M. Bremner, H. D. Brunk, Statistical
+   Inference under Order Restrictions, 1972
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from hashlib import blake2s
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+from harness import Verdict
+from reports.data.evidence import Outcome
+from reports.statistics.intervals import COVERAGE, Interval
+from reports.statistics.resampling import limits
+
+RESAMPLES = 400
+SMALLEST = 1e-17  #: errors below, zero among them, count as this
+
+Floats = NDArray[np.float64]
+
+
+class Matched(NamedTuple):
+    """The time at one error; see `matched`."""
+
+    kind: str  #: "between", "looser" (the loosest is better already), "not reached"
+    time: Interval | None  #: s; of "looser", that of the loosest: it takes at most that
+
+
+def counts(outcome: Outcome) -> bool:
+    """Whether an outcome is a point of its solver's curve."""
+    limited = outcome.verdict in (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
+    return (
+        outcome.claims == ("solved",)
+        and all(r.claimed and r.energy_bound is not None for r in outcome.records)
+        and outcome.seconds("total") is not None
+        and not limited
+    )
+
+
+def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
+    """Interpolate the time of answers that are proven to be within `error`.
+
+    The interval is a bootstrap over the repeats of each tolerance, seeded by the names
+    of the measurements, as wide as few repeats demand; a single one has none.
+
+    outcomes : of one solver on one case, at all tolerances
+    """
+    points = [o for o in outcomes if counts(o)]
+    if not points:
+        return Matched("not reached", None)
+    errors = np.array([max(o.largest("energy_bound") or 0.0, SMALLEST) for o in points])
+    if error < errors.min():
+        return Matched("not reached", None)
+    if error > errors.max():
+        loosest = max(points, key=lambda o: (o.largest("energy_bound") or 0.0, o.tol))
+        return Matched("looser", loosest.seconds("total"))
+    samples = [
+        np.array([r.total_seconds for r in o.records if r.total_seconds])
+        for o in points
+    ]
+    value = time_at(error, errors, np.array([np.median(t) for t in samples]))
+    drawn = [_medians(t, o) for t, o in zip(samples, points, strict=True)]
+    times = [time_at(error, errors, t) for t in np.transpose(drawn)]
+    fewest = min(t.size for t in samples)
+    low, high = limits(np.array(times), fewest) if fewest > 1 else (value, value)
+    return Matched(
+        "between", Interval(value, float(low), float(high), COVERAGE, fewest)
+    )
+
+
+def time_at(error: float, errors: Floats, times: Floats) -> float:
+    """Interpolate monotone in logarithms, between the smallest and the largest error.
+
+    errors, times : (k,) positive; equal errors are one point, their times' mean
+    """
+    points = sorted(zip(-np.log(errors), np.log(times), strict=True))
+    x, y, weights = [], [], []
+    for place, group in groupby(points, key=lambda p: p[0]):
+        logs = [t for _, t in group]
+        x.append(place)
+        y.append(np.mean(logs))
+        weights.append(len(logs))
+    fit = isotonic_regression(y, weights=weights)
+    return float(np.exp(np.interp(-np.log(error), x, fit.x)))
+
+
+def _medians(times: Floats, outcome: Outcome) -> Floats:
+    """Draw medians of repeats with replacement; the same for the same measurements."""
+    names = "\n".join(outcome.run_ids).encode("utf-8", "replace")
+    seed = int.from_bytes(blake2s(names, digest_size=8).digest(), "big")
+    chosen = np.random.default_rng(seed).choice(times, (RESAMPLES, times.size))
+    return np.asarray(np.median(chosen, axis=1))

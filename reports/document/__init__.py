@@ -1,0 +1,1 @@
+"""The report as data: sections, tables and figures, and numbers as text."""

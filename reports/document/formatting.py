@@ -1,0 +1,153 @@
+"""Numbers and names as the report prints them: plain text, escaped by the renderers."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Sequence
+from functools import lru_cache
+
+from harness import Verdict
+from reports.statistics.intervals import Interval, PowerLaw
+
+ABSENT = "–"  #: what was not or cannot be measured
+
+#: What a time is, wherever times are shown.
+TIMED = (
+    "Times are those of the solver from the emitted QP on; assembling, linearising "
+    "and, for dual forms, dualising are the generator's and not in them."
+)
+
+#: Symbol and words of every verdict: colour alone says nothing to many readers.
+VERDICTS = {
+    Verdict.VERIFIED: ("✓", "verified"),
+    Verdict.INACCURATE: ("△", "inaccurate"),
+    Verdict.WRONG: ("✗", "wrong"),
+    Verdict.INFEASIBLE_CLAIM: ("∅", "infeasible claim"),
+    Verdict.ITERATION_LIMIT: ("↻", "iteration limit"),
+    Verdict.TIME_LIMIT: ("↻", "time limit"),
+    Verdict.MEMORY_LIMIT: ("↻", "memory limit"),
+    Verdict.CRASHED: ("†", "crashed"),
+    Verdict.FAILED: ("†", "failed"),
+    Verdict.DECLINED: ("○", "declined"),
+}
+
+_ACCENT = (
+    "[\u0300-\u036f\u0483-\u0489\u1ab0-\u1aff\u1dc0-\u1dff\u20d0-\u20ff\ufe20-\ufe2f]"
+)
+_PILED = re.compile(f"({_ACCENT}{{2}}){_ACCENT}+")
+
+_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
+
+
+@lru_cache(1 << 16)
+def clean(text: str, limit: int = 96) -> str:
+    """Make foreign text fit for a table: one line, no control characters, not longer.
+
+    The middle is left out of what is too long, since names differ at their ends. A
+    letter keeps two accents; one that has no letter to stand on gets a circle.
+    """
+    line = " ".join(text.split())
+    if not line.isascii() or not line.isprintable():
+        visible = "".join("\ufffd" if _invisible(c) else c for c in line)
+        line = _PILED.sub(r"\1", unicodedata.normalize("NFC", visible))
+    if len(line) > limit:
+        tail = limit // 3
+        line = f"{line[: limit - tail - 1]}…{line[-tail:]}"
+    return f"◌{line[: limit - 1]}" if line and unicodedata.combining(line[0]) else line
+
+
+def _invisible(char: str) -> bool:
+    """Whether a character is a control, a direction override or a lone surrogate."""
+    return unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co"}
+
+
+def significant(value: float | None, digits: int = 3) -> str:
+    """Print `digits` significant digits, no more; no exponent if that is short."""
+    if value is None or not math.isfinite(value):
+        return ABSENT
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -3 <= exponent < digits:  # beyond, zeros would pose as digits
+        return f"{value:.{max(digits - 1 - exponent, 0)}f}"
+    return _short(f"{value:.{digits - 1}e}")
+
+
+def power(value: float | None) -> str:
+    """Print an order of magnitude with two digits: 3.2e-9, 1.4, 0.25."""
+    if value is None or not math.isfinite(value):
+        return ABSENT
+    if 0.095 <= abs(value) < 9.95:
+        return significant(value, 2)
+    return "0" if value == 0 else _short(f"{value:.1e}")
+
+
+def _short(text: str) -> str:
+    """Write an exponent as one does: 1e-08 becomes 1e-8."""
+    mantissa, _, exponent = text.partition("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def tolerance(value: float) -> str:
+    """Print a tolerance as one writes it: 1e-8."""
+    mantissa, _, exponent = f"{value:.6e}".partition("e")
+    return _short(f"{float(mantissa):g}e{exponent}")
+
+
+def seconds(interval: Interval | None) -> str:
+    """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
+
+    Both ends are printed to the digit of the median, which has as many digits as tell
+    the ends apart, and at least three. A single run has no uncertainty that one could
+    know, and the text says so.
+    """
+    if interval is None:
+        return ABSENT
+    unit, name = next((u for u in _UNITS if interval.value >= u[0]), _UNITS[-1])
+    scaled = interval.value / unit
+    exponent = math.floor(math.log10(scaled)) if scaled > 0 else 0
+    low, high = interval.low / unit, interval.high / unit
+    decimals = _telling(low, high, max(2 - exponent, 0))
+    ends = f"{low:.{decimals}f}, {high:.{decimals}f}"
+    shown = ends if interval.samples > 1 else "1 run"
+    return f"{scaled:.{decimals}f} {name} [{shown}]"
+
+
+def _telling(low: float, high: float, decimals: int) -> int:
+    """Find how many decimals tell two numbers apart; as given where none do."""
+    further = range(decimals, decimals + 7)
+    return next((d for d in further if f"{low:.{d}f}" != f"{high:.{d}f}"), decimals)
+
+
+def exponent(fit: PowerLaw) -> str:
+    """Print the exponent of a power law with its 95 % interval."""
+    d = _telling(fit.low, fit.high, 2)
+    p, low, high = (round(v, d) + 0.0 for v in (fit.exponent, fit.low, fit.high))
+    return f"{p:.{d}f} [{low:.{d}f}, {high:.{d}f}]"
+
+
+def bracketed(value: float, low: float, high: float) -> str:
+    """Print a number and its interval, three digits each: "1.43 [0.890, 2.57]"."""
+    return f"{significant(value)} [{significant(low)}, {significant(high)}]"
+
+
+def span(least_most: tuple[int, int] | None) -> str:
+    """Print a count, or its range where repeats differ."""
+    if least_most is None:
+        return ABSENT
+    least, most = least_most
+    return str(least) if least == most else f"{least}–{most}"
+
+
+def listing(names: Sequence[str], limit: int = 3) -> str:
+    """Name the first few of a list and count the others."""
+    shown = ", ".join(clean(n) for n in names[:limit])
+    more = len(names) - limit
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def plural(count: int, noun: str) -> str:
+    """Count a noun: "1 case", "3 cases"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,109 @@
+"""The report as data: sections of prose, tables and figures; renderers do the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from harness import Record
+from reports.document.formatting import ABSENT, clean
+
+_RUN = "run "  #: before the run_ids in a title
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One entry of a table: plain text and what it means, never markup."""
+
+    text: str = ABSENT
+    symbol: str = ""  #: before the text, where the medium has it
+    after: str = ""  #: small print behind the text
+    kind: str = ""  #: a verdict, "best", "tied", "void" (not to be compared) or "total"
+    title: str = ""  #: shown when pointed at; run_ids as `source` names them are links
+    value: float | None = None  #: what to sort by; the text, if None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table in the booktabs manner."""
+
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    text_columns: int = 1  #: how many columns from the left hold names, not numbers
+    notes: tuple[str, ...] = ()  #: what must be known to read it; after the caption
+    solver: str = ""  #: the only one that it is about: a reader may hide both
+
+    def wordy(self, column: int) -> bool:
+        """Whether a column holds words, which begin at the left, not numbers."""
+        first = self.rows[0][column].kind if self.rows else ""
+        return column < self.text_columns or first == "words"
+
+    @property
+    def legend(self) -> str:
+        """Caption and notes in one paragraph."""
+        return " ".join((self.caption, *self.notes))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Picture:
+    """A figure, its file name without ending, and its caption.
+
+    The page reads curves back from the figure (`reports.render.plots`) and draws them
+    so that one can zoom; what it cannot read, it shows as it is.
+    """
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Section:
+    """One part of the report; `name` is its anchor and the stem of its files."""
+
+    name: str
+    title: str
+    prose: tuple[str, ...] = ()
+    points: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Page:
+    """The whole report, summary first."""
+
+    title: str
+    dateline: str
+    sections: tuple[Section, ...]
+    footer: str = ""  #: where the numbers are, if not in a result folder
+    records: tuple[Record, ...] = ()  #: the measurements that its numbers come from
+    solvers: tuple[str, ...] = ()  #: of these, in the order of their looks in figures
+
+
+def sources(records: Iterable[Record]) -> str:
+    """Name measurements one by one; empty if there are none."""
+    names = ", ".join(short(r.run_id) for r in records)
+    return _RUN + names if names else ""
+
+
+def named(title: str) -> list[str]:
+    """List the run_ids, as `short` prints them, that `source` put into a title."""
+    before, run, names = title.rpartition(_RUN)
+    at_end = run and (not before or before.endswith(" "))
+    return names.split(", ") if at_end else []
+
+
+def short(run_id: str) -> str:
+    """Print a run_id; ours are short, those of a foreign journal may not be."""
+    is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
+    return run_id if is_ours else clean(run_id, 40)
+
+
+def name_cell(name: str) -> Cell:
+    """Show a name that may be long; all of it appears when pointed at."""
+    shown = clean(name)
+    return Cell(text=shown, title="" if shown == name else clean(name, 2000))

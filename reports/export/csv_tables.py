@@ -1,0 +1,176 @@
+"""The numbers behind the tables at full precision, as data frames for CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from harness import Record, Verdict
+from reports.data.aggregation import EVERY, USUAL, Convention, Standing, standing
+from reports.data.aggregation import geometric_means as means_by
+from reports.data.comparison_groups import Contest, contests
+from reports.data.evidence import RESIDUALS, Evidence, Outcome
+from reports.data.size_series import Ladder, ladders
+from reports.export.parquet import texts
+from reports.sections.physics import spreads
+from reports.sections.ranking import ranks
+from reports.statistics.intervals import PowerLaw
+from reports.statistics.profiles import performance_ratios
+
+_COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
+
+
+def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
+    """Make every sheet by the name of its file; empty ones are left out.
+
+    measurements: one row per journal line. outcomes: the repeats of one solver on one
+    case together, every time a median with its interval. energies, scaling: as in the
+    report. contests, means: see `reports.export.contest_sheets`.
+    """
+    found = {
+        "measurements": _measurements(evidence.records),
+        "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
+        "energies": pd.DataFrame(
+            {
+                "case": s.answers[0].physical,
+                "tol": s.answers[0].tol,
+                "answers": len(s.answers),
+                "energy": s.best.energy,
+                "largest_relative_difference": s.relative,
+            }
+            for s in spreads(evidence.flat)
+        ),
+        "scaling": pd.DataFrame(
+            _law(ladder, solver)
+            for ladder in ladders(evidence)
+            for solver in ladder.solvers
+        ),
+    }
+    found |= contest_sheets(evidence)
+    return {name: _counted(frame) for name, frame in found.items() if len(frame)}
+
+
+def _counted(frame: pd.DataFrame) -> pd.DataFrame:
+    """Keep counts integers where some are missing."""
+    counts = [name for name in _COUNTS if name in frame]
+    return frame.astype(dict.fromkeys(counts, "Int64"))
+
+
+def _measurements(records: Sequence[Record]) -> pd.DataFrame:
+    """Give every field of every record a column; what is nested is JSON text."""
+    columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(Record)}
+    for name, values in columns.items():
+        if isinstance(values[0], Mapping | Verdict):
+            columns[name] = list(texts(values))
+    return pd.DataFrame(columns)
+
+
+def _outcome(o: Outcome) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "case": o.case,
+        "form": o.first.form,
+        "tol": o.tol,
+        "solver": o.solver,
+        "verdict": o.verdict.value,
+        "claimed": "; ".join(o.claims),
+        "repeats": len(o.records),
+    }
+    for phase in ("prepare", "solve", "total"):
+        interval = o.seconds(phase)
+        for part in ("value", "low", "high"):
+            name = "median" if part == "value" else part
+            value = getattr(interval, part) if interval else None
+            row[f"{phase}_seconds_{name}"] = value
+    interval = o.seconds("total")
+    row["interval_coverage"] = interval.coverage if interval else None
+    row["iterations_min"], row["iterations_max"] = o.iterations or (None, None)
+    row |= {name: o.largest(name) for name in (*RESIDUALS, "energy_bound")}
+    row["energy"] = o.energy
+    row["n"] = o.size("dofs")
+    row["m"] = o.size("equality_rows", "contact_rows")
+    row["run_ids"] = " ".join(o.run_ids)
+    return row
+
+
+def _law(ladder: Ladder, solver: str) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "ladder": ladder.title,
+        "solver": solver,
+        "sizes": len(ladder.curve(solver)),
+    }
+    laws: dict[str, PowerLaw | None] = {
+        "time": ladder.time_law(solver),
+        "time_against_m": ladder.time_law(solver, "m"),
+        "iterations": ladder.iteration_law(solver),
+        "iterations_against_m": ladder.iteration_law(solver, "m"),
+    }
+    for what, law in laws.items():
+        for part in ("exponent", "low", "high", "factor"):
+            row[f"{what}_{part}"] = getattr(law, part) if law else None
+    return row
+
+
+def contest_sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
+    """Make the sheets of all contests.
+
+    contests: a row per case and solver with its time and its ratio to the best, both
+    infinite for a failure; profiles are their distributions. means: a row per solver
+    and convention, with intervals and tiers where they are made, at the usual one.
+    """
+    found = contests(evidence)
+    return {
+        "contests": pd.concat([pd.DataFrame(), *map(_cells, found)]),
+        "means": pd.DataFrame(
+            [row for each in map(standing, found) for row in _means(each)]
+        ),
+    }
+
+
+def _cells(contest: Contest) -> pd.DataFrame:
+    """One row per case and solver."""
+    cases, solvers = len(contest.cases), len(contest.solvers)
+    return pd.DataFrame(
+        {
+            "contest": contest.title,
+            "case": np.repeat(_spelt(contest.cases), solvers),
+            "solver": np.tile(_spelt(contest.solvers), cases),
+            "seconds": contest.times.ravel(),
+            "ratio": performance_ratios(contest.times).ravel(),
+            "claimed_seconds": contest.claimed.ravel(),
+            "out_of_time_after": contest.stopped.ravel(),
+        }
+    )
+
+
+def _means(standing: Standing) -> list[dict[str, Any]]:
+    """One row per convention and solver."""
+    contest = standing.contest
+    usual: dict[str, Any] = {
+        "low": standing.intervals[0],
+        "high": standing.intervals[1],
+    }
+    names = ("ratio", "ratio_low", "ratio_high")
+    usual |= dict(zip(names, standing.ratios, strict=True))
+    usual |= {"p_best": standing.first, "tier": standing.tiers}
+    rows = []
+    for convention in (*EVERY, Convention(common=True)):
+        found = means_by(contest, convention)
+        ranked = ranks(found)
+        more = usual if convention == USUAL else {}
+        for i, solver in enumerate(_spelt(contest.solvers)):
+            rows.append(
+                {"contest": contest.title, "solver": solver}
+                | vars(convention)
+                | {"mean": found[i], "rank": ranked[i]}
+                | {name: values[i] for name, values in more.items()}
+            )
+    return rows
+
+
+def _spelt(names: Sequence[str]) -> list[str]:
+    """Spell out lone surrogates, which no file can hold."""
+    return [name.encode(errors="backslashreplace").decode() for name in names]

@@ -1,0 +1,59 @@
+"""The paper's figures and tables from measured data: no measuring happens here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from harness.experiment import load_experiment
+from reports.data.evidence import read_evidence
+from reports.export.csv_tables import sheets as report_sheets
+from reports.figures.saving import save_all
+from reports.paper.csv_tables import sheets
+from reports.paper.page import BEYOND, compose
+from reports.render.html_page import html
+from reports.render.latex import latex
+from reports.render.writing import ENDINGS
+
+
+def write_paper(folder: Path) -> list[Path]:
+    """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex) from data/.
+
+    data/ is an experiment and, where measured, the result folders of the suites of
+    `BEYOND`. The same data give the same bytes.
+
+    Raises
+    ------
+    InputError
+        When data/ is missing or damaged.
+
+    """
+    experiment = load_experiment(folder / "data")
+    suites = {
+        name: read_evidence(folder / "data" / name)
+        for name in BEYOND
+        if (folder / "data" / name).is_dir()
+    }
+    page = compose(experiment, suites)
+    written = [_write(folder / "index.html", html(page))]
+    figures, tables = folder / "figures", folder / "tables"
+    figures.mkdir(exist_ok=True)
+    for section in page.sections:
+        for picture in section.pictures:
+            files = [figures / f"{picture.name}{e}" for e in ENDINGS]
+            written += save_all(picture.figure, files)
+        if section.tables:
+            path = tables / f"{section.name}.tex"
+            written.append(_write(path, latex(section.tables)))
+    frames = sheets(experiment)
+    frames |= {name: report_sheets(e)["outcomes"] for name, e in suites.items()}
+    written += [
+        _write(tables / f"{name}.csv", frame.to_csv(index=False))
+        for name, frame in frames.items()
+    ]
+    return written
+
+
+def _write(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8", newline="\n")
+    return path

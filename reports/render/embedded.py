@@ -1,0 +1,169 @@
+"""What the script of the page reads: tables, plots and measurements as compact JSON."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from base64 import b64encode
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from typing import Any
+
+from harness import Record
+from harness.record import finite
+from reports.document.formatting import VERDICTS, clean, tolerance
+from reports.document.layout import Cell, Page, Table, named, short
+from reports.figures.style import legible, look
+from reports.render.artists import Data
+from reports.render.plots import read_back
+
+Rows = Mapping[str, int]  #: run_id, as titles have it → position among the records
+
+
+def rows_of(records: Sequence[Record]) -> Rows:
+    """Map every run_id to its place in the order of the report."""
+    return {short(r.run_id): i for i, r in enumerate(records)}
+
+
+def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
+    """Serialise what the page needs at once; its measurements' details follow apart."""
+    return script({
+        "solvers": [_solver(s, i) for i, s in enumerate(page.solvers)],
+        "tables": [table(t, rows) for s in page.sections for t in s.tables],
+        "plots": plots,
+        "runs": _keys(page.records),
+    })  # fmt: skip
+
+
+def details(records: Sequence[Record]) -> str:
+    """Serialise every field of every measurement: columns, JSON, gzip, base64.
+
+    A column is a list of values, or, where few differ, these and their positions.
+    """
+    lines = [_as_journalled(r) for r in records]
+    columns = {f.name: [getattr(r, f.name) for r in lines] for f in fields(Record)}
+    text = strict({name: _column(values) for name, values in columns.items()})
+    return b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
+
+
+def _as_journalled(record: Record) -> Record:
+    """Undo the name that the report gives to a solver that drove a sequence."""
+    mode = f" ({record.mode})"
+    named_apart = record.mode != "cold" and record.solver.endswith(mode)
+    return (
+        record.but(solver=record.solver.removesuffix(mode)) if named_apart else record
+    )
+
+
+def script(content: Any) -> str:
+    """Write JSON that can stand in a <script>: no tag, comment or line end in it."""
+    text = strict(content)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def strict(content: Any) -> str:
+    """Write JSON in ASCII; NaN and inf become null, as in the journal."""
+    write = partial(json.dumps, allow_nan=False, separators=(",", ":"))
+    try:
+        return write(content)
+    except ValueError:  # rare, and looking for them takes longer than writing
+        return write(finite(content))
+
+
+def plots(page: Page, rows: Rows) -> dict[str, list[Data]]:
+    """Read back every figure that can be drawn anew, by its name."""
+    labels = {s: legible(s) for s in page.solvers}
+    found = {}
+    for picture in (p for s in page.sections for p in s.pictures):
+        panels = read_back(picture.figure, labels)
+        if panels is not None:
+            found[picture.name] = [_numbered(panel, rows) for panel in panels]
+    return found
+
+
+def _numbered(panel: Data, rows: Rows) -> Data:
+    """Replace run_ids by their positions."""
+    traces = [
+        {**t, "runs": [spans(map(short, ids), rows) for ids in t.get("runs", ())]}
+        for t in panel["traces"]
+    ]
+    return {**panel, "traces": traces}
+
+
+def _solver(name: str, index: int) -> Data:
+    style = look(index)
+    return {
+        "names": [clean(name, 40), clean(name)],
+        "colour": style["color"],
+        "marker": style["marker"],
+    }
+
+
+def table(t: Table, rows: Rows) -> Data:
+    """Give heads, cells, and the solver that the whole table is about."""
+    return {
+        "columns": list(t.columns),
+        "words": t.text_columns,
+        "solver": clean(t.solver, 40),
+        "rows": [[cell(c, rows) for c in row] for row in t.rows],
+    }
+
+
+def cell(c: Cell, rows: Rows) -> Any:
+    """Text alone if there is no more; else all fields, without those empty at the end.
+
+    The last field lists the measurements in pairs: the first, and how many.
+    """
+    value = None if c.value is None else float(f"{c.value:.9g}")
+    runs = runs_of(c, rows)
+    title = "" if runs and c.title.startswith("run ") else c.title
+    full = [c.text, value, c.kind, c.symbol, c.after, title, runs or None]
+    while len(full) > 1 and full[-1] in (None, ""):
+        full.pop()
+    return full if len(full) > 1 else c.text
+
+
+def runs_of(c: Cell, rows: Rows) -> list[int]:
+    """Find the measurements that a cell names."""
+    return spans(named(c.title), rows)
+
+
+def spans(ids: Iterable[str], rows: Rows) -> list[int]:
+    """Pack positions of known measurements in pairs: the first, and how many."""
+    packed: list[int] = []
+    for at in (rows[i] for i in ids if i in rows):
+        if packed and at == packed[-2] + packed[-1]:
+            packed[-1] += 1
+        else:
+            packed += [at, 1]
+    return packed
+
+
+def _keys(records: Sequence[Record]) -> Data:
+    """Give what one filters by, and the run_ids that links name."""
+    shown: dict[str, Callable[[Record], str]] = {
+        "case": lambda r: clean(r.case),
+        "tol": lambda r: tolerance(r.tol),
+        "solver": lambda r: clean(r.solver, 40),
+        "status": lambda r: VERDICTS[r.status][1],
+    }
+    keys = {name: _coded([show(r) for r in records]) for name, show in shown.items()}
+    return {"id": [short(r.run_id) for r in records], **keys}
+
+
+def _coded(values: Sequence[str]) -> Data:
+    different = {v: i for i, v in enumerate(dict.fromkeys(values))}
+    return {"values": list(different), "at": [different[v] for v in values]}
+
+
+def _column(values: Sequence[Any]) -> Any:
+    """Code a column if that shortens it; 1 and 1.0 and True are different."""
+    tables = {id(v): v for v in values if type(v) in (dict, list)}  # many share one
+    known = {place: json.dumps(v) for place, v in tables.items()}
+    keys = [known.get(id(v)) or (type(v), v) for v in values]
+    first = dict(zip(reversed(keys), reversed(values), strict=True))
+    if 2 * len(first) > len(values):
+        return list(values)
+    different = {key: i for i, key in enumerate(first)}
+    return {"values": [*first.values()], "at": [different[key] for key in keys]}

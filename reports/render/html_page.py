@@ -1,0 +1,100 @@
+"""The report as one HTML file that needs no network, and can reach none."""
+
+from __future__ import annotations
+
+import re
+from base64 import b64encode
+from functools import partial
+from hashlib import sha256
+from importlib.resources import files
+from urllib.parse import quote
+
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from reports.document.layout import Cell, Page, Picture, short
+from reports.figures.saving import inline_svg
+from reports.render.embedded import Rows, data, details, plots, rows_of, runs_of
+
+FIRST = 50  #: rows of a table that are in the page as written; its script has all
+SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
+_NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
+_LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
+_RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
+
+
+def html(page: Page) -> str:
+    """Render the whole report; all text is escaped, figures are inline.
+
+    The policy in its head lets a browser run the one script that we wrote, known by
+    its hash, and fetch nothing.
+    """
+    rows = rows_of(page.records)
+    found = plots(page, rows)
+    code = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
+    environment = Environment(
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["breakable"] = breakable
+    environment.filters["told"] = partial(told, rows=rows)
+    environment.filters["drawn"] = drawn
+    environment.filters["link"] = partial(link, page=page, rows=rows)
+    return environment.from_string(_asset("page.html.j2")).render(
+        page=page,
+        first=FIRST,
+        plots=list(found),
+        policy=_policy(code),
+        style=Markup(_asset("page.css")),
+        code=Markup(code),
+        data=Markup(data(page, list(found.values()), rows)),
+        details=Markup(details(page.records)),
+    )
+
+
+def _asset(name: str) -> str:
+    return files("reports.render").joinpath("assets", name).read_text("utf-8")
+
+
+def _policy(code: str) -> str:
+    digest = b64encode(sha256(f"\n{code}\n".encode()).digest()).decode()
+    return (
+        f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
+    )
+
+
+def breakable(text: str) -> Markup:
+    """Allow a line break after every slash of a case name, and none within 1e-8.
+
+    What is written from right to left is isolated, so that it turns nothing around it.
+    """
+    parts = str(Markup("/<wbr>").join(text.split("/")))  # which escapes them
+    kept = _NUMBER.sub(r'<span class="nb">\g<0></span>', parts)
+    return Markup(_LEFTWARDS.sub(r"<bdi>\g<0></bdi>", kept))
+
+
+def told(text: str, rows: Rows) -> Markup:
+    """Break prose as names may be broken, and link the run_ids in it."""
+
+    def linked(match: re.Match[str]) -> str:
+        run_id = match[0]
+        return f'<a href="#run-{run_id}">{run_id}</a>' if run_id in rows else run_id
+
+    return Markup(_RUN_ID.sub(linked, str(breakable(text))))
+
+
+def link(cell: Cell, page: Page, rows: Rows) -> Markup:
+    """Write the attributes of a link to the measurements of a cell; empty if none."""
+    runs = runs_of(cell, rows)
+    if not runs:
+        return Markup("")
+    target = quote(short(page.records[runs[0]].run_id), safe="")
+    return Markup(f'href="#run-{target}" data-runs="{",".join(map(str, runs))}"')
+
+
+def drawn(picture: Picture) -> Markup:
+    """Embed a figure; its text was made by us from names that `legible` has cleaned."""
+    return Markup(inline_svg(picture.figure, picture.name))

@@ -1,0 +1,90 @@
+"""Tables as LaTeX, in the booktabs manner."""
+
+from __future__ import annotations
+
+import re
+
+from reports.document.layout import Cell, Table
+
+_NOT_IN_OT1 = "«»ÐðÞþ"
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&",
+    "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", '"': r"\symbol{34}", "'": r"\textquotesingle{}",
+    "`": r"\textasciigrave{}", "–": "--", "—": "---", "…": r"\ldots{}",
+    "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$", "·": r"$\cdot$",
+    "±": r"$\pm$", "≈": r"$\approx$", "∞": r"$\infty$", "√": r"$\surd$",
+    "½": r"$\frac12$", "µ": r"$\mu$", "λ": r"$\lambda$", "ν": r"$\nu$",
+    "°": r"$^\circ$", "∅": r"$\emptyset$", "✓": r"$\surd$", "−": r"$-$",
+    "\0": "{}",
+}  # fmt: skip
+
+#: text that needs no escape
+_PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
+
+
+def latex(tables: tuple[Table, ...]) -> str:
+    r"""Render tables one after the other; they need \usepackage{booktabs} only.
+
+    Times carry their unit and interval; all other numbers are plain (1.2e-09), as
+    siunitx reads them.
+    """
+    return "% \\usepackage{booktabs}\n" + "\n".join(map(_table, tables))
+
+
+def _table(table: Table) -> str:
+    columns = "".join("lr"[not table.wordy(i)] for i in range(len(table.columns)))
+    lines = [
+        r"\begin{table}",
+        r"  \centering",
+        rf"  \caption{{{escaped(table.legend)}}}",
+        rf"  \begin{{tabular}}{{{columns}}}",
+        r"    \toprule",
+        _row([escaped(c) for c in table.columns]),
+        r"    \midrule",
+    ]
+    before = ""
+    for row in table.rows:
+        if row[0].kind == "total" != before:
+            lines.append(r"    \midrule")
+        before = row[0].kind
+        lines.append(_row([_cell(c) for c in row]))
+    lines += [r"    \bottomrule", r"  \end{tabular}", r"\end{table}", ""]
+    return "\n".join(lines)
+
+
+def _row(cells: list[str]) -> str:
+    return f"    {' & '.join(cells)} \\\\"
+
+
+def _cell(cell: Cell) -> str:
+    text = escaped(cell.text)
+    after = escaped(cell.after)
+    match cell.kind:
+        case "void":
+            return f"{after} ({text})"
+        case "best" | "over":
+            text = rf"\textbf{{{text}}}"
+        case "tied":
+            text = rf"$\approx$ {text}"
+    return f"{text} {after}".strip()
+
+
+def escaped(text: str) -> str:
+    """Escape for text mode; what the oldest font encoding lacks is named, not printed.
+
+    A leading bracket is braced: after a row's end TeX would read an optional argument.
+    So are hyphens in a row, which TeX would join to dashes.
+    """
+    if _PLAIN.fullmatch(text):  # most cells of a large report
+        return text
+    hyphens = re.sub("-(?=-)", "-\0", text)
+    safe = "".join(_SPECIAL.get(c) or _known(c) for c in hyphens)
+    return f"{{}}{safe}" if safe.startswith(("[", "*")) else safe
+
+
+def _known(char: str) -> str:
+    latin = "¡" <= char <= "ÿ" and char not in _NOT_IN_OT1
+    return char if char.isascii() or latin else f"U+{ord(char):04X}"

@@ -1,0 +1,60 @@
+"""The report as Markdown."""
+
+from __future__ import annotations
+
+import re
+
+from reports.document.layout import Cell, Page, Section, Table
+
+_MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
+_LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
+_LIST = re.compile(r"^(\d*)([-+.)])(?=\s)")
+#: what has none of all these, as most cells of a large report, stays as it is
+_ANY = re.compile(r"[&<>\\`*_\[\]|~#$@]|://|www\.|^\d*[-+.)]\s", re.IGNORECASE)
+
+
+def markdown(page: Page) -> str:
+    """Render the whole report; figures are linked, tables are pipes."""
+    parts = [f"# {escaped(page.title)}", escaped(page.dateline)]
+    for section in page.sections:
+        parts += _section(section)
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(section: Section) -> list[str]:
+    parts = [f"## {escaped(section.title)}"]
+    parts += [escaped(p) for p in section.prose]
+    if section.points:
+        parts.append("\n".join(f"- {escaped(p)}" for p in section.points))
+    for table in section.tables:
+        parts += [_table(table), f"*{escaped(table.legend)}*"]
+    for picture in section.pictures:
+        caption = escaped(picture.caption)
+        parts += [f"![{picture.name}](figures/{picture.name}.png)", f"*{caption}*"]
+    return parts
+
+
+def _table(table: Table) -> str:
+    heads = [escaped(c) for c in table.columns]
+    rule = [":--" if table.wordy(i) else "--:" for i in range(len(heads))]
+    rows = [[_cell(c) for c in row] for row in table.rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (heads, rule, *rows))
+
+
+def _cell(cell: Cell) -> str:
+    text = escaped(f"{cell.symbol} {cell.text}".strip())
+    if cell.kind == "void":
+        text = f"~~{text}~~"
+    elif text and cell.kind in {"best", "total", "over"}:
+        text = f"**{text}**"
+    return f"{text} {escaped(cell.after)}".strip()
+
+
+def escaped(text: str) -> str:
+    """Escape what Markdown or HTML would read as markup, or make a link or list of."""
+    if not _ANY.search(text):
+        return text
+    safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    safe = _MARKUP.sub(r"\\\1", safe)
+    safe = _LINK.sub(r"\\\g<0>", safe)
+    return _LIST.sub(r"\1\\\2", safe)

@@ -1,0 +1,126 @@
+"""The section on profiles: what they show, and what no profile can."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from reports.data.aggregation import Standing
+from reports.document.formatting import clean, plural
+from reports.document.layout import Cell, Picture, Section, Table, name_cell
+from reports.figures.profiles import (
+    banded,
+    pairwise_figure,
+    profile_figure,
+    rivals,
+    rows_of,
+)
+from reports.sections.means import described
+from reports.statistics.profiles import Array, performance_ratios, solved_within
+
+DRAWN = 4  #: contests that are drawn; all are tabulated
+FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table
+
+
+def profiles(standings: Sequence[Standing], solvers: Sequence[str]) -> Section | None:
+    """Draw and tabulate the profiles of every contest; None where there is none.
+
+    solvers : of the whole report, which their looks go by
+    """
+    if not standings:
+        return None
+    drawn = standings[:DRAWN]
+    pictures = [
+        picture
+        for number, standing in enumerate(drawn, 1)
+        for picture in _pictures(standing, solvers, number)
+    ]
+    rest = len(standings) - len(drawn)
+    return Section(
+        name="profiles",
+        title="Profiles",
+        prose=(
+            "Performance profiles show the share of the cases that a solver solves "
+            "within a factor of the best time of each case; data profiles, within a "
+            "time. An answer that was not verified is infinitely late: it is never "
+            "counted, whatever the factor. Bands are 95 % intervals of the share at "
+            "each place by itself, for other cases of the same kind.",
+            "A profile tells which solver is best for how many cases, and how often "
+            "each succeeds. It does not rank the others: with another set of solvers "
+            "the best time of a case is another, and their curves may change places "
+            "(Gould and Scott 2016). Only a profile of two compares two, so the "
+            "leader is set against each of the next in turn."
+            + f" The first {len(drawn)} of {len(standings)} groups are drawn."
+            * bool(rest),
+        ),
+        tables=tuple(map(_table, standings)),
+        pictures=tuple(pictures),
+    )
+
+
+def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[Picture]:
+    contest = standing.contest
+    pictures = [
+        Picture(
+            name=f"profiles-{number}",
+            caption="Performance profiles (left) and data profiles (right), "
+            f"{described(contest)}{_remarks(standing, solvers)}",
+            figure=profile_figure(standing, solvers),
+        )
+    ]
+    if len(contest.solvers) > 2:
+        leader = clean(contest.solvers[standing.leader], 40)
+        others = plural(len(rivals(standing)), "solver")
+        pictures.append(
+            Picture(
+                name=f"pairwise-{number}",
+                caption=f"Performance profiles of two solvers each: {leader}, in "
+                f"black, and the next {others} in the order of the means, "
+                f"{described(contest)}",
+                figure=pairwise_figure(standing, solvers),
+            )
+        )
+    return pictures
+
+
+def _remarks(standing: Standing, solvers: Sequence[str]) -> str:
+    """Say what is grey where solvers share out among rows, and where bands are."""
+    rows = rows_of(standing, solvers)
+    bands = "" if banded(standing) else " Bands: in the next figure, pair by pair."
+    if len(rows) < 2:
+        return bands
+    behind = len(standing.contest.solvers) - sum(map(len, rows))
+    others = "the solvers of other rows"
+    if behind:
+        others += f" and {plural(behind, 'solver')} behind"
+    return f" Rows roughly in the order of the means; grey: {others}.{bands}"
+
+
+def _table(standing: Standing) -> Table:
+    contest = standing.contest
+    ratios = performance_ratios(contest.times)
+    unsolved = int((~contest.solved.any(axis=1)).sum())
+    note = f"Nobody solved {plural(unsolved, 'case')}." * bool(unsolved)
+    return Table(
+        caption=f"Share of the cases solved within a factor of the best time, "
+        f"{described(contest)} {note}".rstrip(),
+        columns=("solver", *(_head(f) for f in FACTORS), "at all"),
+        rows=tuple(
+            (name_cell(contest.solvers[i]), *_shares(ratios[:, i]))
+            for i in standing.order
+        ),
+    )
+
+
+def _head(factor: float) -> str:
+    return "best" if factor == 1 else f"within {factor:g} ×"
+
+
+def _shares(ratios: Array) -> list[Cell]:
+    largest = np.finfo(float).max
+    found = solved_within(ratios, (*FACTORS, largest))
+    return [
+        Cell(text=f"{value:.2f} [{low:.2f}, {high:.2f}]", value=float(value))
+        for value, low, high in zip(*found, strict=True)
+    ]

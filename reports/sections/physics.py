@@ -1,0 +1,217 @@
+"""Energies set against each other, and the physical results of verified answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+from reports.data.evidence import Evidence, Outcome, energies
+from reports.document.formatting import clean, plural, power, significant, tolerance
+from reports.document.layout import Cell, Section, Table, name_cell
+from reports.sections.cells import source
+from reports.sections.quantities import (
+    MOST_DIGITS,
+    elastic,
+    head,
+    known_digits,
+    leaves,
+    quantity,
+    unit,
+)
+
+
+class Spread(NamedTuple):
+    """How far the energies of verified answers to one physical case lie apart."""
+
+    answers: tuple[Outcome, ...]  #: of every solver and form; at least one
+    relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
+    pair: tuple[Outcome, Outcome] | None  #: where it occurs
+
+    @property
+    def best(self) -> Outcome:
+        """The answer with the smallest worst residual."""
+        return _best(self.answers)
+
+    @property
+    def digits(self) -> int:
+        """As many as the energies agree on and one more; alone, as tol promises."""
+        doubt = self.answers[0].tol if self.relative is None else self.relative
+        return known_digits(doubt, MOST_DIGITS["energy"])
+
+
+def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
+    """Compare energies pairwise per physical case and tolerance.
+
+    No answer serves as the reference of the others: each is set against each, across
+    solvers and across primal and dual forms.
+    """
+    groups: dict[tuple[str, float], list[Outcome]] = {}
+    for o in energies(tuple(outcomes)):
+        groups.setdefault((o.physical, o.tol), []).append(o)
+    return [_spread(tuple(group)) for group in groups.values()]
+
+
+def _spread(answers: tuple[Outcome, ...]) -> Spread:
+    pairs = list(combinations(answers, 2))
+    if not pairs:
+        return Spread(answers, None, None)
+    differences = [_difference(a, b) for a, b in pairs]
+    worst = max(range(len(pairs)), key=differences.__getitem__)
+    return Spread(answers, differences[worst], pairs[worst])
+
+
+def _difference(a: Outcome, b: Outcome) -> float:
+    e, f = a.energy or 0.0, b.energy or 0.0
+    return abs(e - f) / max(abs(e), abs(f)) if e != f else 0.0
+
+
+def _residual(outcome: Outcome) -> float:
+    return float("inf") if outcome.worst is None else outcome.worst
+
+
+def agreement(evidence: Evidence) -> Section | None:
+    """Show how closely verified answers agree; None where no case has an energy."""
+    found = spreads(evidence.flat)
+    if not found:
+        return None
+    compared = [s for s in found if s.relative is not None]
+    prose = [
+        "Potential energy of the recovered displacement. Every verified answer is set "
+        "against every other one of the same physical case, across solvers and across "
+        "primal and dual forms; none serves as the reference.",
+    ]
+    if compared:
+        worst = max(compared, key=lambda s: s.relative or 0.0)
+        prose.append(
+            f"The largest relative difference is {power(worst.relative)}, on "
+            f"{clean(worst.answers[0].physical)} at tol "
+            f"{tolerance(worst.answers[0].tol)}."
+        )
+    return Section(
+        name="energies",
+        title="Agreement of energies",
+        prose=tuple(prose),
+        tables=(
+            Table(
+                caption="Energies of verified answers and their largest pairwise "
+                "difference. The energy is that of the answer with the smallest "
+                "worst residual, in as many digits as the answers agree on and one "
+                "more, at most 12.",
+                columns=(
+                    "physical case", "tol", "answers", "energy",
+                    "largest relative difference", "between",
+                ),
+                rows=tuple(map(_spread_row, found)),
+            ),
+        ),
+    )  # fmt: skip
+
+
+def _spread_row(s: Spread) -> tuple[Cell, ...]:
+    first = s.answers[0]
+    between = " and ".join(map(_who, s.pair)) if s.pair else "nothing to compare with"
+    return (
+        name_cell(first.physical),
+        Cell(text=tolerance(first.tol), value=first.tol),
+        Cell(text=str(len(s.answers)), value=len(s.answers), title=source(*s.answers)),
+        Cell(
+            text=significant(s.best.energy, s.digits),
+            after=unit(s.best, "energy"),
+            value=s.best.energy,
+            title=source(s.best),
+        ),
+        Cell(text=power(s.relative), value=s.relative, title=source(*(s.pair or ()))),
+        Cell(text=between, kind="words"),
+    )
+
+
+def _who(outcome: Outcome) -> str:
+    form = outcome.first.form
+    return clean(f"{outcome.solver} on {form}" if form else outcome.solver, 60)
+
+
+def physics(evidence: Evidence) -> Section | None:
+    """Show sizes and physical results, one verified answer per physical case."""
+    groups: dict[str, list[Outcome]] = {}
+    for o in evidence.flat:
+        if o.verified and o.quantities:
+            groups.setdefault(o.physical, []).append(o)
+    if not groups:
+        return None
+    chosen = [(_best(answers), answers) for answers in groups.values()]
+    tables = []
+    for family in dict.fromkeys(best.first.family for best, _ in chosen):
+        mine = [(b, answers) for b, answers in chosen if b.first.family == family]
+        tables += [
+            _quantities(mine, family, sizes=True),
+            _quantities(mine, family, sizes=False),
+        ]
+    si = " Units are SI." if any(elastic(o) for o, _ in chosen) else ""
+    si += " A number without a unit is dimensionless, or in that of its file."
+    return Section(
+        name="physics",
+        title="Physical results",
+        prose=(
+            "One answer per physical case: of all verified ones that with the smallest "
+            "worst residual; the last column says whose. Numbers have as many digits "
+            "as the verified answers at the same tolerance agree on, and one more; a "
+            f"lone answer has as many as its tolerance promises.{si}",
+        ),
+        tables=tuple(t for t in tables if t is not None),
+    )
+
+
+def _best(answers: Sequence[Outcome]) -> Outcome:
+    """Take the answer with the smallest worst residual; names break ties."""
+    return min(answers, key=lambda o: (_residual(o), o.case, o.solver))
+
+
+def _quantities(
+    chosen: Sequence[tuple[Outcome, list[Outcome]]], family: str, *, sizes: bool
+) -> Table | None:
+    outcomes = [best for best, _ in chosen]
+    paths = list(dict.fromkeys(p for o in outcomes for p in leaves(o, sizes=sizes)))
+    if not paths:
+        return None
+    rows = []
+    for best, answers in chosen:
+        own = leaves(best, sizes=sizes)
+        peers = [leaves(o, sizes=sizes) for o in answers if o.tol == best.tol]
+        which = f"{_who(best)}, {power(best.worst)} at tol {tolerance(best.tol)}"
+        answer = Cell(text=which, kind="words", title=source(best))
+        cells = [quantity(path, best, own.get(path), peers) for path in paths]
+        rows.append((name_cell(best.physical), *cells, *([] if sizes else [answer])))
+    what = "Sizes" if sizes else "Physical results"
+    return Table(
+        caption=f"{what} of {clean(family, 40)}: {plural(len(rows), 'case')}.",
+        notes=_caveats({path[0] for path in paths}),
+        columns=(
+            "physical case",
+            *(head(path, outcomes) for path in paths),
+            *([] if sizes else ["answer of"]),
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _caveats(names: set[str]) -> tuple[str, ...]:
+    """Say what the numbers of a table do not mean."""
+    found = []
+    if "active" in names:
+        found.append(
+            "active: rows with λ_i > 1e-6 max λ; a range where verified answers differ "
+            "on it, as they do where a multiplier is below the accuracy asked for."
+        )
+    if "max_von_mises" in names:
+        singular = ", being singular under the point load" if "tip" in names else ""
+        found.append(
+            "max von Mises: the largest nodal value, to three digits; it depends on "
+            f"the mesh{singular}."
+        )
+    if "tip" in names:
+        found.append(
+            "A point load makes tip displacement and energy mesh-dependent too: they "
+            "grow without bound as the mesh is refined; compare them on one mesh only."
+        )
+    return tuple(found)

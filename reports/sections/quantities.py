@@ -1,0 +1,126 @@
+"""Physical quantities as a report prints them: with units, and only known digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from reports.data.evidence import Outcome
+from reports.document.formatting import clean, significant, span
+from reports.document.layout import Cell
+from reports.sections.cells import source
+
+SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
+_UNITS = {
+    "energy": "J/m",
+    "tip": "m",
+    "contact_force": "N/m",
+    "multiplier_sum": "N/m",
+    "max_von_mises": "Pa",
+    "p_max": "Pa",
+    "half_width": "m",
+}
+_STRESS = "max_von_mises"  #: what elastic bodies have, and no other family
+MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: a stress depends on the mesh first of all
+_MOST = 7  #: digits of all others
+_COMPONENTS = "xyz"
+
+
+class Leaf(NamedTuple):
+    """One scalar of the quantities."""
+
+    value: Any
+    scale: float  #: its size, of a component that of its vector
+
+
+Leaves = dict[tuple[str, ...], Leaf]  #: by path
+
+
+def elastic(outcome: Outcome) -> bool:
+    """Whether quantities are in SI units: those of elastic bodies are."""
+    return _STRESS in outcome.quantities
+
+
+def unit(outcome: Outcome, name: str) -> str:
+    """Name the unit of a quantity; empty where it is a bare number."""
+    return _UNITS.get(name, "") if elastic(outcome) else ""
+
+
+def known_digits(doubt: float, most: int) -> int:
+    """Count the digits on which answers agree, and one more; at least 1.
+
+    doubt : relative difference of the answers
+    """
+    if doubt <= 0 or not math.isfinite(doubt):
+        return most
+    return min(max(math.floor(-math.log10(doubt)) + 1, 1), most)
+
+
+def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
+    """List every scalar by its path, vectors by component, in their order."""
+    found: dict[tuple[str, ...], Leaf] = {}
+    for name, value in outcome.quantities.items():
+        if (name in SIZES) is sizes:
+            found |= _flat((str(name),), value)
+    return found
+
+
+def _flat(path: tuple[str, ...], value: object) -> dict[tuple[str, ...], Leaf]:
+    match value:
+        case Mapping():
+            parts = [_flat((*path, str(k)), v) for k, v in value.items()]
+            return {k: leaf for part in parts for k, leaf in part.items()}
+        case list() | tuple() if len(value) > len(_COMPONENTS):
+            return {path: Leaf(f"{len(value)} values", 0.0)}
+        case list() | tuple():
+            numbers = [abs(v) for v in value if isinstance(v, int | float)]
+            scale = float(max(numbers, default=0.0))
+            named = zip(_COMPONENTS, value, strict=False)
+            return {(*path, axis): Leaf(v, scale) for axis, v in named}
+        case _:
+            number = isinstance(value, int | float)
+            return {path: Leaf(value, abs(float(value)) if number else 0.0)}  # type: ignore[arg-type]
+
+
+def head(path: tuple[str, ...], outcomes: Sequence[Outcome]) -> str:
+    """Name a column: words, and the unit where all rows have it."""
+    words = clean(" ".join(path).replace("_", " "), 40).replace("mises", "Mises")
+    units = {unit(o, path[0]) for o in outcomes}
+    (only,) = units if len(units) == 1 else ("",)
+    return f"{words} in {only}" if only else words
+
+
+def quantity(
+    path: tuple[str, ...], best: Outcome, leaf: Leaf | None, peers: Sequence[Leaves]
+) -> Cell:
+    """Print what the best answer says, in so many digits as all answers bear out.
+
+    leaf : of the best answer, if it has one there
+    peers : all leaves of each answer
+    """
+    if leaf is None or leaf.value is None or isinstance(leaf.value, bool):
+        return Cell()
+    if not isinstance(leaf.value, int | float):
+        return Cell(text=clean(str(leaf.value), 40), kind="words")
+    others = [found.get(path) for found in peers]
+    values = [
+        o.value
+        for o in others
+        if o is not None and isinstance(o.value, int | float) and o.value == o.value
+    ] or [leaf.value]
+    if isinstance(leaf.value, int):
+        text = span((int(min(values)), int(max(values))))
+    else:
+        differs = (max(values) - min(values)) / leaf.scale if leaf.scale else 0.0
+        doubt = differs if len(values) > 1 else best.tol
+        text = _rounded(leaf, known_digits(doubt, MOST_DIGITS.get(path[0], _MOST)))
+    return Cell(text=text, value=leaf.value, title=source(best))
+
+
+def _rounded(leaf: Leaf, digits: int) -> str:
+    """Print a number; of a component, no digits that its vector does not have."""
+    if not leaf.value or not math.isfinite(leaf.value):
+        return significant(leaf.value)
+    below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))
+    return significant(leaf.value, digits - below) if below < digits else "0"

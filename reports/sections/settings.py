@@ -1,0 +1,118 @@
+"""Under which conditions was measured, what the numbers mean, and what they do not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from reports.data.evidence import Evidence
+from reports.document.formatting import TIMED, clean, tolerance
+from reports.document.layout import Cell, Section, Table
+from reports.sections.summary import flatten
+
+
+def environment(evidence: Evidence) -> Section:
+    """List machine, versions and limits as recorded."""
+    leaves = flatten(evidence.environment)
+    tables = [_settings(evidence), _options(evidence)]
+    if leaves and evidence.environment:
+        tables.append(_pairs("Environment, as recorded with the measurements.", leaves))
+    return Section(
+        name="environment",
+        title="Environment and settings",
+        tables=tuple(t for t in tables if t.rows),
+    )
+
+
+def _settings(evidence: Evidence) -> Table:
+    suite = evidence.suite
+    tols = sorted({r.tol for r in evidence.records}, reverse=True)
+    limits = {
+        "tolerances asked for": ", ".join(map(tolerance, tols)),
+        "verified if every residual ≤": f"{evidence.factor:g} × tolerance",
+        "repeats, each prepared afresh": 1 + max(r.repeat for r in evidence.records),
+        "time limit in s": suite.get("time_limit"),
+        "memory limit in MiB": suite.get("memory_limit"),
+        "environment digest": ", ".join(
+            sorted({r.environment for r in evidence.records if r.environment})
+        ),
+    }
+    known = [(k, v) for k, v in limits.items() if v not in (None, "")]
+    return _pairs("Settings of the run.", known)
+
+
+def _options(evidence: Evidence) -> Table:
+    """List the options of every solver, defaults resolved."""
+    options = {r.solver: r.options for r in evidence.records}
+    leaves = [(s, flatten(options[s])) for s in evidence.solvers if options[s]]
+    return _pairs(
+        "Options of the solvers, defaults resolved.",
+        [(f"{s}.{k}", v) for s, pairs in leaves for k, v in pairs],
+    )
+
+
+def _pairs(caption: str, pairs: list[tuple[str, Any]]) -> Table:
+    return Table(
+        caption=caption,
+        columns=("key", "value"),
+        rows=tuple(
+            (Cell(text=clean(k)), Cell(text=_plain(v), kind="words")) for k, v in pairs
+        ),
+    )
+
+
+def _plain(value: Any) -> str:
+    match value:
+        case None:
+            return "unknown"
+        case bool():
+            return "yes" if value else "no"
+        case list() | tuple():
+            return clean(", ".join(map(str, value)), 400) or "none"
+        case _:
+            return clean(str(value), 400)
+
+
+def definitions(factor: float) -> Section:
+    """Define residuals, verdicts and energies, and say what the report cannot show."""
+    return Section(
+        name="definitions",
+        title="Definitions and limitations",
+        prose=(
+            "Every problem is  min ½xᵀPx + qᵀx  subject to  Ax = b,  Gx ≤ h,  "
+            "lb ≤ x ≤ ub, with multipliers such that  Px + q + Aᵀy + Gᵀz + z_box = 0, "
+            "z ≥ 0, z_box ≤ 0 at an active lower and ≥ 0 at an active upper bound. "
+            "Four residuals vanish exactly at a solution. None changes when the "
+            "objective, a row or the unit of a variable is scaled. E is the largest of "
+            "|xᵀPx|, |qᵀx| and |bᵀy + hᵀz + the bounds' term|, at most 10⁴ times the "
+            "objective and at least a hundredth of what the least variable alone can "
+            "gain; Xⱼ is the larger of |xⱼ| and the length over which the energy "
+            "changes by E; S is the largest of ‖Px‖, ‖q‖ and ‖Aᵀy + Gᵀz + z_box‖ in "
+            "the maximum norm. What rounding explains is taken off first. (Records of "
+            "schema 1 have other scales.)",
+        ),
+        points=(
+            "Primal: the worst violation of a row or bound, relative to |bᵢ| + "
+            "Σ|aᵢⱼ|Xⱼ.",
+            "Dual: ‖Px + q + Aᵀy + Gᵀz + z_box‖∞ / S, each component relative to its "
+            "own terms, unless the energy at stake is small against E; and every "
+            "multiplier of the wrong sign; one on an absent bound has the wrong sign.",
+            "Complementarity: the largest |multiplier × slack| / E.",
+            "Gap: |primal objective − dual objective| / E.",
+            f"Verified: every residual ≤ {factor:g} × tol (and ≤ 0.1), whatever was "
+            "claimed. "
+            "Where a QP is small enough to be solved once more, the difference to its "
+            "proven optimum decides instead (decided_by is then reference). "
+            "Inaccurate: success was claimed and refuted, but at least half of the "
+            f"digits are there (worst residual ≤ √({factor:g} × tol)). Wrong: refuted "
+            "beyond that.",
+            "Failures keep the name of their cause: iteration, time or memory limit, "
+            "crashed (the process died), failed (it raised or gave up), declined (it "
+            "said beforehand why it cannot).",
+            "Limitation: the same tolerance is not the same accuracy. Each solver "
+            "tests it in its own norm, and many deliver more than they were asked for.",
+            f"{TIMED} Conversion to the solver's own format counts as preparation.",
+            "Limitation: times hold for the machine and the versions listed above.",
+            "Limitation: multipliers are not unique where constraints are redundant, "
+            "so energies and displacements are compared, never multipliers.",
+        ),
+    )

@@ -1,0 +1,1 @@
+"""Statistics: intervals, bootstraps, censored times, and profiles."""

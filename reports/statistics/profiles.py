@@ -1,0 +1,93 @@
+"""Performance and data profiles: the share of cases solved within a factor, or a time.
+
+References
+----------
+.. [1] E. D. Dolan, J. J. Moré, Benchmarking optimization software with performance
+   profiles, Mathematical Programming 91 (2002) 201-213
+.. [2] J. J. Moré, S. M. Wild, Benchmarking Derivative-Free Optimization Algorithms,
+   SIAM J. Optimization 20 (2009) 172-191
+.. [3] N. Gould, J. Scott, A Note on Performance Profiles for Benchmarking Software,
+   ACM Trans. Mathematical Software 43 (2016) 15:1-15:5
+.. [4] C. J. Clopper, E. S. Pearson, The Use of Confidence or Fiducial Limits,
+   Biometrika 26 (1934) 404-413
+
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import beta
+
+from reports.statistics.intervals import COVERAGE
+
+POINTS = 200  #: of a curve; with more cases than that, the share at so many places
+
+Array = NDArray[np.float64]
+
+
+class Share(NamedTuple):
+    """Share of the cases, and its 95 % interval at each place by itself."""
+
+    value: Array
+    low: Array
+    high: Array
+
+
+class Curve(NamedTuple):
+    """A step function: `share` holds from `at` to the next."""
+
+    at: Array
+    share: Share
+
+
+def performance_ratios(times: Array) -> Array:
+    """Ratios r = t/min t to the best solver of each case [1]_; inf for a failure.
+
+    A case that nobody solved stays: its ratios are all infinite, so that no profile
+    reaches one. The profile of a solver is the share of cases with r ≤ τ.
+
+    Parameters
+    ----------
+    times : (cases, solvers) positive; inf where unsolved
+
+    """
+    best = times.min(axis=1, keepdims=True)
+    return np.where(np.isinf(times), np.inf, times / np.where(np.isinf(best), 1, best))
+
+
+def share(counts: ArrayLike, cases: int) -> Share:
+    """Interval of the share counts/cases, by the binomial law [4]_.
+
+    Resampling the cases leaves the value at each one as it is, so that the resampled
+    share at a place is binomial: no draws are needed. Unlike a percentile interval,
+    this one has a width where all cases are solved, or none, and covers at least at
+    its rate.
+    """
+    k = np.asarray(counts, dtype=float)
+    tail = (1 - COVERAGE) / 2
+    return Share(
+        value=k / cases,
+        low=np.where(k > 0, beta.ppf(tail, np.maximum(k, 1), cases - k + 1), 0.0),
+        high=np.where(k < cases, beta.isf(tail, k + 1, np.maximum(cases - k, 1)), 1.0),
+    )
+
+
+def solved_within(values: Array, places: ArrayLike) -> Share:
+    """Share of the cases with value ≤ place, at each place; inf is never within.
+
+    values : (cases,) ratios for a performance profile, seconds for a data profile [2]_
+    """
+    counts = np.searchsorted(np.sort(values), np.asarray(places), "right")
+    return share(counts, values.size)
+
+
+def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
+    """Profile between two finite places, which are its ends."""
+    inside = np.unique(values[(values > start) & (values < stop)])
+    if inside.size > points:
+        inside = np.geomspace(start, stop, points)[1:-1]
+    at = np.concatenate([[start], inside, [stop]])
+    return Curve(at, solved_within(values, at))
