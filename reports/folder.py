@@ -8,19 +8,19 @@ from pathlib import Path
 
 from harness.errors import unknown
 from harness.kkt import VERIFIED_FACTOR
-from reports.data.aggregation import standing
-from reports.data.comparison_groups import contests
+from reports.data.aggregation import ranking_of
+from reports.data.comparison_groups import comparison_groups
 from reports.data.evidence import Evidence, read_evidence
-from reports.data.size_series import Ladder, ladders
+from reports.data.size_series import SizeSeries, size_series
 from reports.document.formatting import TIMED, clean
 from reports.document.layout import Page, Picture, Section
-from reports.export.csv_tables import sheets
+from reports.export.csv_tables import csv_tables
 from reports.export.parquet import write_records
 from reports.figures.accuracy import accuracy_figure
 from reports.figures.scaling import scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
 from reports.sections.cases import cases
-from reports.sections.claim_counts import tally
+from reports.sections.claim_counts import claim_counts
 from reports.sections.convergence import convergence
 from reports.sections.deformed import deformed
 from reports.sections.growth import growth
@@ -36,9 +36,9 @@ from reports.sections.settings import definitions, environment
 from reports.sections.summary import dateline, summary
 from reports.sections.sweeps import accuracy
 from reports.sections.times import times
-from reports.sections.value_of_accuracy import worth
+from reports.sections.value_of_accuracy import value_of_accuracy
 
-MOST_LADDERS = 6  #: that are drawn; all are tabulated
+MOST_SERIES = 6  #: that are drawn; all are tabulated
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 
@@ -68,7 +68,7 @@ def write_report(
     if "csv" in formats:
         written += [
             write_text(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
-            for name, frame in sheets(evidence).items()
+            for name, frame in csv_tables(evidence).items()
         ]
     if "parquet" in formats:
         written.append(write_records(target / "records.parquet", evidence.journal))
@@ -77,21 +77,21 @@ def write_report(
 
 def compose(evidence: Evidence) -> Page:
     """Put the report together, summary first."""
-    found = ladders(evidence)
-    standings = [standing(c) for c in contests(evidence)]
+    found = size_series(evidence)
+    rankings = [ranking_of(group) for group in comparison_groups(evidence)]
     sections = (
         summary(evidence),
         cases(evidence),
-        tally(evidence),
+        claim_counts(evidence),
         claims(evidence),
         replace(times(evidence), pictures=_accuracy(evidence)),
         ratios(evidence),
         precision(evidence),
-        means(standings),
-        ranking(standings),
-        profiles(standings, evidence.solvers),
+        means(rankings),
+        ranking(rankings),
+        profiles(rankings, evidence.solvers),
         accuracy(evidence),
-        worth(evidence),
+        value_of_accuracy(evidence),
         iterations(evidence),
         convergence(evidence),
         errors(evidence),
@@ -123,24 +123,24 @@ def _accuracy(evidence: Evidence) -> tuple[Picture, ...]:
     return (Picture(name="accuracy", caption=caption, figure=figure),)
 
 
-def _grown(found: Sequence[Ladder], evidence: Evidence) -> Section | None:
-    """Tables and figures of every ladder of sizes; None where there is none."""
+def _grown(found: Sequence[SizeSeries], evidence: Evidence) -> Section | None:
+    """Tables and figures of every series of sizes; None where there is none."""
     section = scaling(found)
     if section is None:
         return None
-    drawn = sorted(found, key=lambda ladder: -ladder.answers)[:MOST_LADDERS]
+    drawn = sorted(found, key=lambda series: -series.answers)[:MOST_SERIES]
     rest = (
-        f" Of {len(found)} ladders, the {MOST_LADDERS} with most answers are drawn."
-        * (len(found) > MOST_LADDERS)
+        f" Of {len(found)} ladders, the {MOST_SERIES} with most answers are drawn."
+        * (len(found) > MOST_SERIES)
     )
     pictures = tuple(
         Picture(
             name=f"scaling-{i}",
-            caption=f"Growth of time and iterations: {ladder.title}. Bars: interval of "
+            caption=f"Growth of time and iterations: {series.title}. Bars: interval of "
             "the median. p: exponent of the time against n with its 95 % interval. "
             f"{TIMED}{rest}",
-            figure=scaling_figure(ladder, evidence.solvers),
+            figure=scaling_figure(series, evidence.solvers),
         )
-        for i, ladder in enumerate((one for one in found if one in drawn), 1)
+        for i, series in enumerate((one for one in found if one in drawn), 1)
     )
     return replace(section, pictures=pictures)

@@ -12,7 +12,7 @@ from harness.journal import Journal
 from harness.store import save_fields
 from reports import write_report
 from reports.data.evidence import Evidence, arrange
-from reports.data.size_series import ladders
+from reports.data.size_series import size_series
 from reports.document.formatting import clean, exponent, seconds, significant
 from reports.folder import compose
 from reports.render.html_page import breakable
@@ -228,10 +228,10 @@ def grown(measured, solver, power, **changes):
 def test_a_planted_exponent_is_found_from_the_records(measured, evidence):
     records = [*grown(measured, "a", 1.5), *grown(measured, "b", 1.0)]
     liar = measured("a", 900, total_seconds=1e-9, status=Verdict.WRONG)
-    (ladder,) = ladders(evidence([*records, liar]))
-    assert ladder.time_law("a").exponent == pytest.approx(1.5)
-    assert ladder.time_law("b").exponent == pytest.approx(1.0)
-    assert ladder.iteration_law("a").exponent == pytest.approx(0.0)
+    (series,) = size_series(evidence([*records, liar]))
+    assert series.time_law("a").exponent == pytest.approx(1.5)
+    assert series.time_law("b").exponent == pytest.approx(1.0)
+    assert series.iteration_law("a").exponent == pytest.approx(0.0)
     rows = table(compose(evidence(records)), "scaling")
     assert [(r["n"].text, r["m"].text) for r in rows[:2]] == [
         ("20", "14"),
@@ -254,12 +254,12 @@ def test_load_steps_are_no_sizes_and_stay_apart(measured, evidence):
         )  # fmt: skip
 
     records = [on_step(size, step) for size in (10, 20, 40) for step in (1, 5)]
-    found = ladders(evidence(records))
-    assert [ladder.title for ladder in found] == [
+    found = size_series(evidence(records))
+    assert [series.title for series in found] == [
         "beam-ring/step=1/dual, tol 1e-8",
         "beam-ring/step=5/dual, tol 1e-8",
     ]
-    assert [len(ladder.curve("a")) for ladder in found] == [3, 3]
+    assert [len(series.curve("a")) for series in found] == [3, 3]
 
 
 def test_two_sizes_make_no_scaling_table(measured, evidence):

@@ -13,7 +13,7 @@ import pytest
 from harness import InputError, Record, Verdict
 from harness.discretisation import FILE, Discretisation, Level
 from reports.data.evidence import Evidence, arrange
-from reports.data.time_at_accuracy import matched, time_at
+from reports.data.time_at_accuracy import time_at, time_at_accuracy
 from reports.folder import compose
 from reports.render.markdown import markdown
 from reports.sections.certified import certified_picture, certified_sweeps
@@ -68,7 +68,7 @@ def tables(page, name):
 
 @pytest.mark.parametrize("error", [1e-2, 3e-3, 1e-5, 1e-8])
 def test_a_power_law_is_interpolated_exactly(error):
-    found = matched(outcomes(sweep(repeats=1)), error)
+    found = time_at_accuracy(outcomes(sweep(repeats=1)), error)
 
     assert found.kind == "between"
     assert found.time.value == pytest.approx(1e-3 * error**-0.25)
@@ -78,8 +78,8 @@ def test_a_power_law_is_interpolated_exactly(error):
 def test_beyond_the_sweep_nothing_is_invented():
     points = outcomes(sweep(repeats=1))
 
-    assert matched(points, 0.9e-8) == ("not reached", None)
-    looser = matched(points, 0.5)
+    assert time_at_accuracy(points, 0.9e-8) == ("not reached", None)
+    looser = time_at_accuracy(points, 0.5)
     assert looser.kind == "looser"
     assert looser.time.value == pytest.approx(1e-3 * 1e-2**-0.25)
 
@@ -116,22 +116,22 @@ def test_two_tolerances_with_one_answer_are_one_point():
 def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
     records = [r.but(**ending) if r.tol == 1e-8 else r for r in sweep()]
 
-    assert matched(outcomes(records), 1e-7).kind == "not reached"
-    assert matched(outcomes(records), 1e-5).kind == "between"
+    assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
+    assert time_at_accuracy(outcomes(records), 1e-5).kind == "between"
 
 
 def test_one_repeat_that_failed_takes_the_point_away():
     records = sweep()
     records[-1] = records[-1].but(status=Verdict.FAILED, claimed="failed")
 
-    assert matched(outcomes(records), 1e-7).kind == "not reached"
+    assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
 
 
 def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
     """The loose end of a sweep that is judged at a strict accuracy."""
     refuted = [r.but(status=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
-    assert matched(outcomes(refuted), 1e-5).kind == "between"
+    assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
 
 
 def test_the_largest_error_of_the_repeats_is_the_error():
@@ -140,7 +140,7 @@ def test_the_largest_error_of_the_repeats_is_the_error():
         for r in sweep()
     ]
 
-    assert matched(outcomes(records), 1e-7).kind == "not reached"
+    assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
 
 
 def test_the_interval_comes_from_the_repeats_and_is_the_same_every_time():
@@ -148,7 +148,7 @@ def test_the_interval_comes_from_the_repeats_and_is_the_same_every_time():
         r.but(total_seconds=r.total_seconds * (1 + 0.5 * (r.repeat % 2)))
         for r in sweep(repeats=6)
     ]
-    found, again = (matched(outcomes(scattered), 1e-5) for _ in range(2))
+    found, again = (time_at_accuracy(outcomes(scattered), 1e-5) for _ in range(2))
     time = found.time
 
     assert found == again
@@ -171,7 +171,7 @@ def test_intervals_of_medians_hold_the_true_time_nearly_as_often_as_they_say():
             )
             for i, r in enumerate(sweep(repeats=9))
         ]
-        time = matched(outcomes(records), 1e-5).time
+        time = time_at_accuracy(outcomes(records), 1e-5).time
         held += time.low <= 1e-3 * 1e-5**-0.25 <= time.high
     assert 0.85 <= held / n <= 1
 

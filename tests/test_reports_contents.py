@@ -8,7 +8,7 @@ from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
 from reports.data.evidence import Evidence, arrange
-from reports.data.size_series import ladders
+from reports.data.size_series import size_series
 from reports.document.formatting import TIMED, exponent, power, seconds, significant
 from reports.document.layout import Cell, Table
 from reports.figures.scaling import scaling_figure
@@ -362,8 +362,8 @@ def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
         names = [f"solver-{i}" for i in range(count)]
         records = [r for name in names for r in grown(measured, solver=name)]
         evidence = Evidence(directory=tmp_path, records=arrange(records))
-        (ladder,) = ladders(evidence)
-        figure = scaling_figure(ladder, evidence.solvers)
+        (series,) = size_series(evidence)
+        figure = scaling_figure(series, evidence.solvers)
         figure.draw_without_rendering()
         return figure.axes[0].get_position().height * figure.get_figheight()
 

@@ -8,10 +8,10 @@ import pytest
 from harness import Record, Verdict
 from harness.journal import Journal
 from reports import write_report
-from reports.data.aggregation import standing
-from reports.data.comparison_groups import contests
+from reports.data.aggregation import ranking_of
+from reports.data.comparison_groups import comparison_groups
 from reports.data.evidence import Evidence, arrange
-from reports.export.csv_tables import contest_sheets, sheets
+from reports.export.csv_tables import comparison_tables, csv_tables
 from reports.figures.profiles import ROW, pairwise_figure, profile_figure, rows_of
 from reports.figures.style import look
 from reports.folder import compose
@@ -84,7 +84,7 @@ def test_forms_tolerances_and_modes_are_compared_apart(record, evidence):
     ]
     records += [record(f"{s} (sequence)", 9 + case, mode="sequence")
                 for s in "ab" for case in range(6)]  # fmt: skip
-    titles = {c.title for c in contests(evidence(records))}
+    titles = {c.title for c in comparison_groups(evidence(records))}
     assert titles == {
         "primal, tol 1e-3", "primal, tol 1e-6", "dual, tol 1e-3", "dual, tol 1e-6",
         "dual, sequence, tol 1e-6",
@@ -104,7 +104,7 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
         for case in range(6)
         for repeat in range(3)
     ]  # fmt: skip
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert found.times[:, 0] == pytest.approx(0.2)
     assert np.isinf(found.times[:, 1]).tolist() == [False] * 3 + [True] + [False] * 2
     assert np.isinf(found.claimed[:, 1]).tolist() == [False] * 5 + [True]
@@ -112,7 +112,7 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
 
 def test_null_arms_do_not_take_part(record, evidence):
     null = [record("a (A/A)", case, 1e-4, arm="null") for case in range(6)]
-    (found,) = contests(evidence([*crowd(record, 2), *null]))
+    (found,) = comparison_groups(evidence([*crowd(record, 2), *null]))
     assert found.solvers == ("s00", "s01")
 
 
@@ -126,7 +126,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     records += [declined("never", case) for case in range(6)]
     records += [declined("some", case) for case in range(2)]
     records += [record("some", case) for case in range(2, 6)]
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert found.solvers == ("s00", "s01", "some")
     assert np.isinf(found.times[:2, 2]).all()
     assert found.notes == ("Declined all of them: never.",)
@@ -135,7 +135,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
 def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
     records = crowd(record, 2, cases=8) + [record("late", case) for case in range(6)]
     records += [record("rare", case) for case in range(2)]
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert len(found.cases) == 6
     assert found.solvers == ("late", "s00", "s01")
     assert found.notes == (
@@ -156,7 +156,7 @@ def test_of_a_sweep_the_cheapest_verified_answer_counts(record, evidence):
             (1e-7, 0.03, Verdict.VERIFIED),
         )
     ]  # fmt: skip
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert found.title == "dual, accuracy 1e-6"
     assert found.times == pytest.approx(np.full((6, 2), 0.02) * [1, 2])
 
@@ -170,7 +170,7 @@ def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
     }
     records = crowd(record, 1)
     records += [record("b", case, **ends.get(case, {})) for case in range(6)]
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     np.testing.assert_array_equal(
         found.stopped[:, 0], [LIMIT, 7.0, np.nan, np.nan, np.nan, np.nan]
     )
@@ -184,7 +184,7 @@ def test_a_cell_that_was_late_once_is_late(record, evidence):
     records = crowd(record, 2)
     records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
     records += [record("z", 2, repeat=2, **late)]
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert np.isinf(found.times[2, 2])
     assert not np.isnan(found.stopped[2, 2])
 
@@ -280,7 +280,7 @@ def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
         for case in range(6)
     ]
     found = evidence(records)
-    (one,) = map(standing, contests(found))
+    (one,) = map(ranking_of, comparison_groups(found))
     groups = rows_of(one, found.solvers)
     shown = [i for row in groups for i in row]
     assert sorted(shown) == sorted(int(i) for i in one.order[:16])
@@ -294,12 +294,12 @@ def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
         for legend in part.legends
         for text in legend.get_texts()
     ]
-    assert sorted(named) == sorted(one.contest.solvers[i] for i in shown)
+    assert sorted(named) == sorted(one.group.solvers[i] for i in shown)
 
 
 def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
     found = evidence(crowd(record, 5))
-    (one,) = map(standing, contests(found))
+    (one,) = map(ranking_of, comparison_groups(found))
     figure = pairwise_figure(one, found.solvers)
     drawn = [axes for axes in figure.axes if axes.axison]
     assert len(drawn) == 4
@@ -317,7 +317,7 @@ def test_bands_are_drawn_where_they_do_not_hide_each_other(
     record, evidence, solvers, cases, bands
 ):
     found = evidence(crowd(record, solvers, cases=cases))
-    (one,) = map(standing, contests(found))
+    (one,) = map(ranking_of, comparison_groups(found))
     for axes in profile_figure(one, found.solvers).subfigs[0].axes:
         assert len(axes.collections) == bands
     if solvers > 2:
@@ -445,10 +445,10 @@ def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
 
 def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
     records = [record(s, case) for s in ("a\ud800", "b") for case in range(6)]
-    (found,) = contests(evidence(records))
+    (found,) = comparison_groups(evidence(records))
     assert set(found.solvers) == {"a\ud800", "b"}
-    assert standing(found).draws.shape[1] == 2
-    assert set(contest_sheets(evidence(records))["contests"]["solver"]) == {
+    assert ranking_of(found).draws.shape[1] == 2
+    assert set(comparison_tables(evidence(records))["contests"]["solver"]) == {
         r"a\ud800", "b",
     }  # fmt: skip
 
@@ -456,7 +456,7 @@ def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
 def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
     records = crowd(record, 2)
     records[0] = records[0].but(status=Verdict.WRONG)
-    sheet = sheets(evidence(records))["contests"]
+    sheet = csv_tables(evidence(records))["contests"]
     by_cell = sheet.set_index(["case", "solver"])
     assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}
     wrong = by_cell.loc["box/n=0/dual", "s00"]
@@ -466,7 +466,7 @@ def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, eviden
 
 
 def test_the_sheet_of_means_holds_every_convention(record, evidence):
-    sheet = sheets(evidence(crowd(record, 3)))["means"]
+    sheet = csv_tables(evidence(crowd(record, 3)))["means"]
     assert len(sheet) == 3 * 19  # 18 combinations and the common cases
     usual = sheet[(sheet["shift"] == 1) & (sheet["penalty"] == 3)
                   & (sheet["gate"] == "verified") & ~sheet["common"]]  # fmt: skip

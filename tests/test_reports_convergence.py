@@ -1,6 +1,6 @@
 """Figures of histories: what is drawn is what was told, of the cases that were chosen.
 
-The first course below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
+The first run below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
 (0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
 """
 
@@ -237,7 +237,7 @@ def test_of_each_form_the_largest_case_at_its_last_step_and_finest_tol_is_drawn(
         ("a", KNOWN, case("primal", 5, 5, 1e-8)),
     )
     drawn = [
-        (c.courses[0].outcome.case, c.courses[0].outcome.tol)
+        (c.runs[0].outcome.case, c.runs[0].outcome.tol)
         for c in chosen(read_evidence(out))
     ]
     assert drawn == [
@@ -267,9 +267,9 @@ def test_the_first_repeat_that_kept_a_history_speaks_for_all(folder):
         ("a", KNOWN, {"repeat": 1, "run_id": "r1"}),
         ("a", later, {"repeat": 2, "run_id": "r2"}),
     )
-    (course,) = comparison(out).courses
+    (run,) = comparison(out).runs
 
-    assert course.record.run_id == "r1"
+    assert run.record.run_id == "r1"
     assert "r1." in section(out).pictures[0].caption
 
 
@@ -287,7 +287,7 @@ def test_a_history_that_is_gone_is_said_and_costs_nothing_else(folder):
     first.unlink()
     found = section(out)
 
-    assert [len(c.courses) for c in chosen(read_evidence(out))] == [1]
+    assert [len(c.runs) for c in chosen(read_evidence(out))] == [1]
     assert f"vectors/{first.name}" in found.prose[1]
     assert len(found.pictures) == 2
 

@@ -10,9 +10,9 @@ from reports.data.aggregation import (
     Convention,
     common_cases,
     geometric_means,
-    standing,
+    ranking_of,
 )
-from reports.data.comparison_groups import Contest
+from reports.data.comparison_groups import ComparisonGroup
 from reports.sections.growth import growth_of
 from reports.sections.ranking import panel, ranks
 from reports.statistics.censoring import restricted_mean
@@ -22,10 +22,10 @@ from reports.statistics.resampling import firsts, limits, told_apart, weights
 INF = np.inf
 
 
-def contest(times, *, claimed=None, limit=60.0, solvers=None):
+def group(times, *, claimed=None, limit=60.0, solvers=None):
     times = np.asarray(times, dtype=float)
     cases, count = times.shape
-    return Contest(
+    return ComparisonGroup(
         title="dual, tol 1e-6",
         cases=tuple(f"case {i}" for i in range(cases)),
         solvers=tuple(solvers or (f"s{i}" for i in range(count))),
@@ -44,18 +44,18 @@ def lognormal(rng, shape, scatter=1.0):
 
 
 def test_the_shifted_geometric_mean_by_hand():
-    found = contest([[1, 1], [3, 1], [7, 1]])
+    found = group([[1, 1], [3, 1], [7, 1]])
     assert found.shift == 1.0  # the median of the best times
     assert geometric_means(found, USUAL) == pytest.approx([3, 1])  # ∛(2·4·8) − 1
 
 
 def test_a_convention_changes_the_shift_by_a_factor():
-    found = geometric_means(contest([[1, 1], [3, 1], [7, 1]]), Convention(shift=10.0))
+    found = geometric_means(group([[1, 1], [3, 1], [7, 1]]), Convention(shift=10.0))
     assert found == pytest.approx([(11 * 13 * 17) ** (1 / 3) - 10, 1])
 
 
 def test_a_failure_is_charged_so_many_limits():
-    found = contest([[1, 1], [1, 1], [INF, 1]], limit=5)
+    found = group([[1, 1], [1, 1], [INF, 1]], limit=5)
     assert geometric_means(found, Convention(penalty=3.0))[0] == pytest.approx(3)
     one = geometric_means(found, Convention(penalty=1.0))[0]
     assert one == pytest.approx((2 * 2 * 6) ** (1 / 3) - 1)
@@ -64,13 +64,13 @@ def test_a_failure_is_charged_so_many_limits():
 def test_the_shift_follows_the_time_scale_up_to_ten_seconds():
     rng = np.random.default_rng(11)
     times = lognormal(rng, (9, 3))
-    assert contest(1e-3 * times).shift == pytest.approx(1e-3 * contest(times).shift)
-    assert contest(1e6 * times).shift == 10.0
+    assert group(1e-3 * times).shift == pytest.approx(1e-3 * group(times).shift)
+    assert group(1e6 * times).shift == 10.0
 
 
 def test_milliseconds_are_not_averaged_arithmetically():
     times = lognormal(np.random.default_rng(12), (500, 2), scatter=2.0)
-    mean = geometric_means(contest(times), USUAL)
+    mean = geometric_means(group(times), USUAL)
     arithmetic, geometric = times.mean(axis=0), np.exp(np.log(times).mean(axis=0))
     assert (mean < 0.4 * arithmetic).all()
     assert (mean > geometric).all()
@@ -80,10 +80,10 @@ def test_common_cases_leave_out_solvers_that_solve_little():
     times = np.ones((8, 3))
     times[0, 1] = times[1, 0] = INF
     times[2:, 2] = INF  # solves two of eight
-    rows, columns = common_cases(contest(times))
+    rows, columns = common_cases(group(times))
     assert list(columns) == [True, True, False]
     assert list(np.flatnonzero(~rows)) == [0, 1]
-    found = geometric_means(contest(times), Convention(common=True))
+    found = geometric_means(group(times), Convention(common=True))
     assert found[:2] == pytest.approx([1, 1])
     assert np.isnan(found[2])
 
@@ -93,22 +93,22 @@ def test_ranks_do_not_depend_on_the_unit_of_time(factor):
     rng = np.random.default_rng(13)
     times = lognormal(rng, (15, 6))
     times[rng.random(times.shape) < 0.15] = INF
-    one, other = contest(times), contest(factor * times, limit=60 * factor)
+    one, other = group(times), group(factor * times, limit=60 * factor)
     assert other.shift < 10
     a, b = panel(one), panel(other)
     assert (a.usual == b.usual).all()
     for name, changed in a.single.items():
         np.testing.assert_array_equal(changed.ranks, b.single[name].ranks)
-    np.testing.assert_allclose(standing(one).ratios, standing(other).ratios)
-    assert (standing(one).tiers == standing(other).tiers).all()
+    np.testing.assert_allclose(ranking_of(one).ratios, ranking_of(other).ratios)
+    assert (ranking_of(one).tiers == ranking_of(other).tiers).all()
 
 
 def test_the_order_of_the_solvers_does_not_matter():
     times = lognormal(np.random.default_rng(14), (12, 5))
-    turned = contest(times[:, ::-1])
-    assert (panel(contest(times)).usual[::-1] == panel(turned).usual).all()
+    turned = group(times[:, ::-1])
+    assert (panel(group(times)).usual[::-1] == panel(turned).usual).all()
     assert (
-        standing(contest(times)).faster[::-1, ::-1] == standing(turned).faster
+        ranking_of(group(times)).faster[::-1, ::-1] == ranking_of(turned).faster
     ).all()
 
 
@@ -130,7 +130,7 @@ def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate():
     for _ in range(300):
         times = rng.lognormal(0, 1, (25, 1)) * rng.lognormal(0, 0.5, (25, 2))
         anchor = np.full((25, 1), 1e-9)  # makes the shift small, and leads
-        found = standing(contest(np.hstack([anchor, times * [1, 1.5]])))
+        found = ranking_of(group(np.hstack([anchor, times * [1, 1.5]])))
         draws = found.draws[:, 2] / found.draws[:, 1]
         low, high = limits(draws, 25)
         hits.append(low <= 1.5 <= high)
@@ -138,7 +138,7 @@ def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate():
 
 
 def test_a_constant_ratio_has_no_uncertainty():
-    found = standing(contest(np.full((6, 2), 2.0) * [1, 3]))
+    found = ranking_of(group(np.full((6, 2), 2.0) * [1, 3]))
     assert [float(part[1]) for part in found.ratios] == pytest.approx([3, 3, 3])
     assert found.faster.tolist() == [[False, True], [False, False]]
     assert found.tiers.tolist() == [1, 2]
@@ -198,18 +198,18 @@ def test_who_fails_twice_is_not_told_to_be_slower_if_faster_otherwise():
 
 def test_equal_solvers_share_one_tier_and_every_rank():
     times = lognormal(np.random.default_rng(18), (30, 1)) * np.ones((1, 4))
-    found = standing(contest(times))
+    found = ranking_of(group(times))
     assert found.tiers.tolist() == [1, 1, 1, 1]
     assert found.spans == [(1, 4)] * 4
     assert found.first == pytest.approx([0.25] * 4)
-    assert panel(found.contest).usual.tolist() == [1, 1, 1, 1]
-    assert not panel(found.contest).turned.any()
+    assert panel(found.group).usual.tolist() == [1, 1, 1, 1]
+    assert not panel(found.group).turned.any()
 
 
 def test_a_faster_pair_makes_a_tier_of_its_own():
     rng = np.random.default_rng(19)
     times = rng.lognormal(0, 2, (40, 1)) * rng.lognormal(0, 0.1, (40, 4))
-    found = standing(contest(times * [1, 1, 3, 3]))
+    found = ranking_of(group(times * [1, 1, 3, 3]))
     assert found.tiers.tolist() == [1, 1, 2, 2]
     assert found.spans == [(1, 2), (1, 2), (3, 4), (3, 4)]
     assert found.first[2:].tolist() == [0, 0]
@@ -222,8 +222,8 @@ def test_shares_of_firsts_add_up_and_ties_share_one():
 
 def test_solvers_that_solve_nothing_tie_at_the_end():
     times = np.ones((6, 4)) * [1, 2, INF, INF]
-    assert panel(contest(times)).usual.tolist() == [1, 2, 3, 3]
-    assert standing(contest(times)).tiers[2] == standing(contest(times)).tiers[3]
+    assert panel(group(times)).usual.tolist() == [1, 2, 3, 3]
+    assert ranking_of(group(times)).tiers[2] == ranking_of(group(times)).tiers[3]
 
 
 # ---- conventions
@@ -238,7 +238,7 @@ def test_a_liar_ranks_first_only_if_it_is_believed():
     honest = np.full(8, 1.0)
     times = np.column_stack([honest, np.full(8, INF)])
     claimed = np.column_stack([honest, np.full(8, 0.01)])
-    found = panel(contest(times, claimed=claimed))
+    found = panel(group(times, claimed=claimed))
     assert found.usual.tolist() == [1, 2]
     assert found.single["claimed"].ranks.tolist() == [2, 1]
     assert found.single["claimed"].turned.any()
@@ -250,7 +250,7 @@ def test_a_penalty_that_turns_two_solvers_is_found():
     fast = np.full(5, 1.0)
     fast[0] = INF
     steady = np.full(5, 4.0)
-    found = panel(contest(np.column_stack([fast, steady]), limit=60))
+    found = panel(group(np.column_stack([fast, steady]), limit=60))
     assert found.single["1 limit"].ranks.tolist() == [1, 2]
     assert found.single["10 limits"].ranks.tolist() == [2, 1]
     assert found.turned[0, 1]

@@ -26,7 +26,7 @@ from harness.run import run
 from harness.store import load_fields, load_solution
 from harness.suite import Suite
 from reports.data.evidence import read_evidence
-from reports.data.size_series import ladders
+from reports.data.size_series import size_series
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
 SIZES = (10, 20, 40, 80)
@@ -281,8 +281,8 @@ def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
 ):
     sizes = [CaseName(family="sized", params={"n": n}, form="plain") for n in SIZES]
     measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
-    (ladder,) = ladders(read_evidence(tmp_path))
-    law = ladder.time_law("sleepsbypower")
+    (series,) = size_series(read_evidence(tmp_path))
+    law = series.time_law("sleepsbypower")
 
     assert law.points == len(SIZES)
     assert law.low <= 1.5 <= law.high

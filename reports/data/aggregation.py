@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from reports.data.comparison_groups import CASES, Contest
+from reports.data.comparison_groups import CASES, ComparisonGroup
 from reports.statistics import resampling
 
 Array = NDArray[np.float64]
@@ -23,7 +23,7 @@ GATES = ("verified", "claimed")
 class Convention:
     """What has to be agreed before times over cases become one number."""
 
-    shift: float = 1.0  #: times that of the contest
+    shift: float = 1.0  #: times that of the group
     penalty: float = 3.0  #: an unsolved case is charged this many limits
     gate: str = "verified"  #: or "claimed": the solver's word is taken
     common: bool = False  #: only cases that all solved, see `common_cases`
@@ -48,23 +48,23 @@ EVERY = tuple(
 )
 
 
-def geometric_means(contest: Contest, convention: Convention) -> Array:
+def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
     """Shifted geometric means exp(mean log(t + s)) − s over the cases, by solver; s.
 
     An unsolved case counts as `penalty` times the limit. In `common` mode there is none
     to charge, and solvers outside of the comparison have NaN.
     """
-    logs, shift = _logs(contest, convention)
+    logs, shift = _logs(group, convention)
     if not convention.common:
         return np.asarray(np.exp(logs.mean(axis=0)) - shift)
-    rows, columns = common_cases(contest)
-    means = np.full(len(contest.solvers), np.nan)
+    rows, columns = common_cases(group)
+    means = np.full(len(group.solvers), np.nan)
     if rows.sum() >= CASES:
         means[columns] = np.exp(logs[rows][:, columns].mean(axis=0)) - shift
     return means
 
 
-def common_cases(contest: Contest) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Find the cases solved by every solver that solved at least half of them.
 
     One solver that solves next to nothing would leave no case to compare the others on.
@@ -74,30 +74,30 @@ def common_cases(contest: Contest) -> tuple[NDArray[np.bool_], NDArray[np.bool_]
     cases, solvers : which of them
 
     """
-    solvers = contest.solved.mean(axis=0) >= 0.5
-    cases = np.logical_and.reduce(contest.solved[:, solvers], axis=1)
+    solvers = group.solved.mean(axis=0) >= 0.5
+    cases = np.logical_and.reduce(group.solved[:, solvers], axis=1)
     return np.asarray(cases), np.asarray(solvers)
 
 
-def _logs(contest: Contest, convention: Convention) -> tuple[Array, float]:
+def _logs(group: ComparisonGroup, convention: Convention) -> tuple[Array, float]:
     """Logarithms of t + s, (cases, solvers), and s in seconds."""
-    times = contest.times if convention.gate == "verified" else contest.claimed
-    shift = convention.shift * contest.shift
-    charged = np.where(np.isinf(times), convention.penalty * contest.horizon, times)
+    times = group.times if convention.gate == "verified" else group.claimed
+    shift = convention.shift * group.shift
+    charged = np.where(np.isinf(times), convention.penalty * group.horizon, times)
     return np.log(charged + shift), shift
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Standing:
-    """What one contest says under the usual convention, and how surely."""
+class Ranking:
+    """What one group of cases says under the usual convention, and how surely."""
 
-    contest: Contest
+    group: ComparisonGroup
     draws: Array  #: (draws, solvers) means over resampled cases, s
 
     @cached_property
     def means(self) -> Array:
         """(solvers,) shifted geometric means, s."""
-        return geometric_means(self.contest, USUAL)
+        return geometric_means(self.group, USUAL)
 
     @cached_property
     def order(self) -> NDArray[np.int64]:
@@ -112,13 +112,13 @@ class Standing:
     @cached_property
     def intervals(self) -> tuple[Array, Array]:
         """95 % intervals of the means, s."""
-        return resampling.limits(self.draws, len(self.contest.cases))
+        return resampling.limits(self.draws, len(self.group.cases))
 
     @cached_property
     def ratios(self) -> tuple[Array, Array, Array]:
         """Mean over that of the leader, on the same cases, and its 95 % interval."""
         draws = self.draws / self.draws[:, [self.leader]]
-        low, high = resampling.limits(draws, len(self.contest.cases))
+        low, high = resampling.limits(draws, len(self.group.cases))
         return self.means / self.means[self.leader], low, high
 
     @cached_property
@@ -129,8 +129,8 @@ class Standing:
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
         """(solvers, solvers) whether row is told to be faster than column."""
-        logs, _ = _logs(self.contest, USUAL)
-        return resampling.told_apart(logs, self.contest.cases)
+        logs, _ = _logs(self.group, USUAL)
+        return resampling.told_apart(logs, self.group.cases)
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
@@ -145,7 +145,7 @@ class Standing:
 
         """
         behind, ahead = self.faster.sum(axis=0), self.faster.sum(axis=1)
-        last = len(self.contest.solvers)
+        last = len(self.group.solvers)
         return [(1 + int(b), last - int(a)) for b, a in zip(behind, ahead, strict=True)]
 
     @cached_property
@@ -156,7 +156,7 @@ class Standing:
         that is known badly, as it is with failures, may be in an earlier tier than a
         smaller one.
         """
-        tiers = np.zeros(len(self.contest.solvers), dtype=np.int64)
+        tiers = np.zeros(len(self.group.solvers), dtype=np.int64)
         heads: list[int] = []
         for solver in self.order:
             fits = [n for n, head in enumerate(heads) if not self.faster[head, solver]]
@@ -166,8 +166,8 @@ class Standing:
         return tiers
 
 
-def standing(contest: Contest) -> Standing:
-    """Resample the cases of a contest."""
-    logs, shift = _logs(contest, USUAL)
-    draws = np.exp(resampling.weights(contest.cases) @ logs) - shift
-    return Standing(contest=contest, draws=draws)
+def ranking_of(group: ComparisonGroup) -> Ranking:
+    """Rank the solvers of a group, resampling its cases."""
+    logs, shift = _logs(group, USUAL)
+    draws = np.exp(resampling.weights(group.cases) @ logs) - shift
+    return Ranking(group=group, draws=draws)

@@ -26,7 +26,7 @@ Name = TypeVar("Name")
 
 
 class _Kind(NamedTuple):
-    """What the cases of one contest share."""
+    """What the cases of one group share."""
 
     sweep: bool
     mode: str
@@ -35,7 +35,7 @@ class _Kind(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Contest:
+class ComparisonGroup:
     """Cases of one form at one accuracy, and the solvers that were measured on each.
 
     Null arms take no part. Times are medians of prepare + solve over the repeats; in a
@@ -69,12 +69,12 @@ class Contest:
         return float(max(self.limit, both[np.isfinite(both)].max()))
 
 
-def contests(evidence: Evidence) -> tuple[Contest, ...]:
+def comparison_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
     """Group what was measured by form and accuracy; groups of few cases are left out.
 
     Forms are apart, since the primal and the dual QP of one problem are two problems to
     a solver; so are cold solves and sequences. At least `CASES` cases, two solvers and
-    one verified answer make a contest.
+    one verified answer make a group.
     """
     records = [r for r in evidence.records if not r.arm]
     if not records:
@@ -91,10 +91,10 @@ def contests(evidence: Evidence) -> tuple[Contest, ...]:
     limit = _limit(evidence, outcomes)
     groups = zip(kinds, outcomes.groupby("kind"), strict=True)
     found = [
-        _contest(_title(kind), group, [*cases], evidence.solvers, limit)
+        _group(_title(kind), group, [*cases], evidence.solvers, limit)
         for kind, (_, group) in groups
     ]
-    return tuple(contest for contest in found if contest is not None)
+    return tuple(group for group in found if group is not None)
 
 
 def _kind(r: Record) -> _Kind:
@@ -108,7 +108,7 @@ def _numbered(names: Iterable[Name]) -> dict[Name, int]:
 
 
 def _row(r: Record) -> dict[str, float]:
-    """Take of a record what a contest asks for."""
+    """Take of a record what a group asks for."""
     return {
         "tol": r.tol,
         "seconds": np.nan if r.total_seconds is None else r.total_seconds,
@@ -163,13 +163,13 @@ def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
     return longest if longest > 0 else 1.0
 
 
-def _contest(
+def _group(
     title: str,
     group: pd.DataFrame,
     cases: Sequence[str],
     solvers: Sequence[str],
     limit: float,
-) -> Contest | None:
+) -> ComparisonGroup | None:
     """Keep the solvers with at least half of the cases, and cases that they all had."""
     wide = group.pivot(index="case", columns="solver")
     present = np.array([cases[i] for i in wide.index], dtype=object)
@@ -188,7 +188,7 @@ def _contest(
     if complete.sum() < CASES or taken.sum() < 2 or not np.isfinite(times[part]).any():
         return None
     stopped = matrix("stopped")[part]
-    return Contest(
+    return ComparisonGroup(
         title=title,
         cases=tuple(present[complete]),
         solvers=tuple(met[taken]),

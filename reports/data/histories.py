@@ -26,7 +26,7 @@ RULE = (
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Course:
+class SolverRun:
     """How one solver went through one case, by its own account; rows from its start."""
 
     outcome: Outcome
@@ -92,38 +92,38 @@ class Course:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Comparison:
-    """The courses through one case at one tolerance, drawn over one axis of work."""
+class CaseHistories:
+    """The runs through one case at one tolerance, drawn over one axis of work."""
 
-    courses: tuple[Course, ...]  #: at least one, in the order of the suite
+    runs: tuple[SolverRun, ...]  #: at least one, in the order of the suite
     solvers: tuple[str, ...]  #: all of the report: each looks the same in all figures
 
     @property
     def counted(self) -> bool:
-        """Whether all courses can be drawn over products; over iterations if not."""
-        return all(c.products is not None for c in self.courses)
+        """Whether all runs can be drawn over products; over iterations if not."""
+        return all(c.products is not None for c in self.runs)
 
-    def work(self, course: Course) -> Vector:
+    def work(self, run: SolverRun) -> Vector:
         """(rows,) products or iterations."""
-        products = course.products if self.counted else None
-        return course.iterations if products is None else products
+        products = run.products if self.counted else None
+        return run.iterations if products is None else products
 
     def taken(self, kind: str) -> bool:
-        """Whether any course has a step of that kind."""
-        return any(c.steps(kind).any() for c in self.courses)
+        """Whether any run has a step of that kind."""
+        return any(c.steps(kind).any() for c in self.runs)
 
 
-def chosen(evidence: Evidence) -> list[Comparison]:
+def chosen(evidence: Evidence) -> list[CaseHistories]:
     """Choose the cases to draw by `RULE`."""
     ordered = sorted(evidence.outcomes.values(), key=_importance, reverse=True)
-    found: dict[tuple[str, str], Comparison] = {}
+    found: dict[tuple[str, str], CaseHistories] = {}
     for row in ordered:
         one = next(iter(row.values())).first
         key = (one.family, one.form)
         if len(found) == MOST:
             break
-        if key not in found and (told := tuple(_courses(evidence, row))):
-            found[key] = Comparison(courses=told, solvers=evidence.solvers)
+        if key not in found and (told := tuple(_runs(evidence, row))):
+            found[key] = CaseHistories(runs=told, solvers=evidence.solvers)
     return list(found.values())
 
 
@@ -140,12 +140,12 @@ def unread(evidence: Evidence) -> list[str]:
     return lost
 
 
-def _courses(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[Course]:
+def _runs(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[SolverRun]:
     for outcome in row.values():
         for record in outcome.records:
             history = _history(evidence, record)
             if history and next(iter(history.values())).size:
-                yield Course(outcome=outcome, record=record, history=history)
+                yield SolverRun(outcome=outcome, record=record, history=history)
                 break
 
 

@@ -14,21 +14,21 @@ SIZES = 3  #: fewer different sizes make no table
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Ladder:
+class SizeSeries:
     """Cases that differ in size only, and the verified answers on each."""
 
     title: str  #: family, the parameters held, form, tolerance
     solvers: tuple[str, ...]
-    rungs: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+    sizes: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
 
     @property
     def answers(self) -> int:
         """How many verified answers it rests on."""
-        return sum(len(row) for _, _, row in self.rungs)
+        return sum(len(row) for _, _, row in self.sizes)
 
     def curve(self, solver: str) -> list[tuple[int, Outcome]]:
         """Sizes n and verified answers of one solver, smallest first."""
-        return [(n, row[solver]) for n, _, row in self.rungs if solver in row]
+        return [(n, row[solver]) for n, _, row in self.sizes if solver in row]
 
     def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
         """Fit median total time ~ nᵖ or mᵖ; None with fewer than three sizes."""
@@ -44,7 +44,7 @@ class Ladder:
         """Sizes n or m and the answers of one solver; those without are left out."""
         return [
             (size, row[solver])
-            for n, m, row in self.rungs
+            for n, m, row in self.sizes
             if solver in row and (size := n if against == "n" else m) is not None
         ]
 
@@ -56,11 +56,11 @@ def _law(points: list[tuple[int, float]]) -> PowerLaw | None:
     return power_law(*zip(*kept, strict=True))
 
 
-def ladders(evidence: Evidence) -> list[Ladder]:
-    """Find the cases that form a ladder of at least three sizes.
+def size_series(evidence: Evidence) -> list[SizeSeries]:
+    """Find the cases that form a series of at least three sizes.
 
     n is the number of dofs, m the rows of equalities and contact. A key of the case
-    name is held fixed within a ladder if cases of equal n differ in it (the load step,
+    name is held fixed within a series if cases of equal n differ in it (the load step,
     say); the others are what makes a case larger.
     """
     sized = [(o, n) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
@@ -71,9 +71,9 @@ def ladders(evidence: Evidence) -> list[Ladder]:
         key = (o.first.family, kept, o.first.form, o.tol)
         groups.setdefault(key, {}).setdefault(n, {})[o.solver] = o
     return [
-        _ladder(key, rungs, evidence.solvers)
-        for key, rungs in groups.items()
-        if len(rungs) >= SIZES
+        _series(key, sizes, evidence.solvers)
+        for key, sizes in groups.items()
+        if len(sizes) >= SIZES
     ]
 
 
@@ -90,20 +90,20 @@ def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
     return {family: tuple(keys) for family, keys in held.items()}
 
 
-def _ladder(
+def _series(
     key: tuple[Any, ...],
-    rungs: dict[int, dict[str, Outcome]],
+    sizes: dict[int, dict[str, Outcome]],
     solvers: tuple[str, ...],
-) -> Ladder:
+) -> SizeSeries:
     family, kept, form, tol = key
     names = [family, *(f"{k}={v}" for k, v in kept), *([form] if form else [])]
-    present = {s for row in rungs.values() for s in row}
+    present = {s for row in sizes.values() for s in row}
     rows = []
-    for n, row in sorted(rungs.items()):
+    for n, row in sorted(sizes.items()):
         m = next(iter(row.values())).size("equality_rows", "contact_rows")
         rows.append((n, m, row))
-    return Ladder(
+    return SizeSeries(
         title=f"{clean('/'.join(names))}, tol {tolerance(tol)}",
         solvers=tuple(s for s in solvers if s in present),
-        rungs=tuple(rows),
+        sizes=tuple(rows),
     )

@@ -38,8 +38,8 @@ SMALLEST = 1e-17  #: errors below, zero among them, count as this
 Floats = NDArray[np.float64]
 
 
-class Matched(NamedTuple):
-    """The time at one error; see `matched`."""
+class TimeAtAccuracy(NamedTuple):
+    """The time at one error; see `time_at_accuracy`."""
 
     kind: str  #: "between", "looser" (the loosest is better already), "not reached"
     time: Interval | None  #: s; of "looser", that of the loosest: it takes at most that
@@ -56,7 +56,7 @@ def counts(outcome: Outcome) -> bool:
     )
 
 
-def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
+def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccuracy:
     """Interpolate the time of answers that are proven to be within `error`.
 
     The interval is a bootstrap over the repeats of each tolerance, seeded by the names
@@ -66,13 +66,13 @@ def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
     """
     points = [o for o in outcomes if counts(o)]
     if not points:
-        return Matched("not reached", None)
+        return TimeAtAccuracy("not reached", None)
     errors = np.array([max(o.largest("energy_bound") or 0.0, SMALLEST) for o in points])
     if error < errors.min():
-        return Matched("not reached", None)
+        return TimeAtAccuracy("not reached", None)
     if error > errors.max():
         loosest = max(points, key=lambda o: (o.largest("energy_bound") or 0.0, o.tol))
-        return Matched("looser", loosest.seconds("total"))
+        return TimeAtAccuracy("looser", loosest.seconds("total"))
     samples = [
         np.array([r.total_seconds for r in o.records if r.total_seconds])
         for o in points
@@ -82,7 +82,7 @@ def matched(outcomes: Sequence[Outcome], error: float) -> Matched:
     times = [time_at(error, errors, t) for t in np.transpose(drawn)]
     fewest = min(t.size for t in samples)
     low, high = limits(np.array(times), fewest) if fewest > 1 else (value, value)
-    return Matched(
+    return TimeAtAccuracy(
         "between", Interval(value, float(low), float(high), COVERAGE, fewest)
     )
 

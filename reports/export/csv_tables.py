@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 
 from harness import Record, Verdict
-from reports.data.aggregation import EVERY, USUAL, Convention, Standing, standing
+from reports.data.aggregation import EVERY, USUAL, Convention, Ranking, ranking_of
 from reports.data.aggregation import geometric_means as means_by
-from reports.data.comparison_groups import Contest, contests
+from reports.data.comparison_groups import ComparisonGroup, comparison_groups
 from reports.data.evidence import RESIDUALS, Evidence, Outcome
-from reports.data.size_series import Ladder, ladders
+from reports.data.size_series import SizeSeries, size_series
 from reports.export.parquet import texts
 from reports.sections.physics import spreads
 from reports.sections.ranking import ranks
@@ -24,12 +24,12 @@ from reports.statistics.profiles import performance_ratios
 _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
 
 
-def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
-    """Make every sheet by the name of its file; empty ones are left out.
+def csv_tables(evidence: Evidence) -> dict[str, pd.DataFrame]:
+    """Make every table by the name of its file; empty ones are left out.
 
     measurements: one row per journal line. outcomes: the repeats of one solver on one
     case together, every time a median with its interval. energies, scaling: as in the
-    report. contests, means: see `reports.export.contest_sheets`.
+    report. contests, means: see `comparison_tables`.
     """
     found = {
         "measurements": _measurements(evidence.records),
@@ -45,12 +45,12 @@ def sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
             for s in spreads(evidence.flat)
         ),
         "scaling": pd.DataFrame(
-            _law(ladder, solver)
-            for ladder in ladders(evidence)
-            for solver in ladder.solvers
+            _law(series, solver)
+            for series in size_series(evidence)
+            for solver in series.solvers
         ),
     }
-    found |= contest_sheets(evidence)
+    found |= comparison_tables(evidence)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
 
 
@@ -96,17 +96,17 @@ def _outcome(o: Outcome) -> dict[str, Any]:
     return row
 
 
-def _law(ladder: Ladder, solver: str) -> dict[str, Any]:
+def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "ladder": ladder.title,
+        "ladder": series.title,
         "solver": solver,
-        "sizes": len(ladder.curve(solver)),
+        "sizes": len(series.curve(solver)),
     }
     laws: dict[str, PowerLaw | None] = {
-        "time": ladder.time_law(solver),
-        "time_against_m": ladder.time_law(solver, "m"),
-        "iterations": ladder.iteration_law(solver),
-        "iterations_against_m": ladder.iteration_law(solver, "m"),
+        "time": series.time_law(solver),
+        "time_against_m": series.time_law(solver, "m"),
+        "iterations": series.iteration_law(solver),
+        "iterations_against_m": series.iteration_law(solver, "m"),
     }
     for what, law in laws.items():
         for part in ("exponent", "low", "high", "factor"):
@@ -114,56 +114,56 @@ def _law(ladder: Ladder, solver: str) -> dict[str, Any]:
     return row
 
 
-def contest_sheets(evidence: Evidence) -> dict[str, pd.DataFrame]:
-    """Make the sheets of all contests.
+def comparison_tables(evidence: Evidence) -> dict[str, pd.DataFrame]:
+    """Make the tables of all groups of cases.
 
     contests: a row per case and solver with its time and its ratio to the best, both
     infinite for a failure; profiles are their distributions. means: a row per solver
     and convention, with intervals and tiers where they are made, at the usual one.
     """
-    found = contests(evidence)
+    found = comparison_groups(evidence)
     return {
         "contests": pd.concat([pd.DataFrame(), *map(_cells, found)]),
         "means": pd.DataFrame(
-            [row for each in map(standing, found) for row in _means(each)]
+            [row for each in map(ranking_of, found) for row in _means(each)]
         ),
     }
 
 
-def _cells(contest: Contest) -> pd.DataFrame:
+def _cells(group: ComparisonGroup) -> pd.DataFrame:
     """One row per case and solver."""
-    cases, solvers = len(contest.cases), len(contest.solvers)
+    cases, solvers = len(group.cases), len(group.solvers)
     return pd.DataFrame(
         {
-            "contest": contest.title,
-            "case": np.repeat(_spelt(contest.cases), solvers),
-            "solver": np.tile(_spelt(contest.solvers), cases),
-            "seconds": contest.times.ravel(),
-            "ratio": performance_ratios(contest.times).ravel(),
-            "claimed_seconds": contest.claimed.ravel(),
-            "out_of_time_after": contest.stopped.ravel(),
+            "contest": group.title,
+            "case": np.repeat(_spelt(group.cases), solvers),
+            "solver": np.tile(_spelt(group.solvers), cases),
+            "seconds": group.times.ravel(),
+            "ratio": performance_ratios(group.times).ravel(),
+            "claimed_seconds": group.claimed.ravel(),
+            "out_of_time_after": group.stopped.ravel(),
         }
     )
 
 
-def _means(standing: Standing) -> list[dict[str, Any]]:
+def _means(ranking: Ranking) -> list[dict[str, Any]]:
     """One row per convention and solver."""
-    contest = standing.contest
+    group = ranking.group
     usual: dict[str, Any] = {
-        "low": standing.intervals[0],
-        "high": standing.intervals[1],
+        "low": ranking.intervals[0],
+        "high": ranking.intervals[1],
     }
     names = ("ratio", "ratio_low", "ratio_high")
-    usual |= dict(zip(names, standing.ratios, strict=True))
-    usual |= {"p_best": standing.first, "tier": standing.tiers}
+    usual |= dict(zip(names, ranking.ratios, strict=True))
+    usual |= {"p_best": ranking.first, "tier": ranking.tiers}
     rows = []
     for convention in (*EVERY, Convention(common=True)):
-        found = means_by(contest, convention)
+        found = means_by(group, convention)
         ranked = ranks(found)
         more = usual if convention == USUAL else {}
-        for i, solver in enumerate(_spelt(contest.solvers)):
+        for i, solver in enumerate(_spelt(group.solvers)):
             rows.append(
-                {"contest": contest.title, "solver": solver}
+                {"contest": group.title, "solver": solver}
                 | vars(convention)
                 | {"mean": found[i], "rank": ranked[i]}
                 | {name: values[i] for name, values in more.items()}

@@ -15,23 +15,23 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from harness import Vector
-from reports.data.histories import Comparison, Course
+from reports.data.histories import CaseHistories, SolverRun
 from reports.document.formatting import VERDICTS
 from reports.figures.provenance import behind
 from reports.figures.style import INK, STYLE, legible, look
 
 #: letter of a step, its name, and its mark; the others, CG above all, are bare
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
-WIDE = 10.0  #: ratio of the longest course to the shortest that makes their axis log
+WIDE = 10.0  #: ratio of the longest run to the shortest that makes their axis log
 CLOSEST = 5.0  #: distance of marks of one kind on a curve, in points
 COLUMNS = 4  #: of a legend
 FLOOR = 1e-5  #: times the tolerance: less is rounding, and not shown
 
 
-def convergence_figure(c: Comparison) -> Figure | None:
+def convergence_figure(c: CaseHistories) -> Figure | None:
     """Draw projected gradient and infeasibility over the work; None without either."""
-    gradients = [(one, y) for one in c.courses if (y := one.gradient) is not None]
-    errors = [(one, y) for one in c.courses if (y := one.infeasibility) is not None]
+    gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
+    errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
     heights = [2.6] * bool(gradients) + [1.9] * bool(errors)
     if not heights:
         return None
@@ -43,47 +43,47 @@ def convergence_figure(c: Comparison) -> Figure | None:
         if errors:
             panels[-1].set_ylabel(r"$\|Ax-b\|$, relative")
             _curves(panels[-1], c, errors)
-            _tolerance(panels[-1], c.courses[0].outcome.tol)
-        for course, values in gradients or errors:
-            _mark_steps(panels[0], c, course, values)
-        _legend(figure, c, c.courses, KINDS)
+            _tolerance(panels[-1], c.runs[0].outcome.tol)
+        for run, values in gradients or errors:
+            _mark_steps(panels[0], c, run, values)
+        _legend(figure, c, c.runs, KINDS)
     return figure
 
 
-def active_set_figure(c: Comparison) -> Figure | None:
+def active_set_figure(c: CaseHistories) -> Figure | None:
     """Draw the number of active bounds over the work; None if nobody counts them."""
-    counts = [(one, n) for one in c.courses if (n := one.active) is not None]
+    counts = [(one, n) for one in c.runs if (n := one.active) is not None]
     if not counts:
         return None
     with rc_context(STYLE):
         figure, (axes,) = _panels(c, [2.2])
-        for course, active in counts:
-            style = _style(c, course)
-            (line,) = axes.plot(c.work(course), active, drawstyle="steps-post", **style)
-            behind(line, [[course.record]])
+        for run, active in counts:
+            style = _style(c, run)
+            (line,) = axes.plot(c.work(run), active, drawstyle="steps-post", **style)
+            behind(line, [[run.record]])
         axes.set_ylabel("active bounds")
         axes.set_ylim(0, 1.06 * max(*(float(np.nanmax(n)) for _, n in counts), 1.0))
         axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-        _legend(figure, c, [course for course, _ in counts])
+        _legend(figure, c, [run for run, _ in counts])
     return figure
 
 
-def marked(c: Comparison) -> list[str]:
+def marked(c: CaseHistories) -> list[str]:
     """Name the kinds of steps that `convergence_figure` marks."""
     return [name for letter, name, _ in KINDS if c.taken(letter)]
 
 
-def _panels(c: Comparison, heights: list[float]) -> tuple[Figure, list[Axes]]:
+def _panels(c: CaseHistories, heights: list[float]) -> tuple[Figure, list[Axes]]:
     """Stack panels over one axis of work, with a strip for outer iterations below."""
-    outer = [course for course in c.courses if course.outer_ends.any()]
+    outer = [run for run in c.runs if run.outer_ends.any()]
     parts = heights + [0.11 * len(outer) + 0.06] * bool(outer)
-    entries = len(c.courses) + len(marked(c))
+    entries = len(c.runs) + len(marked(c))
     legend = 0.2 * ceil(entries / COLUMNS)
     figure = Figure(figsize=(6.9, sum(parts) + 0.5 + legend))
     stack = figure.subplots(
         len(parts), 1, sharex=True, squeeze=False, height_ratios=parts
     )[:, 0]
-    ends = [float(c.work(course).max()) for course in c.courses]
+    ends = [float(c.work(run).max()) for run in c.runs]
     if max(ends) > WIDE * max(min(ends), 1.0):
         stack[-1].set_xscale("log")
     else:
@@ -99,24 +99,26 @@ def _panels(c: Comparison, heights: list[float]) -> tuple[Figure, list[Axes]]:
     return figure, list(stack[: len(heights)])
 
 
-def _strip(axes: Axes, c: Comparison, outer: Sequence[Course]) -> None:
+def _strip(axes: Axes, c: CaseHistories, outer: Sequence[SolverRun]) -> None:
     """Put a tick where an outer iteration ends, a row for each solver."""
-    for row, course in enumerate(outer):
-        ticks = c.work(course)[course.outer_ends]
-        colour = _style(c, course)["color"]
+    for row, run in enumerate(outer):
+        ticks = c.work(run)[run.outer_ends]
+        colour = _style(c, run)["color"]
         ends = axes.vlines(ticks, -row - 0.38, -row + 0.38, color=colour, linewidth=0.8)
-        behind(ends, [[course.record]])
+        behind(ends, [[run.record]])
     axes.set(ylim=(-len(outer) + 0.4, 0.6), yticks=[])
     axes.set_ylabel("outer", rotation=0, ha="right", va="center", fontsize=8.5)
     axes.spines["left"].set_visible(False)
 
 
-def _curves(axes: Axes, c: Comparison, drawn: Sequence[tuple[Course, Vector]]) -> None:
+def _curves(
+    axes: Axes, c: CaseHistories, drawn: Sequence[tuple[SolverRun, Vector]]
+) -> None:
     """Plot positive values on a logarithmic axis."""
-    for course, values in drawn:
+    for run, values in drawn:
         seen = _positive(values)
-        (line,) = axes.plot(c.work(course)[seen], values[seen], **_style(c, course))
-        behind(line, [[course.record]])
+        (line,) = axes.plot(c.work(run)[seen], values[seen], **_style(c, run))
+        behind(line, [[run.record]])
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     floor = FLOOR * drawn[0][0].outcome.tol
@@ -125,18 +127,16 @@ def _curves(axes: Axes, c: Comparison, drawn: Sequence[tuple[Course, Vector]]) -
     axes.yaxis.set_minor_locator(NullLocator())
 
 
-def _mark_steps(axes: Axes, c: Comparison, course: Course, values: Vector) -> None:
+def _mark_steps(axes: Axes, c: CaseHistories, run: SolverRun, values: Vector) -> None:
     """Mark the kinds of steps on a curve, except where marks would overlap."""
     axes.autoscale_view()  # which is otherwise put off until the figure is drawn
     point = axes.figure.dpi / 72
     for letter, _, marker in KINDS:
-        at = np.flatnonzero(course.steps(letter) & _positive(values))
-        points = np.column_stack([c.work(course)[at], values[at]])
+        at = np.flatnonzero(run.steps(letter) & _positive(values))
+        points = np.column_stack([c.work(run)[at], values[at]])
         apart = _apart(axes.transData.transform(points) / point)
-        (line,) = axes.plot(
-            *points[apart].T, **_mark(marker, _style(c, course)["color"])
-        )
-        behind(line, [[course.record]])
+        (line,) = axes.plot(*points[apart].T, **_mark(marker, _style(c, run)["color"]))
+        behind(line, [[run.record]])
 
 
 def _apart(places: NDArray[np.float64]) -> list[int]:
@@ -165,9 +165,9 @@ def _positive(values: Vector) -> NDArray[np.bool_]:
     return values > 0  # NaN is not
 
 
-def _style(c: Comparison, course: Course) -> dict[str, Any]:
+def _style(c: CaseHistories, run: SolverRun) -> dict[str, Any]:
     """Colour and dashes of a solver, without the marker: that tells the step."""
-    return {**look(c.solvers.index(course.outcome.solver)), "marker": "none"}
+    return {**look(c.solvers.index(run.outcome.solver)), "marker": "none"}
 
 
 def _mark(marker: str, colour: str) -> dict[str, Any]:
@@ -179,13 +179,13 @@ def _mark(marker: str, colour: str) -> dict[str, Any]:
 
 def _legend(
     figure: Figure,
-    c: Comparison,
-    courses: Sequence[Course],
+    c: CaseHistories,
+    runs: Sequence[SolverRun],
     kinds: Sequence[tuple[str, str, str]] = (),
 ) -> None:
     """Name the solvers, with the verdict where it is not good, and the marks."""
-    keys = [Line2D([], [], **_style(c, course)) for course in courses]
-    names = [_name(course) for course in courses]
+    keys = [Line2D([], [], **_style(c, run)) for run in runs]
+    names = [_name(run) for run in runs]
     for letter, name, marker in kinds:
         if c.taken(letter):
             keys.append(Line2D([], [], **_mark(marker, INK)))
@@ -193,7 +193,7 @@ def _legend(
     figure.legend(keys, names, loc="outside lower center", ncols=COLUMNS)
 
 
-def _name(course: Course) -> str:
-    outcome = course.outcome
+def _name(run: SolverRun) -> str:
+    outcome = run.outcome
     verdict = "" if outcome.verified else f" ({VERDICTS[outcome.verdict][1]})"
     return legible(outcome.solver) + verdict

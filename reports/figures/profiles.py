@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
-from reports.data.aggregation import Standing
+from reports.data.aggregation import Ranking
 from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_ticks, look
 from reports.statistics.profiles import Array, Curve, curve, performance_ratios
 
@@ -33,14 +33,14 @@ _FACTORS = {
 Place = tuple[float, float]  #: ends of an axis
 
 
-def rows_of(standing: Standing, solvers: Sequence[str]) -> list[list[int]]:
+def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
     """Share the solvers out among rows, best means first, no colour twice in a row.
 
     solvers : of the whole report, which their looks go by
     """
     rows: list[dict[str, int]] = []
-    for i in map(int, standing.order[: ROW * ROWS]):
-        colour = look(solvers.index(standing.contest.solvers[i]))["color"]
+    for i in map(int, ranking.order[: ROW * ROWS]):
+        colour = look(solvers.index(ranking.group.solvers[i]))["color"]
         free = (row for row in rows if len(row) < ROW and colour not in row)
         row = next(free, None)
         if row is None:
@@ -50,28 +50,28 @@ def rows_of(standing: Standing, solvers: Sequence[str]) -> list[list[int]]:
     return [list(row.values()) for row in rows]
 
 
-def rivals(standing: Standing) -> list[int]:
+def rivals(ranking: Ranking) -> list[int]:
     """Choose the solvers that the leader is paired with: the next in that order."""
-    return [int(i) for i in standing.order[1 : PAIRS + 1]]
+    return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 
-def banded(standing: Standing) -> bool:
+def banded(ranking: Ranking) -> bool:
     """Whether `profile_figure` has bands; `pairwise_figure` always has."""
-    contest = standing.contest
-    return len(contest.solvers) <= 2 or len(contest.cases) >= BANDED
+    group = ranking.group
+    return len(group.solvers) <= 2 or len(group.cases) >= BANDED
 
 
-def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
+def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     """Draw both profiles of every solver, a few in colour in each row of panels."""
-    contest = standing.contest
-    ratios = performance_ratios(contest.times)
-    known = contest.times[contest.solved]
+    group = ranking.group
+    ratios = performance_ratios(group.times)
+    known = group.times[group.solved]
     span = (float(known.min()) / 1.3, 1.3 * float(known.max()))
     sides = (
         (ratios, (1.0, _end(ratios)), "time / best time of the case"),
-        (contest.times, span, "time in s"),
+        (group.times, span, "time in s"),
     )
-    rows = rows_of(standing, solvers)
+    rows = rows_of(ranking, solvers)
     heights = [1.9 + LEGEND_LINE] * len(rows)
     heights[-1] += LEGEND_LINE  # for the labels of the axes
     with rc_context(STYLE):
@@ -82,23 +82,23 @@ def profile_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
             for axes, (values, ends, name) in zip(panels, sides, strict=True):
                 _others(axes, values, mine, ends)
                 for i in mine:
-                    style = look(solvers.index(contest.solvers[i]))
+                    style = look(solvers.index(group.solvers[i]))
                     drawn = curve(values[:, i], *ends)
-                    _profile(axes, drawn, style, band=banded(standing))
+                    _profile(axes, drawn, style, band=banded(ranking))
                 _dress(axes, ends, name if mine is rows[-1] else "")
                 if values is ratios:
                     _factors(axes, ends[1])
             panels[0].set_ylabel("share of cases")
-            names = [contest.solvers[i] for i in mine]
+            names = [group.solvers[i] for i in mine]
             _legend(part, names, [look(solvers.index(name)) for name in names])
     return figure
 
 
-def pairwise_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
+def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     """Draw performance profiles of two: the leader, in black, and each next rival."""
-    contest, leader = standing.contest, standing.leader
-    against = rivals(standing)
-    names = [contest.solvers[i] for i in (leader, *against)]
+    group, leader = ranking.group, ranking.leader
+    against = rivals(ranking)
+    names = [group.solvers[i] for i in (leader, *against)]
     styles = [look(solvers.index(name)) for name in names]
     styles[0] |= {"color": INK}
     columns = min(len(against), _COLUMNS)
@@ -111,7 +111,7 @@ def pairwise_figure(standing: Standing, solvers: Sequence[str]) -> Figure:
             if n >= len(against):
                 axes.set_axis_off()
                 continue
-            ratios = performance_ratios(contest.times[:, [leader, against[n]]])
+            ratios = performance_ratios(group.times[:, [leader, against[n]]])
             ends = (1.0, _end(ratios))
             _profile(axes, curve(ratios[:, 1], *ends), styles[n + 1])
             _profile(axes, curve(ratios[:, 0], *ends), styles[0])

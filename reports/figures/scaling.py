@@ -10,24 +10,24 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from reports.data.size_series import Ladder
+from reports.data.size_series import SizeSeries
 from reports.document.formatting import exponent
 from reports.figures.provenance import behind
 from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
 
 
-def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
+def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
     """Draw total time and iterations against n on logarithmic axes."""
     with rc_context(STYLE):
-        entries = -(-len(ladder.solvers) // 2)  # lines of the legend
+        entries = -(-len(series.solvers) // 2)  # lines of the legend
         figure = Figure(figsize=(6.9, 2.4 + LEGEND_LINE * max(entries, 3)))
         left, right = figure.subplots(1, 2)
-        for solver in ladder.solvers:
+        for solver in series.solvers:
             style = look(solvers.index(solver))
-            _times(left, ladder, solver, style=style)
+            _times(left, series, solver, style=style)
             counted = [
                 (n, sum(o.iterations) / 2, o.records)
-                for n, o in ladder.curve(solver)
+                for n, o in series.curve(solver)
                 if o.iterations is not None
             ]
             if counted:
@@ -42,15 +42,17 @@ def scaling_figure(ladder: Ladder, solvers: Sequence[str]) -> Figure:
     return figure
 
 
-def _times(axes: Axes, ladder: Ladder, solver: str, *, style: dict[str, Any]) -> None:
+def _times(
+    axes: Axes, series: SizeSeries, solver: str, *, style: dict[str, Any]
+) -> None:
     """Plot medians with their intervals, and the exponent in the legend."""
-    timed = [(n, o.seconds("total")) for n, o in ladder.curve(solver)]
+    timed = [(n, o.seconds("total")) for n, o in series.curve(solver)]
     points = [(n, t.value, t.low, t.high) for n, t in timed if t is not None]
     if not points:
         return
     n, t, low, high = np.array(points, dtype=float).T
-    runs = [o.records for _, o in ladder.curve(solver) if o.seconds("total")]
-    law = ladder.time_law(solver)
+    runs = [o.records for _, o in series.curve(solver) if o.seconds("total")]
+    law = series.time_law(solver)
     label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
     (line,) = axes.plot(n, t, label=label, **style)
     _, caps, bars = axes.errorbar(

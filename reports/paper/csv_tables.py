@@ -17,7 +17,7 @@ KEYS = {
 }
 
 
-def sheets(experiment: Experiment) -> dict[str, pd.DataFrame]:
+def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
     """Make one table per figure, in seconds, Table 1 and the published times.
 
     kind: measured, or fitted where nothing was measured.

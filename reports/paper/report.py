@@ -6,9 +6,9 @@ from pathlib import Path
 
 from harness.experiment import load_experiment
 from reports.data.evidence import read_evidence
-from reports.export.csv_tables import sheets as report_sheets
+from reports.export.csv_tables import csv_tables as report_tables
 from reports.figures.saving import save_all
-from reports.paper.csv_tables import sheets
+from reports.paper.csv_tables import csv_tables
 from reports.paper.page import BEYOND, compose
 from reports.render.html_page import html
 from reports.render.latex import latex
@@ -44,8 +44,8 @@ def write_paper(folder: Path) -> list[Path]:
         if section.tables:
             path = tables / f"{section.name}.tex"
             written.append(_write(path, latex(section.tables)))
-    frames = sheets(experiment)
-    frames |= {name: report_sheets(e)["outcomes"] for name, e in suites.items()}
+    frames = csv_tables(experiment)
+    frames |= {name: report_tables(e)["outcomes"] for name, e in suites.items()}
     written += [
         _write(tables / f"{name}.csv", frame.to_csv(index=False))
         for name, frame in frames.items()

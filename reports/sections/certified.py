@@ -14,7 +14,12 @@ from matplotlib.lines import Line2D
 from harness import Verdict
 from harness.discretisation import Discretisation
 from reports.data.evidence import Evidence, Outcome
-from reports.data.time_at_accuracy import SMALLEST, Matched, counts, matched
+from reports.data.time_at_accuracy import (
+    SMALLEST,
+    TimeAtAccuracy,
+    counts,
+    time_at_accuracy,
+)
 from reports.document.formatting import ABSENT, TIMED, clean, power, seconds, tolerance
 from reports.document.layout import Cell, Picture, Table, name_cell
 from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
@@ -47,13 +52,15 @@ def _swept(row: Mapping[str, Sequence[Outcome]]) -> bool:
     return len(bounded) >= LEAST
 
 
-def matched_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
+def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     """Tabulate the times at matched certified errors."""
     present = [s for s in solvers if any(s in row for row in swept.values())]
     rows = []
     for case, row in swept.items():
         for error in ERRORS:
-            found = {s: matched(outcomes, error) for s, outcomes in row.items()}
+            found = {
+                s: time_at_accuracy(outcomes, error) for s, outcomes in row.items()
+            }
             kinds = _kinds({s: m for s, m in found.items() if not row[s][0].first.arm})
             cells = [
                 _cell(found.get(s), row.get(s, ()), kinds.get(s, "")) for s in present
@@ -78,7 +85,7 @@ def matched_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     )
 
 
-def _kinds(found: Mapping[str, Matched]) -> dict[str, str]:
+def _kinds(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
     """Rank the times of a row; what is only bounded from above has no place in it."""
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:
@@ -93,7 +100,7 @@ def _kinds(found: Mapping[str, Matched]) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _cell(found: Matched | None, tried: Sequence[Outcome], kind: str) -> Cell:
+def _cell(found: TimeAtAccuracy | None, tried: Sequence[Outcome], kind: str) -> Cell:
     if found is None:
         return Cell(text=ABSENT)
     reached = [o for o in tried if counts(o)]

@@ -19,7 +19,7 @@ KINDS = {
 }
 
 
-def tally(evidence: Evidence) -> Section:
+def claim_counts(evidence: Evidence) -> Section:
     """Count, for every solver, what it claimed and what was found."""
     count: dict[str, Counter[tuple[bool, bool]]] = defaultdict(Counter)
     for o in evidence.flat:

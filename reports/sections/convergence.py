@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from reports.data.evidence import Evidence
-from reports.data.histories import RULE, Comparison, chosen, unread
+from reports.data.histories import RULE, CaseHistories, chosen, unread
 from reports.document.formatting import clean, listing, tolerance
 from reports.document.layout import Picture, Section
 from reports.figures.convergence import (
@@ -36,15 +36,15 @@ def convergence(evidence: Evidence) -> Section | None:
     )
 
 
-def _pictures(c: Comparison, i: int) -> list[Picture]:
+def _pictures(c: CaseHistories, i: int) -> list[Picture]:
     """Make the figures of one case: convergence, active set, or one of them."""
-    one = c.courses[0].outcome
+    one = c.runs[0].outcome
     where = f"{clean(one.case)} at tol {tolerance(one.tol)}"
-    runs = clean(", ".join(course.record.run_id for course in c.courses), 200)
+    runs = clean(", ".join(run.record.run_id for run in c.runs), 200)
     over = "products with P" if c.counted else "iterations"
     ticks = (
         " Ticks: ends of outer iterations; solvers from top to bottom as in the key."
-        if any(course.outer_ends.any() for course in c.courses)
+        if any(run.outer_ends.any() for run in c.runs)
         else ""
     )
     pictures = []
@@ -67,9 +67,9 @@ def _pictures(c: Comparison, i: int) -> list[Picture]:
     return pictures
 
 
-def _quantities(c: Comparison) -> str:
+def _quantities(c: CaseHistories) -> str:
     gradient = "norm of the projected gradient relative to its first value"
     error = "relative infeasibility ‖Ax − b‖"
-    shown = [gradient] * any(one.gradient is not None for one in c.courses)
-    shown += [error] * any(one.infeasibility is not None for one in c.courses)
+    shown = [gradient] * any(one.gradient is not None for one in c.runs)
+    shown += [error] * any(one.infeasibility is not None for one in c.runs)
     return " and ".join(shown)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import t
 
-from reports.data.size_series import Ladder
+from reports.data.size_series import SizeSeries
 from reports.document.formatting import ABSENT, clean, seconds
 from reports.document.layout import Cell, Section, Table
 from reports.statistics.intervals import COVERAGE, Interval, power_law
@@ -102,9 +102,9 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     )
 
 
-def growth(found: Sequence[Ladder]) -> Section | None:
-    """Test every ladder of at least four sizes; None where there is none."""
-    tested = [ladder for ladder in found if len(ladder.rungs) >= SIZES]
+def growth(found: Sequence[SizeSeries]) -> Section | None:
+    """Test every series of at least four sizes; None where there is none."""
+    tested = [series for series in found if len(series.sizes) >= SIZES]
     if not tested:
         return None
     return Section(
@@ -125,20 +125,20 @@ def growth(found: Sequence[Ladder]) -> Section | None:
     )
 
 
-def _table(ladder: Ladder) -> Table:
-    largest = ladder.rungs[-1][0]
+def _table(series: SizeSeries) -> Table:
+    largest = series.sizes[-1][0]
     return Table(
-        caption=f"Growth of iterations, and time at n = {largest}: {ladder.title}.",
+        caption=f"Growth of iterations, and time at n = {largest}: {series.title}.",
         columns=(
             "solver", "sizes", "p of iterations", "p at most", "p-value",
             "iterations", f"time at n = {largest}",
         ),
-        rows=tuple(_row(ladder, s, largest) for s in ladder.solvers),
+        rows=tuple(_row(series, s, largest) for s in series.solvers),
     )  # fmt: skip
 
 
-def _row(ladder: Ladder, solver: str, largest: int) -> tuple[Cell, ...]:
-    curve = ladder.curve(solver)
+def _row(series: SizeSeries, solver: str, largest: int) -> tuple[Cell, ...]:
+    curve = series.curve(solver)
     counted = [(n, sum(o.iterations) / 2) for n, o in curve if o.iterations]
     timed = [(n, t.value) for n, o in curve if (t := o.seconds("total"))]
     return (

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.pairs import paired_ratio
-from reports.data.aggregation import USUAL, Convention, Standing, common_cases
+from reports.data.aggregation import USUAL, Convention, Ranking, common_cases
 from reports.data.aggregation import geometric_means as means_by
-from reports.data.comparison_groups import CASES, LARGEST_SHIFT, Contest
+from reports.data.comparison_groups import CASES, LARGEST_SHIFT, ComparisonGroup
 from reports.document.formatting import (
     ABSENT,
     TIMED,
@@ -28,9 +28,9 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def means(standings: Sequence[Standing]) -> Section | None:
-    """Tabulate the means of every contest; None where there is none."""
-    if not standings:
+def means(rankings: Sequence[Ranking]) -> Section | None:
+    """Tabulate the means of every group; None where there is none."""
+    if not rankings:
         return None
     return Section(
         name="means",
@@ -52,22 +52,22 @@ def means(standings: Sequence[Standing]) -> Section | None:
             "share of resampled sets of cases in which a solver has the least mean. "
             "Formulas, sources and limits are in docs/statistics.md.",
         ),
-        tables=tuple(map(_table, standings)),
+        tables=tuple(map(_table, rankings)),
     )
 
 
-def described(contest: Contest) -> str:
-    """Name a contest with the numbers that its means depend on."""
+def described(group: ComparisonGroup) -> str:
+    """Name a group of cases with the numbers that its means depend on."""
     return (
-        f"{contest.title}: {plural(len(contest.cases), 'case')}, shift "
-        f"{significant(contest.shift)} s, limit {significant(contest.limit)} s."
+        f"{group.title}: {plural(len(group.cases), 'case')}, shift "
+        f"{significant(group.shift)} s, limit {significant(group.limit)} s."
     )
 
 
-def _table(standing: Standing) -> Table:
-    contest = standing.contest
-    rows, columns = common_cases(contest)
-    left = [s for s, used in zip(contest.solvers, columns, strict=True) if not used]
+def _table(ranking: Ranking) -> Table:
+    group = ranking.group
+    rows, columns = common_cases(group)
+    left = [s for s, used in zip(group.solvers, columns, strict=True) if not used]
     common = f"Common cases: {rows.sum()}, solved by all"
     common += (
         f" but {plural(len(left), 'solver')} with less than half solved."
@@ -75,42 +75,42 @@ def _table(standing: Standing) -> Table:
         else "."
     )
     return Table(
-        caption=f"Times over cases, {described(contest)} {common} Both solved: "
+        caption=f"Times over cases, {described(group)} {common} Both solved: "
         "geometric mean of the ratios on cases that the solver and the leader solved.",
-        notes=(*contest.notes, TIMED),
+        notes=(*group.notes, TIMED),
         columns=_COLUMNS,
-        rows=tuple(_row(standing, int(i)) for i in standing.order),
+        rows=tuple(_row(ranking, int(i)) for i in ranking.order),
     )
 
 
-def _row(standing: Standing, i: int) -> tuple[Cell, ...]:
-    contest, leads = standing.contest, i == standing.leader
-    solved = int(contest.solved[:, i].sum())
-    tier = int(standing.tiers[i])
+def _row(ranking: Ranking, i: int) -> tuple[Cell, ...]:
+    group, leads = ranking.group, i == ranking.leader
+    solved = int(group.solved[:, i].sum())
+    tier = int(ranking.tiers[i])
     return (
-        name_cell(contest.solvers[i]),
+        name_cell(group.solvers[i]),
         Cell(text=str(tier), value=tier),
-        Cell(text=f"{solved} of {len(contest.cases)}", value=solved),
-        _mean(standing, i) if solved else Cell(text="none solved", kind="quiet"),
-        _ratio(standing, i),
-        Cell(text=_share(float(standing.first[i])), value=float(standing.first[i])),
-        Cell(text="1") if leads else _pairs(contest, i, standing.leader),
-        _common(standing, i),
-        _restricted(contest, i) if solved else Cell(text="none solved", kind="quiet"),
+        Cell(text=f"{solved} of {len(group.cases)}", value=solved),
+        _mean(ranking, i) if solved else Cell(text="none solved", kind="quiet"),
+        _ratio(ranking, i),
+        Cell(text=_share(float(ranking.first[i])), value=float(ranking.first[i])),
+        Cell(text="1") if leads else _pairs(group, i, ranking.leader),
+        _common(ranking, i),
+        _restricted(group, i) if solved else Cell(text="none solved", kind="quiet"),
     )
 
 
-def _mean(standing: Standing, i: int) -> Cell:
-    value = float(standing.means[i])
-    low, high = (float(end[i]) for end in standing.intervals)
-    mean = Interval(value, low, high, COVERAGE, len(standing.contest.cases))
-    kind = "best" if i == standing.leader else ""
+def _mean(ranking: Ranking, i: int) -> Cell:
+    value = float(ranking.means[i])
+    low, high = (float(end[i]) for end in ranking.intervals)
+    mean = Interval(value, low, high, COVERAGE, len(ranking.group.cases))
+    kind = "best" if i == ranking.leader else ""
     return Cell(text=seconds(mean), value=value, kind=kind)
 
 
-def _ratio(standing: Standing, i: int) -> Cell:
-    value, low, high = (float(part[i]) for part in standing.ratios)
-    if i == standing.leader:
+def _ratio(ranking: Ranking, i: int) -> Cell:
+    value, low, high = (float(part[i]) for part in ranking.ratios)
+    if i == ranking.leader:
         return Cell(text="1", value=1.0)
     return Cell(text=bracketed(value, low, high), value=value)
 
@@ -120,10 +120,10 @@ def _share(p: float) -> str:
     return "0" if p == 0 else "< 0.01" if p < 0.01 else f"{p:.2f}"
 
 
-def _pairs(contest: Contest, i: int, leader: int) -> Cell:
+def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
     """Compare with the leader on the cases that both solved; nothing is charged."""
     mine, its = (
-        {p: float(t) for p, t in enumerate(contest.times[:, s]) if np.isfinite(t)}
+        {p: float(t) for p, t in enumerate(group.times[:, s]) if np.isfinite(t)}
         for s in (i, leader)
     )
     ratio = paired_ratio(mine, its)
@@ -136,18 +136,18 @@ def _pairs(contest: Contest, i: int, leader: int) -> Cell:
     )
 
 
-def _common(standing: Standing, i: int) -> Cell:
+def _common(ranking: Ranking, i: int) -> Cell:
     """Ratio to the leader where all solved."""
-    found = means_by(standing.contest, Convention(common=True))
-    value = float(found[i] / found[standing.leader])
+    found = means_by(ranking.group, Convention(common=True))
+    value = float(found[i] / found[ranking.leader])
     if np.isnan(value):
         return Cell(text=ABSENT, title="too few cases that all solved")
     return Cell(text=significant(value), value=value)
 
 
-def _restricted(contest: Contest, i: int) -> Cell:
+def _restricted(group: ComparisonGroup, i: int) -> Cell:
     """Mean of the times cut at the limit, with what is censored."""
-    found = restricted_mean(contest.times[:, i], contest.stopped[:, i], contest.horizon)
+    found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
     known = [
         f"{count} {what}"
         for count, what in ((found.stopped, "out of time"), (found.never, "never"))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reports.data.aggregation import Standing
+from reports.data.aggregation import Ranking
 from reports.document.formatting import clean, plural
 from reports.document.layout import Cell, Picture, Section, Table, name_cell
 from reports.figures.profiles import (
@@ -19,24 +19,24 @@ from reports.figures.profiles import (
 from reports.sections.means import described
 from reports.statistics.profiles import Array, performance_ratios, solved_within
 
-DRAWN = 4  #: contests that are drawn; all are tabulated
+DRAWN = 4  #: groups that are drawn; all are tabulated
 FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table
 
 
-def profiles(standings: Sequence[Standing], solvers: Sequence[str]) -> Section | None:
-    """Draw and tabulate the profiles of every contest; None where there is none.
+def profiles(rankings: Sequence[Ranking], solvers: Sequence[str]) -> Section | None:
+    """Draw and tabulate the profiles of every group; None where there is none.
 
     solvers : of the whole report, which their looks go by
     """
-    if not standings:
+    if not rankings:
         return None
-    drawn = standings[:DRAWN]
+    drawn = rankings[:DRAWN]
     pictures = [
         picture
-        for number, standing in enumerate(drawn, 1)
-        for picture in _pictures(standing, solvers, number)
+        for number, ranking in enumerate(drawn, 1)
+        for picture in _pictures(ranking, solvers, number)
     ]
-    rest = len(standings) - len(drawn)
+    rest = len(rankings) - len(drawn)
     return Section(
         name="profiles",
         title="Profiles",
@@ -51,64 +51,63 @@ def profiles(standings: Sequence[Standing], solvers: Sequence[str]) -> Section |
             "the best time of a case is another, and their curves may change places "
             "(Gould and Scott 2016). Only a profile of two compares two, so the "
             "leader is set against each of the next in turn."
-            + f" The first {len(drawn)} of {len(standings)} groups are drawn."
+            + f" The first {len(drawn)} of {len(rankings)} groups are drawn."
             * bool(rest),
         ),
-        tables=tuple(map(_table, standings)),
+        tables=tuple(map(_table, rankings)),
         pictures=tuple(pictures),
     )
 
 
-def _pictures(standing: Standing, solvers: Sequence[str], number: int) -> list[Picture]:
-    contest = standing.contest
+def _pictures(ranking: Ranking, solvers: Sequence[str], number: int) -> list[Picture]:
+    group = ranking.group
     pictures = [
         Picture(
             name=f"profiles-{number}",
             caption="Performance profiles (left) and data profiles (right), "
-            f"{described(contest)}{_remarks(standing, solvers)}",
-            figure=profile_figure(standing, solvers),
+            f"{described(group)}{_remarks(ranking, solvers)}",
+            figure=profile_figure(ranking, solvers),
         )
     ]
-    if len(contest.solvers) > 2:
-        leader = clean(contest.solvers[standing.leader], 40)
-        others = plural(len(rivals(standing)), "solver")
+    if len(group.solvers) > 2:
+        leader = clean(group.solvers[ranking.leader], 40)
+        others = plural(len(rivals(ranking)), "solver")
         pictures.append(
             Picture(
                 name=f"pairwise-{number}",
                 caption=f"Performance profiles of two solvers each: {leader}, in "
                 f"black, and the next {others} in the order of the means, "
-                f"{described(contest)}",
-                figure=pairwise_figure(standing, solvers),
+                f"{described(group)}",
+                figure=pairwise_figure(ranking, solvers),
             )
         )
     return pictures
 
 
-def _remarks(standing: Standing, solvers: Sequence[str]) -> str:
+def _remarks(ranking: Ranking, solvers: Sequence[str]) -> str:
     """Say what is grey where solvers share out among rows, and where bands are."""
-    rows = rows_of(standing, solvers)
-    bands = "" if banded(standing) else " Bands: in the next figure, pair by pair."
+    rows = rows_of(ranking, solvers)
+    bands = "" if banded(ranking) else " Bands: in the next figure, pair by pair."
     if len(rows) < 2:
         return bands
-    behind = len(standing.contest.solvers) - sum(map(len, rows))
+    behind = len(ranking.group.solvers) - sum(map(len, rows))
     others = "the solvers of other rows"
     if behind:
         others += f" and {plural(behind, 'solver')} behind"
     return f" Rows roughly in the order of the means; grey: {others}.{bands}"
 
 
-def _table(standing: Standing) -> Table:
-    contest = standing.contest
-    ratios = performance_ratios(contest.times)
-    unsolved = int((~contest.solved.any(axis=1)).sum())
+def _table(ranking: Ranking) -> Table:
+    group = ranking.group
+    ratios = performance_ratios(group.times)
+    unsolved = int((~group.solved.any(axis=1)).sum())
     note = f"Nobody solved {plural(unsolved, 'case')}." * bool(unsolved)
     return Table(
         caption=f"Share of the cases solved within a factor of the best time, "
-        f"{described(contest)} {note}".rstrip(),
+        f"{described(group)} {note}".rstrip(),
         columns=("solver", *(_head(f) for f in FACTORS), "at all"),
         rows=tuple(
-            (name_cell(contest.solvers[i]), *_shares(ratios[:, i]))
-            for i in standing.order
+            (name_cell(group.solvers[i]), *_shares(ratios[:, i])) for i in ranking.order
         ),
     )
 

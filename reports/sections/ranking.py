@@ -16,10 +16,10 @@ from reports.data.aggregation import (
     USUAL,
     Array,
     Convention,
-    Standing,
+    Ranking,
     geometric_means,
 )
-from reports.data.comparison_groups import Contest
+from reports.data.comparison_groups import ComparisonGroup
 from reports.document.formatting import ABSENT, plural
 from reports.document.layout import Cell, Section, Table, name_cell
 from reports.sections.means import described
@@ -35,7 +35,7 @@ class Changed(NamedTuple):
 
 
 class Panel(NamedTuple):
-    """Ranks of the solvers of a contest under every convention."""
+    """Ranks of the solvers of a group under every convention."""
 
     usual: Array  #: (solvers,)
     single: dict[str, Changed]  #: by the one thing that was changed
@@ -48,12 +48,12 @@ class Panel(NamedTuple):
         return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
 
 
-def panel(contest: Contest) -> Panel:
+def panel(group: ComparisonGroup) -> Panel:
     """Rank under the usual convention, with one thing changed, and with all."""
-    usual = geometric_means(contest, USUAL)
+    usual = geometric_means(group, USUAL)
 
     def changed(convention: Convention) -> Changed:
-        means = geometric_means(contest, convention)
+        means = geometric_means(group, convention)
         return Changed(ranks(means), order_of(usual) * order_of(means) < 0)
 
     return Panel(
@@ -76,11 +76,11 @@ def order_of(means: Array) -> NDArray[np.int64]:
     return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)
 
 
-def ranking(standings: Sequence[Standing]) -> Section | None:
-    """Tabulate the panel of every contest; None where there is none."""
-    if not standings:
+def ranking(rankings: Sequence[Ranking]) -> Section | None:
+    """Tabulate the panel of every group; None where there is none."""
+    if not rankings:
         return None
-    panels = [(standing, panel(standing.contest)) for standing in standings]
+    panels = [(ranking, panel(ranking.group)) for ranking in rankings]
     return Section(
         name="ranking",
         title="What ranks depend on",
@@ -105,12 +105,12 @@ def _listed(values: Sequence[float]) -> str:
     return ", ".join(f"{v:g}" for v in values)
 
 
-def _verdict(standing: Standing, ranked: Panel) -> str:
-    """Say in a sentence what the ranking of one contest is worth."""
+def _verdict(ranking: Ranking, ranked: Panel) -> str:
+    """Say in a sentence what the ranking of one group is worth."""
     upper = np.triu(np.ones_like(ranked.turned), 1)
-    told = (standing.faster | standing.faster.T) & upper
+    told = (ranking.faster | ranking.faster.T) & upper
     turned = ranked.turned & upper
-    n = len(standing.contest.solvers)
+    n = len(ranking.group.solvers)
     turns = (
         f"conventions turn the order of {turned.sum()}, among them "
         f"{(turned & told).sum()} that are told apart"
@@ -118,31 +118,31 @@ def _verdict(standing: Standing, ranked: Panel) -> str:
         else "no convention turns an order"
     )
     return (
-        f"{standing.contest.title}: {plural(n, 'solver')} in "
-        f"{plural(int(standing.tiers.max()), 'tier')}; of "
+        f"{ranking.group.title}: {plural(n, 'solver')} in "
+        f"{plural(int(ranking.tiers.max()), 'tier')}; of "
         f"{plural(n * (n - 1) // 2, 'pair')} {told.sum()} told apart; {turns}."
     )
 
 
-def _table(standing: Standing, ranked: Panel) -> Table:
+def _table(ranking: Ranking, ranked: Panel) -> Table:
     return Table(
-        caption=f"Ranks under changed conventions, {described(standing.contest)} "
+        caption=f"Ranks under changed conventions, {described(ranking.group)} "
         f"Usual: {USUAL.penalty:g} limits for an unsolved case, verified answers.",
         columns=(
             "solver", "tier", "rank", "inside the noise", *ranked.single, "all",
             "reading",
         ),
-        rows=tuple(_row(standing, ranked, int(i)) for i in standing.order),
+        rows=tuple(_row(ranking, ranked, int(i)) for i in ranking.order),
     )  # fmt: skip
 
 
-def _row(standing: Standing, ranked: Panel, i: int) -> tuple[Cell, ...]:
-    tier, rank = int(standing.tiers[i]), int(ranked.usual[i])
-    low, high = standing.spans[i]
+def _row(ranking: Ranking, ranked: Panel, i: int) -> tuple[Cell, ...]:
+    tier, rank = int(ranking.tiers[i]), int(ranked.usual[i])
+    low, high = ranking.spans[i]
     every = [int(changed.ranks[i]) for changed in ranked.every]
-    told = standing.faster[i] | standing.faster[:, i]
+    told = ranking.faster[i] | ranking.faster[:, i]
     return (
-        name_cell(standing.contest.solvers[i]),
+        name_cell(ranking.group.solvers[i]),
         Cell(text=str(tier), value=tier),
         Cell(text=str(rank), value=rank),
         Cell(text=_range(low, high), value=low),

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from reports.data.evidence import Outcome
-from reports.data.size_series import Ladder
+from reports.data.size_series import SizeSeries
 from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
 from reports.document.layout import Cell, Section, Table
 from reports.sections.cells import source
 from reports.statistics.intervals import PowerLaw
 
-#: What the sizes of a ladder count, wherever they are shown.
+#: What the sizes of a series count, wherever they are shown.
 SIZES_NAMED = (
     "n: displacement components (degrees of freedom); m: dual size, the rows of "
     "equality and contact constraints."
 )
 
 
-def scaling(found: Sequence[Ladder]) -> Section | None:
-    """Tabulate every ladder; None where there is none."""
+def scaling(found: Sequence[SizeSeries]) -> Section | None:
+    """Tabulate every series; None where there is none."""
     if not found:
         return None
     return Section(
@@ -34,36 +34,36 @@ def scaling(found: Sequence[Ladder]) -> Section | None:
             "them. Where m grows more slowly than n, as it does for contact on a "
             "boundary, the exponent against m is the larger for the same times.",
         ),
-        tables=tuple(t for ladder in found for t in _tables(ladder)),
+        tables=tuple(t for series in found for t in _tables(series)),
     )
 
 
-def _tables(ladder: Ladder) -> tuple[Table, Table]:
-    heads = ("n", "m", *(clean(s, 40) for s in ladder.solvers))
+def _tables(series: SizeSeries) -> tuple[Table, Table]:
+    heads = ("n", "m", *(clean(s, 40) for s in series.solvers))
     times, counts = [], []
-    for n, m, row in ladder.rungs:
+    for n, m, row in series.sizes:
         size = (Cell(text=str(n), value=n), Cell(text=_rows(m), value=m))
-        present = [row.get(s) for s in ladder.solvers]
+        present = [row.get(s) for s in series.solvers]
         times.append((*size, *map(_time, present)))
         counts.append((*size, *map(_iterations, present)))
     for against in ("n", "m"):
         head = f"p against {against} [95 %]"
         label = (Cell(text=head, kind="total"), Cell(text="", kind="total"))
-        laws = [ladder.time_law(s, against) for s in ladder.solvers]
-        growth = [ladder.iteration_law(s, against) for s in ladder.solvers]
-        from_runs = [source(*(o for _, o in ladder.curve(s))) for s in ladder.solvers]
+        laws = [series.time_law(s, against) for s in series.solvers]
+        growth = [series.iteration_law(s, against) for s in series.solvers]
+        from_runs = [source(*(o for _, o in series.curve(s))) for s in series.solvers]
         times.append((*label, *map(_exponent, laws, from_runs)))
         counts.append((*label, *map(_exponent, growth, from_runs)))
     return (
         Table(
-            caption=f"Total time against size: {ladder.title}.",
+            caption=f"Total time against size: {series.title}.",
             notes=(SIZES_NAMED, TIMED),
             columns=heads,
             rows=tuple(times),
             text_columns=0,
         ),
         Table(
-            caption=f"Iterations against size: {ladder.title}.",
+            caption=f"Iterations against size: {series.title}.",
             notes=(SIZES_NAMED,),
             columns=heads,
             rows=tuple(counts),

@@ -20,7 +20,7 @@ from reports.sections.cells import source
 from reports.sections.certified import (
     certified_picture,
     certified_sweeps,
-    matched_table,
+    time_at_accuracy_table,
 )
 
 LEGEND_COLUMNS = 4
@@ -48,7 +48,7 @@ def accuracy(evidence: Evidence) -> Section | None:
             "time at equal error. No claim is believed: it only tells that a solver's "
             "own test ended the solve."
         )
-        tables.append(matched_table(certified, evidence.solvers))
+        tables.append(time_at_accuracy_table(certified, evidence.solvers))
         pictures.append(certified_picture(certified, evidence.solvers, meshes))
     if swept:
         prose.append(

@@ -29,7 +29,7 @@ _KNOWN = ("limit", "change")  #: kinds with an error to compare with
 Priced = Mapping[str, Mapping[str, Sequence[Outcome]]]  #: case → solver, loosest first
 
 
-def worth(evidence: Evidence) -> Section | None:
+def value_of_accuracy(evidence: Evidence) -> Section | None:
     """Set certified errors beside discretisation errors; None where none are known."""
     meshes = read_discretisation(evidence.directory)
     physical = dict.fromkeys(o.physical for o in evidence.flat)
