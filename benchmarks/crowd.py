@@ -27,7 +27,7 @@ TIMES = """() => new Promise((done) =>
 
 def read(folder):
     """Read the journal of a folder in this process."""
-    from harness.journal import read_journal
+    from harness.results.journal import read_journal
 
     start = process_time()
     records = read_journal(Path(folder))

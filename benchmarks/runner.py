@@ -17,14 +17,14 @@ from pathlib import Path
 from statistics import median, quantiles
 from time import perf_counter
 
-from harness.block import Commands
-from harness.journal import read_journal
-from harness.measure import SAMPLE_SECONDS, memory_mib
 from harness.names import CaseName
-from harness.pairs import paired_ratio
 from harness.registry import SolverSpec, load_plugin, resolve
-from harness.run import run
-from harness.suite import NULL, Suite
+from harness.results.journal import read_journal
+from harness.results.work_unit import Commands
+from harness.running.pairs import paired_ratio
+from harness.running.run import run
+from harness.suite.suite import NULL, Suite
+from harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests" / "adversaries.py"
 ATTACKERS = PLUGIN.with_name("attackers.py")

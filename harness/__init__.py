@@ -1,15 +1,15 @@
 """The contract between problems, solvers and reports, and the clock."""
 
 from harness.about import About
-from harness.certificate import Certificate, UncertifiableError, certify
 from harness.errors import InputError
-from harness.kkt import Residuals, kkt_residuals, verdict
 from harness.limits import memory_limit_mib, too_large
 from harness.mechanics import Grid, Mechanics
 from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
 from harness.solution import Solution, Status
+from harness.verify.certificate import Certificate, UncertifiableError, certify
+from harness.verify.kkt import Residuals, kkt_residuals, verdict
 
 __all__ = [
     "QP",

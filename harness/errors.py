@@ -1,10 +1,12 @@
-"""What we tell a user whose input was wrong."""
+"""What a user is told: errors of the input, faults, remarks beside the results."""
 
 from __future__ import annotations
 
 import os
 import re
+import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from difflib import get_close_matches
 
 MOST_SHOWN = 200  #: characters of somebody's input that a message repeats
@@ -87,3 +89,9 @@ def some(names: Iterable[str], most: int = 3) -> str:
     """Enumerate the first few of `names`, and say how many more there are."""
     first, rest = (listed := list(names))[:most], len(listed) - most
     return ", ".join(map(shortened, first)) + (f" and {rest} more" if rest > 0 else "")
+
+
+def say(text: str) -> None:
+    """Say something on stderr, beside the results."""
+    with suppress(BrokenPipeError):  # nobody listens: no reason to stop
+        print(f"mortarbench: {text}", file=sys.stderr)

@@ -1,7 +1,7 @@
 """The elastic problem behind a QP of any form: what a certificate of errors needs.
 
 A family that gives it with its case (`harness.plugin.Case`) has every answer certified,
-whatever form of the problem the solver was handed; see `harness.certificate`.
+whatever form of the problem the solver was handed; see `harness.verify.certificate`.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class RigidMotions(NamedTuple):
 
     Columns are orthonormal in extended precision. K·felt would be zero without
     rounding; what there is instead matters where bodies move far, see
-    `harness.certificate`.
+    `harness.verify.certificate`.
     """
 
     felt: Any  #: (n, p) sparse; contact rows open or close
@@ -101,7 +101,9 @@ class Mechanics:
     names: tuple[str, ...] = ()  #: of the bodies; the columns of `rigid` are in turn
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
-    grid: Grid | None = None  #: to compare meshes, see `harness.discretisation`
+    grid: Grid | None = (
+        None  #: to compare meshes, see `harness.crossval.discretisation`
+    )
 
     @cached_property
     def inverse(self) -> Inverse:

@@ -102,6 +102,7 @@ class Family(Protocol):
         ``path_suffix`` takes a file; see `harness.names`.
 
         One with ``refined(params) -> params`` says which case has every cell halved,
-        for `harness.discretisation`; its mechanics have a grid. A text ``singular``
-        says why refinement has no limit of finite energy, where it has none.
+        for `harness.crossval.discretisation`; its mechanics have a grid. A text
+        ``singular`` says why refinement has no limit of finite energy, where it has
+        none.
         """

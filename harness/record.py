@@ -100,15 +100,17 @@ class Record:
     mode: str = "cold"  #: or "sequence": may use what earlier steps left
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
     arm: str = ""  #: "null": the same solver once more, to show the noise
-    primal: float | None = None  #: the four scale-free residuals of harness.kkt
+    primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
     #: "reference" where `optimum_error` decided the status, and not the residuals
     decided_by: str = "residuals"
-    optimum_error: float | None = None  #: against the proven optimum, harness.optimum
+    optimum_error: float | None = (
+        None  #: against the proven optimum, harness.verify.optimum
+    )
     energy_bound: float | None = None  #: certified relative error, energy norm
-    #: what it is made of, as relative; see `harness.judge.certified`
+    #: what it is made of, as relative; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI

@@ -18,17 +18,9 @@ from threading import Timer
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import (
-    QP,
-    Case,
-    Fields,
-    InputError,
-    Solution,
-    Status,
-    generator,
-    no_rows,
-)
-from harness.worker import serve
+from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from harness.processes import case_worker as generator
+from harness.processes.worker import serve
 
 
 @dataclass(frozen=True)

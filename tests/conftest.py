@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from harness import QP, Solution
-from harness.planted import planted as drawn
+from harness.conformance.manufactured import planted as drawn
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -32,5 +32,5 @@ def state(tmp_path_factory):
 
 @pytest.fixture
 def planted() -> Callable[..., tuple[QP, Solution]]:
-    """Factory: ``planted(shape, seed=…, dense=False, n=20)``, see `harness.planted`."""
+    """Factory: ``planted(shape, seed=…, dense=False, n=20)``; see `manufactured`."""
     return drawn

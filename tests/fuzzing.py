@@ -12,9 +12,9 @@ from scipy.io import savemat
 from scipy.sparse import csc_array, random_array
 
 from harness import QP, InputError
-from harness.matfile import save_mat
-from harness.parquetfile import save_parquet
-from harness.qpfile import save_qp
+from harness.files.matfile import save_mat
+from harness.files.parquetfile import save_parquet
+from harness.files.qpfile import save_qp
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import eye_array, tril
 
 from harness import QP, Case, Solution, Status, no_rows
-from harness.planted import membrane
+from harness.conformance.manufactured import membrane
 from solvers.common.conversion import csc
 from solvers.reference.solve import reference_solution
 

@@ -13,22 +13,23 @@ from pathlib import Path
 
 import pytest
 
-from harness import Solution, Status, Verdict, supervisor
-from harness.block import Commands
+from harness import Solution, Status, Verdict
 from harness.errors import FaultError
-from harness.journal import read_journal
-from harness.judge import blank
-from harness.measure import SAMPLE_SECONDS
+from harness.files.qpfile import save_qp
 from harness.names import CaseName
-from harness.optimum import proves
-from harness.qpfile import save_qp
-from harness.reaper import lives
+from harness.processes import supervisor
+from harness.processes.measurement import _believed, measured, scratch_folder
+from harness.processes.protocol import ForeignReplyError, checked_answer, event_of
+from harness.processes.reaper import lives
+from harness.processes.supervisor import REPLACED, Clock, Reply, WorkerProcess
 from harness.registry import SolverSpec, load_plugin, resolve
-from harness.remote import _believed, measured, scratch_folder
-from harness.run import run
-from harness.serving import ForeignReplyError, checked_answer, event_of
-from harness.suite import Suite
-from harness.supervisor import REPLACED, Clock, Reply, WorkerProcess
+from harness.results.journal import read_journal
+from harness.results.work_unit import Commands
+from harness.running.run import run
+from harness.suite.suite import Suite
+from harness.verify.measure import SAMPLE_SECONDS
+from harness.verify.optimum import proves
+from harness.verify.verdicts import blank
 from solvers.reference.solve import reference_solution
 
 PLUGIN = Path(__file__).with_name("attackers.py")
@@ -449,7 +450,7 @@ def test_a_qp_that_changed_on_disk_is_a_fault(bench):
 def test_a_full_disk_is_a_fault_and_no_crash(bench):
     limit = (
         "import resource, signal, runpy, sys\n"
-        "import harness.worker as w\n"
+        "import harness.processes.worker as w\n"
         "def full(*_): raise OSError(28, 'No space left on device')\n"
         "w._write_new = full\n"
         f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"

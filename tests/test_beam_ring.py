@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from harness import InputError, kkt_residuals
-from harness.suite import load_suite
-from harness.workbench import SUITES
+from harness.suite.suite import load_suite
+from mortarbench.cli.registries import SUITES
 from problems.contact.bodies import clamped, floating
 from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dual_bounds, dualise

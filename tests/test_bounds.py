@@ -6,15 +6,15 @@ import os
 import pytest
 
 from harness import InputError
-from harness.__main__ import _workbench
-from harness.cli import main
 from harness.errors import one_line, shown
-from harness.journal import read_journal
+from harness.files.reading import VARIABLE, read_json, read_toml, toml
 from harness.limits import CASE_VARIABLE
 from harness.names import canonical, parse
-from harness.reading import VARIABLE, read_json, read_toml, toml
 from harness.record import Record, Verdict
-from harness.suite import load_suite
+from harness.results.journal import read_journal
+from harness.suite.suite import load_suite
+from mortarbench.__main__ import _workbench
+from mortarbench.cli.main import main
 from problems import PROBLEMS
 from solvers import SOLVERS
 

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from harness.cases import entry, user_key
 from harness.names import CaseName
+from harness.processes.case_folder import entry, user_key
 
 
 def name(**params):
@@ -87,7 +87,9 @@ def test_a_build_that_fails_leaves_no_entry(get, tmp_path):
 def test_an_entry_that_another_user_signed_is_built_again(get, monkeypatch):
     """A folder that was sent could hold another QP under the name of the case."""
     get(name(n=1), content=b"forged")
-    monkeypatch.setattr("harness.cases.user_key", lambda: b"of another user")
+    monkeypatch.setattr(
+        "harness.processes.case_folder.user_key", lambda: b"of another user"
+    )
 
     assert get(name(n=1)).qp.read_bytes() == b"content"
     assert len(get.made) == 2

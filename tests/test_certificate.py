@@ -9,14 +9,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import Mechanics, Solution, Status, UncertifiableError, certify, generator
+from harness import Mechanics, Solution, Status, UncertifiableError, certify
 from harness.build import build
-from harness.certificate import Certificate
-from harness.judge import certified, has_point
+from harness.files.store import write_point
 from harness.mechanics import Extended, Real
 from harness.names import parse
-from harness.references import ReferencePoint, reference_point
-from harness.store import write_point
+from harness.processes import case_worker as generator
+from harness.verify.certificate import Certificate
+from harness.verify.references import ReferencePoint, reference_point
+from harness.verify.verdicts import certified, has_point
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

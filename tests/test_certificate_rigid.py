@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from harness import Case, Solution, Status, UncertifiableError, certify
-from harness.admissible import _newton, admissible, balanced
 from harness.build import build
-from harness.certificate import Certificate, _Reach, _rounding
-from harness.kkt import kkt_residuals
 from harness.mechanics import Extended, Mechanics, Real, _cancelling
 from harness.names import parse
-from harness.references import reference_point
+from harness.verify.admissible import _newton, admissible, balanced
+from harness.verify.certificate import Certificate, _Reach, _rounding
+from harness.verify.kkt import kkt_residuals
+from harness.verify.references import reference_point
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports import write_comparison
 from reports.compare.changes import (
     Mean,

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from harness.cli import main
-from harness.journal import Journal, read_journal
-from harness.progress import shown_on
-from harness.qpfile import load_qp
-from harness.reaper import lives
+from harness.files.qpfile import load_qp
+from harness.processes.reaper import lives
 from harness.registry import load_plugin
-from harness.workbench import Workbench
+from harness.results.journal import Journal, read_journal
+from harness.running.progress import shown_on
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 
 WELLS = Path(__file__).with_name("wells.py")
 SOLVERS = load_plugin(WELLS).solvers

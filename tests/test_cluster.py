@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from harness import InputError
-from harness.cli import main
-from harness.environment import capture, digest
-from harness.folder import environment_of
-from harness.journal import read_journal
+from harness.environment.environment import capture, digest
 from harness.registry import load_plugin
-from harness.workbench import Workbench
+from harness.results.folder import environment_of
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 
 pytest.importorskip("distributed")
 
@@ -235,7 +235,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
 
 
 def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
-    monkeypatch.setattr("harness.cluster.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", ""):
         code, _, err = cli("run", "wells.toml", "--out", "d", "--dask", address)
         assert code == 2
@@ -303,7 +303,8 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     worker = cluster.join()
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import wells; "
-        "from harness.cli import main; from harness.workbench import Workbench; "
+        "from mortarbench.cli.main import main; "
+        "from mortarbench.cli.registries import Workbench; "
         "nothing = dict.fromkeys(('reference', 'plot', 'vtu', 'series', 'paper')); "
         "main(Workbench(families=wells.PROBLEMS, solvers=wells.SOLVERS, "
         "report=lambda *_: [], start=(sys.executable, '-P', wells.__file__), "
@@ -345,7 +346,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 @pytest.fixture
 def meet():
     """What a parent does with the environment of a node; what it keeps and says."""
-    from harness.cluster import Nodes
+    from harness.running.cluster import Nodes
 
     kept, said = {}, []
     here = capture()

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from harness import InputError, Verdict
-from harness.cli import main
-from harness.cluster import on_cluster
 from harness.registry import load_plugin
-from harness.workbench import Workbench
+from harness.running.cluster import on_cluster
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from tests.test_cluster import Cluster, measured
 
 WELLS = Path(__file__).with_name("wells.py")

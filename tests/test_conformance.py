@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness import Solution, Status, examine, kkt_residuals
-from harness.conformance import CHECKS, KEEPS, Grade, run_check
-from harness.equivalence import (
+from harness import Solution, Status, kkt_residuals
+from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from harness.conformance.equivalence import (
     CHANGES,
     DeclinedError,
     WeakError,
@@ -22,8 +22,9 @@ from harness.equivalence import (
     changes_of,
     same_answer,
 )
-from harness.planted import FORMS, SHAPES, planted, strings
-from harness.weaknesses import line_of
+from harness.conformance.manufactured import FORMS, SHAPES, planted, strings
+from harness.conformance.weaknesses import line_of
+from mortarbench.cli import test_solver as examine
 from solvers import SOLVERS
 
 #: backends that stand for the wildcard entries of the registry; the others are slow
@@ -387,7 +388,7 @@ def plugin(tmp_path):
 
 
 def command(*arguments):
-    from harness.__main__ import main
+    from mortarbench.__main__ import main
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["mortarbench", *map(str, arguments)])

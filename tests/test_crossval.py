@@ -10,22 +10,22 @@ import pytest
 from scipy.sparse import csc_array
 
 from harness import QP, Case, Mechanics, Solution, Status, no_rows
-from harness.assessment import assess, distances, energy_allowed
 from harness.build import build
-from harness.cli import main
-from harness.crossval import brief, compared
-from harness.discretisation import read_discretisation
-from harness.journal import Journal, read_journal
-from harness.judge import blank, judged
-from harness.measure import Measurement
+from harness.crossval.assessment import assess, distances, energy_allowed
+from harness.crossval.comparison import brief, compared
+from harness.crossval.discretisation import read_discretisation
+from harness.crossval.ground_truth import Given, truth_of
+from harness.files.qpfile import qp_digest, save_qp
+from harness.files.store import save_solution, write_point
 from harness.names import canonical, parse
-from harness.qpfile import qp_digest, save_qp
 from harness.record import Verdict
-from harness.references import reference_point
 from harness.registry import SolverSpec, load_plugin
-from harness.store import save_solution, write_point
-from harness.truth import Given, truth_of
-from harness.workbench import Workbench
+from harness.results.journal import Journal, read_journal
+from harness.verify.measure import Measurement
+from harness.verify.references import reference_point
+from harness.verify.verdicts import blank, judged
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from reports.validation.report import write_validation
 from solvers.reference.solve import reference_solution
@@ -349,7 +349,7 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     def doubtful(*args):
         return truth_of(*args)._replace(doubt=np.inf)
 
-    monkeypatch.setattr("harness.crossval.truth_of", doubtful)
+    monkeypatch.setattr("harness.crossval.comparison.truth_of", doubtful)
     case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
     s = pushed((1.5, 0.0))
     answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]

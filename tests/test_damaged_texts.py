@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from harness import InputError
-from harness.__main__ import _workbench
-from harness.cli import main
-from harness.folder import environment_of
-from harness.journal import read_journal
 from harness.names import canonical, parse
-from harness.suite import load_suite
+from harness.results.folder import environment_of
+from harness.results.journal import read_journal
+from harness.suite.suite import load_suite
+from mortarbench.__main__ import _workbench
+from mortarbench.cli.main import main
 from problems import PROBLEMS
 from problems.families.description import described_bodies
 from reports.data.evidence import read_evidence

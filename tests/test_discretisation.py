@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from harness import InputError
-from harness.discretisation import (
+from harness.crossval.discretisation import (
     FILE,
     MOST_UNKNOWNS,
     Level,
@@ -20,9 +20,9 @@ from harness.discretisation import (
     estimated,
     read_discretisation,
 )
-from harness.halving import prolongation
+from harness.crossval.mesh_refinement import prolongation
 from harness.names import completed, parse
-from harness.references import reference_point
+from harness.verify.references import reference_point
 from problems import PROBLEMS
 from problems.families.hertz import halved
 from problems.families.obstacle import exact_energy, exact_height, obstacle_problem

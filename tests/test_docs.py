@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 from harness import kkt_residuals
-from harness.describe import about, solvers_page
 from harness.registry import load_plugin
+from mortarbench.cli.list_ import about, solvers_page
 from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from harness import __main__ as root
+from mortarbench import __main__ as root
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

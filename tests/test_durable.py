@@ -14,20 +14,21 @@ from pathlib import Path
 
 import pytest
 
-from harness import InputError, remote
-from harness.cli import main
-from harness.durable import (
+from harness import InputError
+from harness.errors import FaultError
+from harness.files.durable import (
     Lines,
     full_disk_told,
     refuse_full_disk,
     remove_unfinished,
     replace_file,
 )
-from harness.errors import FaultError
-from harness.faults import FAULTS, Fault, in_words, left, read_faults
-from harness.folder import Held, refuse_foreign
+from harness.processes import measurement as remote
 from harness.registry import load_plugin
-from harness.workbench import Workbench
+from harness.results.faults import FAULTS, Fault, in_words, left, read_faults
+from harness.results.folder import Held, refuse_foreign
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from reports.data.evidence import read_evidence
 from reports.sections.summary import summary
 
@@ -304,7 +305,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
             raise FaultError("the worker could not be started")
         return remote.measured(worker, qp, record, request, **limits)
 
-    monkeypatch.setattr("harness.station.measured", measured)
+    monkeypatch.setattr("harness.running.executor.measured", measured)
     code, out, err = cli("run", "wells.toml", "--out", "d")
     told = "2 measurements could not be made, by no fault of a solver: the worker could"
 
@@ -327,7 +328,7 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
     def measured(*_, **__):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("harness.station.measured", measured)
+    monkeypatch.setattr("harness.running.executor.measured", measured)
     with pytest.raises(SystemExit) as e:
         cli("run", "wells.toml", "--out", "d")
 

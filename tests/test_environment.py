@@ -17,9 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.doctor import Level, as_json, examine, render
-from harness.environment import capture, capture_in, digest, source, system_blas
-from harness.noise import NoiseFloor, noise_floor
+from harness.environment.doctor import Level, as_json, examine, render
+from harness.environment.environment import (
+    capture,
+    capture_in,
+    digest,
+    source,
+    system_blas,
+)
+from harness.environment.noise import NoiseFloor, noise_floor
 
 ROOT = Path(__file__).resolve().parents[1]
 DEBIAN = "/usr/lib/x86_64-linux-gnu"

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from harness.cli import main
-from harness.workbench import Workbench
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

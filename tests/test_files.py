@@ -10,11 +10,11 @@ from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, vstack
 
 from harness import InputError, kkt_residuals
-from harness.cli import main
+from harness.files.qpfile import load_qp, save_qp
 from harness.names import assemble, canonical, parse
-from harness.qpfile import load_qp, save_qp
 from harness.registry import SolverSpec, resolve
-from harness.workbench import Workbench
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from problems.files.qps import parse_qps
 from problems.files.two_sided import one_sided

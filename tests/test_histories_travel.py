@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from harness import InputError, Solution, Status
-from harness.cli import main
-from harness.journal import read_journal
-from harness.measure import measure
+from harness.files.store import load_history, load_solution, save, save_solution
 from harness.registry import load_plugin
-from harness.show import convergence
-from harness.store import load_history, load_solution, save, save_solution
-from harness.workbench import Workbench
+from harness.results.journal import read_journal
+from harness.verify.measure import measure
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
+from mortarbench.cli.text import convergence
 
 DESCENTS = Path(__file__).with_name("descents.py")
 WELLS = Path(__file__).with_name("wells.py")

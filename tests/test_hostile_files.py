@@ -18,12 +18,12 @@ from scipy.io import savemat
 from scipy.sparse import csc_array, csc_matrix
 
 from harness import QP, InputError, no_rows
-from harness.cli import main
-from harness.datafile import VARIABLE
-from harness.parquetfile import save_parquet
-from harness.qpfile import load_qp, save_qp
+from harness.files.datafile import VARIABLE
+from harness.files.parquetfile import save_parquet
+from harness.files.qpfile import load_qp, save_qp
 from harness.recipe import Recipe
-from harness.workbench import Workbench
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
 from solvers import SOLVERS
@@ -111,7 +111,8 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     """A request without a digest: the file may be anybody's."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
-        "import os, sys; from harness.worker import _Bench; qp, out = sys.argv[1:]; "
+        "import os, sys; from harness.processes.worker import _Bench; "
+        "qp, out = sys.argv[1:]; "
         "bench = _Bench(None, {'subprocess:call': os.abort}); "
         "bench.answer({'qp': qp, 'out': out}, None)"
     )

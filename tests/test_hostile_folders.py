@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.cli import main
-from harness.folder import environment_of
-from harness.journal import Journal
-from harness.store import load_fields, load_history, load_solution, save
-from harness.workbench import Workbench
+from harness.files.store import load_fields, load_history, load_solution, save
+from harness.results.folder import environment_of
+from harness.results.journal import Journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from reports import write_report
 from solvers import SOLVERS

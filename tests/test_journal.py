@@ -6,10 +6,10 @@ import shutil
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.journal import Journal, read_journal
-from harness.judge import blank
 from harness.names import CaseName
 from harness.registry import SolverSpec
+from harness.results.journal import Journal, read_journal
+from harness.verify.verdicts import blank
 
 
 def record(run_id, **changes):

@@ -9,11 +9,11 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Solution, Status, Verdict
-from harness.certificate import UncertifiableError
-from harness.judge import blank, certified, judged, quantities_of
-from harness.measure import Measurement
 from harness.names import CaseName
 from harness.registry import SolverSpec
+from harness.verify.certificate import UncertifiableError
+from harness.verify.measure import Measurement
+from harness.verify.verdicts import blank, certified, judged, quantities_of
 
 #: min ½(x₁² + x₂²) − x₁ − x₂, x₁ + x₂ = 1, x₁ ≤ ¼, x ≥ 0: (¼, ¾), y = ¼, z = ½
 QP_ = QP(
@@ -136,8 +136,8 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
         raise UncertifiableError("no admissible pair")
 
     looks = iter([10.0, 12.0])
-    monkeypatch.setattr("harness.judge.certify", certify)
-    monkeypatch.setattr("harness.judge.perf_counter", lambda: next(looks))
+    monkeypatch.setattr("harness.verify.verdicts.certify", certify)
+    monkeypatch.setattr("harness.verify.verdicts.perf_counter", lambda: next(looks))
     fields, note = certified(case(mechanics=SimpleNamespace(back=lambda s: s)), POINT)
 
     assert fields.pop("certify_seconds") == 2.0

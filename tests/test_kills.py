@@ -13,7 +13,7 @@ from unittest.mock import ANY
 
 import pytest
 
-from harness.journal import read_journal
+from harness.results.journal import read_journal
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
 SUITE = """
@@ -34,11 +34,11 @@ RUNS = f"""
 import sys
 from pathlib import Path
 from harness import InputError
-from harness.block import Commands
-from harness.progress import shown_on
+from harness.results.work_unit import Commands
+from harness.running.progress import shown_on
 from harness.registry import load_plugin, resolve
-from harness.run import run
-from harness.suite import load_suite
+from harness.running.run import run
+from harness.suite.suite import load_suite
 
 start = [sys.executable, "-P", {str(PLUGIN)!r}]
 plugin = load_plugin(Path({str(PLUGIN)!r}))

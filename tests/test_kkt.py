@@ -17,7 +17,7 @@ from harness import (
     no_rows,
     verdict,
 )
-from harness.planted import planted
+from harness.conformance.manufactured import planted
 from problems.families.beam_ring import BeamRing
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP

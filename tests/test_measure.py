@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import harness.measure
+import harness.verify.measure
 from harness import Status
-from harness.measure import measure
 from harness.registry import load_plugin
+from harness.verify.measure import measure
 
 PLUGIN = load_plugin(Path(__file__).with_name("adversaries.py"))
 
@@ -73,7 +73,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
             return moving
 
-    clock = sys.modules["harness.measure"]
+    clock = sys.modules["harness.verify.measure"]
     monkeypatch.setattr(clock, "perf_counter", lambda: now[0])
     m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds)
 
@@ -131,7 +131,7 @@ def test_garbage_is_not_collected_while_the_clock_runs(qp):
 
 
 def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
-    monkeypatch.setattr(harness.measure, "_inner", lambda *_: 3)
+    monkeypatch.setattr(harness.verify.measure, "_inner", lambda *_: 3)
     seen = []
 
     class Sees(type(PLUGIN.solvers["honest"])):
@@ -158,7 +158,7 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
         def declines(self, qp):
             asked.append(next(clock))
 
-    monkeypatch.setattr(harness.measure, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(harness.verify.measure, "perf_counter", lambda: next(clock))
     m = measure(Asks(), qp, 1e-6)
 
     assert asked == [1]  # the clock had been read once
@@ -171,7 +171,7 @@ def test_processes_of_runs_import_nothing_that_they_never_call():
         "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.spatial",
         "matplotlib", "pandas", "pyarrow", "distributed", "rich",
     }  # fmt: skip
-    program = "import sys, harness.__main__; print(*sys.modules)"
+    program = "import sys, mortarbench.__main__; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-P", "-c", program],
         capture_output=True,

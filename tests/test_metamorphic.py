@@ -7,8 +7,9 @@ import pytest
 from scipy.sparse.linalg import aslinearoperator
 
 from harness import QP, Solution, Status, kkt_residuals, verdict
-from harness.equivalence import CHANGES, changes_of
-from harness.metamorphic import (
+from harness.conformance.equivalence import CHANGES, changes_of
+from harness.conformance.manufactured import FORMS, SHAPES, strings
+from harness.conformance.metamorphic import (
     change_units,
     duplicate_rows,
     mirror,
@@ -17,7 +18,6 @@ from harness.metamorphic import (
     scale_rows,
     shift_unknowns,
 )
-from harness.planted import FORMS, SHAPES, strings
 from solvers.adapters.piqp_ import PIQP
 
 
@@ -140,7 +140,7 @@ def test_what_is_violated_stays_violated(planted, transform, shape):
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
 def test_names_and_units_change_no_residual_at_any_point(planted, transform, shape):
-    """What harness.kkt promises, at good and bad points and where there is none."""
+    """What `harness.verify.kkt` promises, at good and bad points, and at none."""
     qp, expected = planted(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)

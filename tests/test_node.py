@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import pytest
 
 from harness import InputError
-from harness.node import own_cpu
+from harness.running.dask_worker import own_cpu
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Status, no_rows
-from harness.measure import measure
-from harness.npz import ALIGNMENT, mapped, write_mappable
-from harness.qpfile import load_qp, save_qp
+from harness.files.npz import ALIGNMENT, mapped, write_mappable
+from harness.files.qpfile import load_qp, save_qp
 from harness.recipe import Recipe
+from harness.verify.measure import measure
 
 ARRAYS = {
     "vector": np.arange(5.0),

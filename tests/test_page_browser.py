@@ -12,7 +12,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from harness import Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports.compare.changes import compare
 from reports.compare.page import compose as comparison
 from reports.data.evidence import read_evidence

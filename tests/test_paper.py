@@ -13,8 +13,8 @@ import pytest
 from matplotlib import image
 
 from harness import InputError, Record, Verdict
-from harness.experiment import Experiment, load_experiment, save_experiment
-from harness.journal import Journal
+from harness.files.experiment import Experiment, load_experiment, save_experiment
+from harness.results.journal import Journal
 from problems.experiments import QUICK, paper_experiment
 from problems.experiments.analysis import WAYS, analyse
 from problems.experiments.clock import Rounds, Stopwatch, race, whole

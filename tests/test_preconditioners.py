@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Status, Structure, kkt_residuals, no_rows
-from harness.qpfile import load_qp, save_qp
+from harness.files.qpfile import load_qp, save_qp
 from problems import PROBLEMS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.preconditioner import face_preconditioner

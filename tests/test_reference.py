@@ -10,8 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
 from harness import QP, kkt_residuals, no_rows
-from harness.names import completed
-from harness.planted import (
+from harness.conformance.manufactured import (
     SHAPES,
     infeasible,
     membrane,
@@ -19,6 +18,7 @@ from harness.planted import (
     planted,
     unbounded,
 )
+from harness.names import completed
 from problems import PROBLEMS
 from solvers.reference.equilibrate import equilibrated
 from solvers.reference.interior import interior_point
@@ -385,7 +385,7 @@ import sys, types
 bare = types.ModuleType("solvers")  # solvers/__init__.py names every solver under test
 bare.__path__ = [sys.argv[1]]
 sys.modules["solvers"] = bare
-from harness.planted import planted
+from harness.conformance.manufactured import planted
 from solvers.reference.solve import reference_solution
 for shape in ("everything", "singular", "bounds"):
     for dense in (False, True):

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness import Record, Status, Verdict
-from harness.cli import main
-from harness.journal import Journal, read_journal
-from harness.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
-from harness.workbench import Workbench
+from harness.results.journal import Journal, read_journal
+from harness.verify.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.cli import main
-from harness.journal import read_journal
-from harness.qpfile import load_qp, save_qp
+from harness.files.qpfile import load_qp, save_qp
 from harness.registry import load_plugin
-from harness.workbench import Workbench
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 
 #: one process has the run that all replay
 pytestmark = pytest.mark.xdist_group("replay")

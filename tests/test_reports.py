@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from harness import Fields, InputError, Record, Verdict
-from harness.journal import Journal
-from harness.store import save_fields
+from harness.files.store import save_fields
+from harness.results.journal import Journal
 from reports import write_report
 from reports.data.evidence import Evidence, arrange
 from reports.data.size_series import size_series

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.discretisation import FILE, Discretisation, Level
+from harness.crossval.discretisation import FILE, Discretisation, Level
 from reports.data.evidence import Evidence, arrange
 from reports.data.time_at_accuracy import time_at, time_at_accuracy
 from reports.folder import compose

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from harness import Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports import write_report
 from reports.data.evidence import Evidence, arrange
 from reports.data.size_series import size_series

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from harness import Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports import write_report
 from reports.data.aggregation import ranking_of
 from reports.data.comparison_groups import comparison_groups

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from harness import Record, Solution, Status, Verdict
-from harness.journal import Journal
-from harness.store import save_solution
+from harness.files.store import save_solution
+from harness.results.journal import Journal
 from reports import write_report
 from reports.data.evidence import read_evidence
 from reports.data.histories import MOST, chosen

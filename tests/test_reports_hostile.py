@@ -7,7 +7,7 @@ import unicodedata
 import pytest
 
 from harness import Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports import write_report
 from reports.document.formatting import clean
 from reports.render.latex import escaped as tex

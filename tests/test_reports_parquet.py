@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from harness import Record, Verdict
-from harness.journal import Journal
+from harness.results.journal import Journal
 from reports import write_report
 
 NESTED = {"params", "sizes", "options", "counts", "reported", "quantities"}

@@ -15,16 +15,17 @@ from pathlib import Path
 
 import pytest
 
-from harness import InputError, Status, Verdict, remote
-from harness.block import Commands
+from harness import InputError, Status, Verdict
 from harness.errors import FaultError
-from harness.faults import left, read_faults
-from harness.journal import read_journal
+from harness.files.store import load_fields, load_solution
 from harness.names import CaseName
+from harness.processes import measurement as remote
 from harness.registry import SolverSpec, load_plugin, resolve
-from harness.run import run
-from harness.store import load_fields, load_solution
-from harness.suite import Suite
+from harness.results.faults import left, read_faults
+from harness.results.journal import read_journal
+from harness.results.work_unit import Commands
+from harness.running.run import run
+from harness.suite.suite import Suite
 from reports.data.evidence import read_evidence
 from reports.data.size_series import size_series
 
@@ -583,7 +584,8 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
     measure, tmp_path
 ):
     hold = (
-        "import sys; from pathlib import Path; from harness.folder import locked\n"
+        "import sys; from pathlib import Path\n"
+        "from harness.results.folder import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -714,7 +716,7 @@ def faults(monkeypatch):
                 raise FaultError("the worker was killed before its solve")
             return remote.measured(worker, qp, record, request, **limits)
 
-        monkeypatch.setattr("harness.station.measured", measured)
+        monkeypatch.setattr("harness.running.executor.measured", measured)
 
     return faults
 

@@ -7,10 +7,10 @@ import pytest
 
 from harness import Verdict
 from harness.names import CaseName
-from harness.pairs import paired_ratio, widest
 from harness.registry import SolverSpec
-from harness.schedule import Schedule
-from harness.suite import Suite
+from harness.running.pairs import paired_ratio, widest
+from harness.running.schedule import Schedule
+from harness.suite.suite import Suite
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
 from harness import QP, Status, kkt_residuals
-from harness.planted import infeasible, one_of_each, unbounded
+from harness.conformance.manufactured import infeasible, one_of_each, unbounded
 from harness.registry import options_of
 from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS

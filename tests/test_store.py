@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from harness import Fields, InputError, Solution, Status
-from harness.store import load_fields, load_solution, save_fields, save_solution
+from harness.files.store import load_fields, load_solution, save_fields, save_solution
 
 
 @pytest.fixture

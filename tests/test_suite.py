@@ -10,11 +10,11 @@ import pytest
 import problems
 import solvers
 from harness import InputError
-from harness.__main__ import BEYOND
 from harness.names import canonical
-from harness.overrides import with_overrides
 from harness.registry import SolverSpec
-from harness.suite import load_suite
+from harness.suite.overrides import with_overrides
+from harness.suite.suite import load_suite
+from mortarbench.__main__ import BEYOND
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from select import select
 
 import pytest
 
-from harness import Verdict, supervisor
-from harness.qpfile import save_qp
-from harness.reaper import descendants
+from harness import Verdict
+from harness.files.qpfile import save_qp
+from harness.processes import supervisor
+from harness.processes.reaper import descendants
+from harness.processes.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
 from harness.registry import load_plugin
-from harness.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
 
 PLUGIN = Path(__file__).with_name("adversaries.py")
 
@@ -41,7 +42,7 @@ for line in os.fdopen(requests):
 ASKS = """
 import json, sys
 from pathlib import Path
-from harness.supervisor import WorkerProcess
+from harness.processes.supervisor import WorkerProcess
 command, request, log = map(json.loads, sys.argv[1:])
 WorkerProcess(command, Path(log)).ask(request, time_limit=60, memory_limit=2000)
 """

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdict
-from harness.hard import KINDS, hard
-from harness.judge import judged
-from harness.kkt import Residuals, rejudged, widths
-from harness.measure import Measurement
-from harness.optimum import decided, exact_value, proven_optimum, proves
+from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
+from harness.verify.kkt import Residuals, rejudged, widths
+from harness.verify.measure import Measurement
+from harness.verify.optimum import decided, exact_value, proven_optimum, proves
+from harness.verify.verdicts import judged
 from solvers.reference.solve import reference_solution
 
 TOL = 1e-8

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from harness import Fields, InputError
-from harness.cli import main
-from harness.qpfile import save_qp
-from harness.workbench import Workbench
+from harness.files.qpfile import save_qp
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 from problems import PROBLEMS
 from reports.export.vtu import write_series, write_vtu
 from solvers import SOLVERS

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
-from harness.cli import main
-from harness.workbench import Workbench
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Workbench
 
 FAULTS = {
     13: KeyboardInterrupt(),

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from harness import Reference
-from harness.experiment import Experiment
+from harness.files.experiment import Experiment
 from problems.experiments.analysis import scaling, states
 from problems.experiments.parts import Rows, assembly, contact, counts, inverse
 from problems.experiments.physics import pressures, stepping, verification

@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from harness import InputError, Value, checked
 from harness.checked import located
 from harness.errors import shown, unknown
-from harness.reading import read_toml
+from harness.files.reading import read_toml
 from problems.contact.bodies import Bodies, ContactPair, assemble
 from problems.contact.linearise import METHODS
 from problems.families.ranges import MOST_STEPS

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from harness import InputError
-from harness.datafile import check_size, opened, parsing
+from harness.files.datafile import check_size, opened, parsing
 from problems.fem.mesh import Nodes
 
 _COPIES = 32  #: of a file that its parser may hold

@@ -6,7 +6,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from harness import InputError, Value
-from harness.datafile import opened
+from harness.files.datafile import opened
 
 _PIECE = 2**20  #: bytes that are read at once
 
@@ -18,7 +18,7 @@ def digest(*paths: Path) -> str:
     ------
     InputError
         When one cannot be read, is no regular file, or is larger than
-        `harness.datafile` allows.
+        `harness.files.datafile` allows.
 
     """
     content = sha256()

@@ -15,11 +15,11 @@ from scipy.sparse import eye_array
 
 from harness import QP, Case, InputError, Reference, Solution, Value
 from harness.checked import is_number, located
-from harness.datafile import check_size, opened
 from harness.errors import unknown
-from harness.matfile import matrix, read_mat, to_qp, vector
-from harness.parquetfile import load_parquet
-from harness.qpfile import load_qp
+from harness.files.datafile import check_size, opened
+from harness.files.matfile import matrix, read_mat, to_qp, vector
+from harness.files.parquetfile import load_parquet
+from harness.files.qpfile import load_qp
 from problems.files.file_digest import check_digest, digest
 from problems.files.qps import parse_qps
 from problems.files.two_sided import TwoSided, one_sided

@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from scipy.stats import norm, t
 
-from harness.pairs import Ratio, paired_ratio
+from harness.running.pairs import Ratio, paired_ratio
 from reports.compare.conditions import hardware
 from reports.data.evidence import SEVERITY, Evidence, Outcome
 from reports.statistics.intervals import COVERAGE

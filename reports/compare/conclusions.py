@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from harness.kkt import VERIFIED_FACTOR
-from harness.pairs import Ratio
+from harness.running.pairs import Ratio
+from harness.verify.kkt import VERIFIED_FACTOR
 from reports.compare.changes import (
     ALIKE,
     Comparison,

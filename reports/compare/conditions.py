@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from harness import InputError
-from harness.folder import differences, environment_of
+from harness.results.folder import differences, environment_of
 from reports.data.evidence import Evidence
 from reports.sections.summary import flatten
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from harness import InputError, Record, Verdict
-from harness.faults import Fault, left, read_faults
-from harness.journal import read_journal
-from harness.kkt import VERIFIED_FACTOR, allowed, rejudged
-from harness.reading import read_json, read_toml
-from harness.show import say
+from harness.errors import say
+from harness.files.reading import read_json, read_toml
+from harness.results.faults import Fault, left, read_faults
+from harness.results.journal import read_journal
+from harness.verify.kkt import VERIFIED_FACTOR, allowed, rejudged
 from reports.statistics.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
@@ -64,7 +64,7 @@ class Outcome:
 
     @property
     def allowed(self) -> float:
-        """The largest residual that verification allows, as `harness.kkt.verdict`."""
+        """The largest residual that verification allows, as `harness.verify.kkt`."""
         at = self.first.tol if self.first.accuracy is None else self.first.accuracy
         return allowed(at, self.factor)
 

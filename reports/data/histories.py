@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import InputError, Record, Vector
+from harness.files.store import load_history
 from harness.history import History
-from harness.store import load_history
 from reports.data.evidence import Evidence, Outcome
 
 MOST = 4  #: cases that are drawn

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from harness.experiment import Experiment
+from harness.files.experiment import Experiment
 from reports.data.evidence import Evidence
 from reports.document.formatting import TIMED, plural
 from reports.document.layout import Picture, Section

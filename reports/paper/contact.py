@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from harness import Fields
-from harness.experiment import Row
+from harness.files.experiment import Row
 from reports.figures.deformed import edges, outlines
 from reports.figures.style import COLOURS, INK, STYLE, log_log, look
 from reports.paper.geometry import FILLS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from harness.experiment import Experiment
+from harness.files.experiment import Experiment
 from reports.paper import published
 from reports.paper.samples import medians
 from reports.paper.timings import pinv_fit

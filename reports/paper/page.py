@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from harness.experiment import Experiment, Row
+from harness.files.experiment import Experiment, Row
 from reports.data.evidence import Evidence
 from reports.document.formatting import clean, seconds, significant
 from reports.document.layout import Page, Picture, Section

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.experiment import load_experiment
+from harness.files.experiment import load_experiment
 from reports.data.evidence import read_evidence
 from reports.export.csv_tables import csv_tables as report_tables
 from reports.figures.saving import save_all

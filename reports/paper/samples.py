@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.experiment import Row
+from harness.files.experiment import Row
 from reports.statistics.intervals import Interval, median_interval
 
 Key = tuple[Any, ...]

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from harness.experiment import Row
+from harness.files.experiment import Row
 from reports.document.formatting import exponent, significant
 from reports.document.layout import Cell, Table
 from reports.figures.style import INK, STYLE, log_log, look

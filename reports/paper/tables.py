@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from harness.experiment import Experiment, Row
+from harness.files.experiment import Experiment, Row
 from reports.document.formatting import clean, seconds, significant
 from reports.document.layout import Cell, Table
 from reports.paper import published

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from harness.experiment import Row
+from harness.files.experiment import Row
 from reports.figures.style import COLOURS, INK, STYLE, log_log, look
 from reports.paper import published
 from reports.paper.samples import Fit, Point, curve, fit

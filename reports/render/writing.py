@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from harness.durable import replace_file
+from harness.files.durable import replace_file
 from reports.document.layout import Page
 from reports.figures.saving import save_all
 from reports.render.html_page import html

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness import Verdict
-from harness.discretisation import Discretisation
+from harness.crossval.discretisation import Discretisation
 from reports.data.evidence import Evidence, Outcome
 from reports.data.time_at_accuracy import (
     SMALLEST,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from harness import Fields, InputError
-from harness.store import load_fields
+from harness.files.store import load_fields
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import clean, tolerance
 from reports.document.layout import Picture, Section

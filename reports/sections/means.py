@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness.pairs import paired_ratio
+from harness.running.pairs import paired_ratio
 from reports.data.aggregation import USUAL, Convention, Ranking, common_cases
 from reports.data.aggregation import geometric_means as means_by
 from reports.data.comparison_groups import CASES, LARGEST_SHIFT, ComparisonGroup

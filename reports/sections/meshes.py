@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from harness.discretisation import Discretisation
+from harness.crossval.discretisation import Discretisation
 from reports.document.formatting import ABSENT, clean, power
 from reports.document.layout import Cell, Table, name_cell
 

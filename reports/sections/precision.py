@@ -11,8 +11,8 @@ from statistics import median
 import numpy as np
 
 from harness import Record
-from harness.pairs import COVERAGE, Ratio, paired_ratio
-from harness.suite import NULL
+from harness.running.pairs import COVERAGE, Ratio, paired_ratio
+from harness.suite.suite import NULL
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, clean, plural, seconds
 from reports.document.layout import Cell, Section, Table, name_cell

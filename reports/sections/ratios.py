@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from statistics import median
 
-from harness.pairs import COVERAGE, paired_ratio
+from harness.running.pairs import COVERAGE, paired_ratio
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, bracketed
 from reports.document.layout import Cell, Section

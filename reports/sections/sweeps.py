@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness import Verdict
-from harness.discretisation import read_discretisation
+from harness.crossval.discretisation import read_discretisation
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, TIMED, clean, seconds, tolerance
 from reports.document.layout import Cell, Picture, Section, Table, name_cell

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import median
 
-from harness.discretisation import Discretisation, read_discretisation
-from harness.pairs import paired_ratio
+from harness.crossval.discretisation import Discretisation, read_discretisation
+from harness.running.pairs import paired_ratio
 from reports.data.evidence import Evidence, Outcome
 from reports.data.time_at_accuracy import counts
 from reports.document.formatting import (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from harness import Verdict
-from harness.discretisation import Discretisation
+from harness.crossval.discretisation import Discretisation
 from reports.document.formatting import ABSENT, VERDICTS, clean, plural, tolerance
 from reports.document.layout import Cell, Page, Picture, Section, Table, name_cell
 from reports.render.html_page import html

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from harness import QP, Solution, Status, kkt_residuals
-from harness.optimum import is_small
+from harness.verify.optimum import is_small
 from solvers.reference.equilibrate import equilibrated
 from solvers.reference.interior import interior_point
 from solvers.reference.polish import polished

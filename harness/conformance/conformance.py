@@ -1,0 +1,286 @@
+"""What every solver must do: the checks of ``mortarbench test-solver``.
+
+Each check is named after what it shows. It passes, fails with what was wrong, or, where
+the solver declines its QP, is declined with the solver's reason. That an equivalent
+formulation changes the answer is told as a weakness; most solvers have one.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from enum import StrEnum
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.linalg import aslinearoperator
+
+from harness.conformance.equivalence import (
+    DeclinedError,
+    WeakError,
+    changes_of,
+    same_answer,
+)
+from harness.conformance.manufactured import (
+    FORMS,
+    SHAPES,
+    infeasible,
+    membrane,
+    one_of_each,
+    planted,
+    unbounded,
+)
+from harness.plugin import Solver
+from harness.qp import QP, Vector
+from harness.solution import Solution, Status
+from harness.verify.kkt import VERIFIED_FACTOR, kkt_residuals
+from harness.verify.measure import measure
+
+FINDS = "finds the planted solution"  #: how the checks begin that need an answer
+KEEPS = "keeps its answer"  #: how those begin that compare equivalent formulations
+ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
+
+
+class Grade(StrEnum):
+    """How a check ended."""
+
+    PASS = "pass"
+    DECLINE = "decline"  #: the solver says that it cannot
+    WEAK = "weak"  #: a weakness, reported; the solver conforms nevertheless
+    FAIL = "fail"
+
+
+class Result(NamedTuple):
+    """How a check ended; why where it did not pass, else a remark if there is one."""
+
+    grade: Grade
+    message: str = ""
+    work: float | None = None  #: iterations, relative to those before a change
+
+
+class BrokenError(Exception):
+    """What a solver did wrong."""
+
+
+#: raises that, DeclinedError or WeakError; where there is a remark, returns it
+Check = Callable[[Solver], Result | None]
+
+
+def run_check(name: str, solver: Solver) -> Result:
+    """Run one of `CHECKS`."""
+    try:
+        return CHECKS[name](solver) or Result(Grade.PASS)
+    except BrokenError as e:
+        return Result(Grade.FAIL, str(e))
+    except DeclinedError as e:
+        return Result(Grade.DECLINE, str(e))
+    except WeakError as e:
+        return Result(Grade.WEAK, str(e))
+
+
+def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
+    """Solve by the harness's own clock, which makes a status of whatever happens."""
+    s = measure(solver, qp, tol).solution
+    if s.status is Status.DECLINED:
+        raise DeclinedError(s.message)
+    return s
+
+
+def _solved(solver: Solver, qp: QP, tol: float, factor: float) -> Solution:
+    """Solve, and insist on a claim of success that holds within `factor`·tol."""
+    s = _solve(solver, qp, tol)
+    _judge(qp, s, factor * tol)
+    return s
+
+
+def _judge(qp: QP, s: Solution, allowed: float) -> None:
+    if s.status is not Status.SOLVED:
+        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+    residuals = kkt_residuals(qp, s)
+    if not residuals.worst <= allowed:
+        values = ", ".join(f"{k} {v:.1e}" for k, v in residuals._asdict().items())
+        raise BrokenError(f"claimed solved, but residuals are {values}; {allowed:g} ok")
+
+
+def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
+    qp, expected = planted(shape, dense=dense)
+    s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
+    objective = qp.objective(expected.x)
+    _near("objective", qp.objective(s.x), objective, 1e-6 * abs(objective))
+    if shape != "singular":
+        _near("x", s.x, expected.x, 1e-6)
+
+
+def _reaches_the_tolerance(shape: str, tol: float, solver: Solver) -> None:
+    _solved(solver, planted(shape, seed=161803)[0], tol, VERIFIED_FACTOR)
+
+
+def _multipliers_have_our_signs(solver: Solver) -> None:
+    qp, expected = one_of_each()
+    s = _solve(solver, qp, 1e-9)
+    for name, value in expected.items():
+        _near(name, getattr(s, name), value, 1e-6)
+
+
+def _absent_bounds_have_no_multipliers(solver: Solver) -> None:
+    qp, _ = planted("some bounds")
+    z_box = _solve(solver, qp, 1e-3).z_box
+    worst = max(
+        (-z_box[np.isinf(qp.lb)]).max(initial=0), z_box[np.isinf(qp.ub)].max(initial=0)
+    )
+    if not worst <= 0:
+        raise BrokenError(f"a multiplier of {worst:.1e} on an absent bound; expected 0")
+
+
+def _repeats_are_cold_and_alike(solver: Solver) -> None:
+    qp, _ = planted("bounds", n=60)
+    first, *others = (_solve(solver, qp, 1e-6) for _ in range(3))
+    if first.status is not Status.SOLVED:
+        raise BrokenError(f"ended as {first.status}: {first.message}")
+    for s in others:
+        if s.iterations != first.iterations:
+            raise BrokenError(f"iterations: {first.iterations}, then {s.iterations}")
+        _near("x of a repeat", s.x, first.x, ROUNDING)
+
+
+def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
+    qp, _ = planted("everything", dense=dense)
+    before = [buffer.copy() for buffer in _buffers(qp)]
+    s = _solve(solver, qp, 1e-6)
+    for buffer, copy in zip(_buffers(qp), before, strict=True):
+        if buffer.flags.writeable or not np.array_equal(buffer, copy):
+            raise BrokenError("changed the QP that it was given")
+    if s.status is not Status.SOLVED:
+        raise BrokenError(f"ended as {s.status}: {s.message}")
+
+
+def _a_misspelt_option_is_refused(solver: Solver) -> None:
+    try:
+        type(solver)(**{"no_such_option": 1})
+    except TypeError:
+        return
+    raise BrokenError("takes any option; expected TypeError for no_such_option")
+
+
+def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> None:
+    s = _solve(solver, problem(), 1e-9)
+    if s.status is Status.SOLVED:
+        raise BrokenError("claims to have solved what has no solution")
+    if not s.message:
+        raise BrokenError(f"ended as {s.status} without a message; expected a reason")
+
+
+def _an_operator_is_taken_or_declined(solver: Solver) -> None:
+    qp, _ = planted("bounds")
+    _solved(solver, replace(qp, P=aslinearoperator(qp.P)), 1e-6, VERIFIED_FACTOR)
+
+
+def _many_bounds_and_no_rows(solver: Solver) -> None:
+    """Catch an optimum claimed at the start, as HiGHS does without any rows."""
+    _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
+
+
+def _runs_in_one_thread(solver: Solver) -> None:
+    """Let no two threads compute: one cannot use more CPU time than passes.
+
+    The process may use all CPUs meanwhile, or two threads would take turns on one.
+    """
+    qp, _ = planted("everything", n=300, dense=True)
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    try:
+        used, passed = time.process_time(), time.perf_counter()
+        s = _solve(solver, qp, 1e-6)
+        used, passed = time.process_time() - used, time.perf_counter() - passed
+    finally:
+        os.sched_setaffinity(0, allowed)
+    if s.status is not Status.SOLVED:
+        raise BrokenError(f"ended as {s.status}: {s.message}")
+    if used > 1.2 * passed + 0.02:
+        raise BrokenError(f"used {used:.2f} s CPU within {passed:.2f} s; one thread?")
+
+
+def _a_sequence_is_solved(solver: Solver) -> None:
+    """Two QPs with the same matrices, one with others, one of another size."""
+    chain = getattr(solver, "chain", None)
+    if chain is None:
+        raise DeclinedError("has no chain()")
+    qps = _sequence()
+    prepare = chain(1e-6)
+    for i, qp in enumerate(qps):
+        if reason := solver.declines(qp):
+            raise DeclinedError(reason)
+        try:
+            _judge(qp, prepare(qp)(), VERIFIED_FACTOR * 1e-6)
+        except BrokenError as e:
+            raise BrokenError(f"QP {i + 1} of the sequence: {e}") from None
+        except ImportError as e:
+            raise DeclinedError(f"not installed: {e.name}") from None
+        except Exception as e:  # the solver's own code
+            message = f"QP {i + 1} of the sequence: {type(e).__name__}: {e}"
+            raise BrokenError(message) from None
+
+
+def _sequence() -> list[QP]:
+    qp, point = planted("everything")
+    shift = 0.1 * np.cos(np.arange(qp.q.size))  # of the solution, the active set kept
+    moved = replace(
+        qp, q=qp.q - qp.P @ shift, b=qp.b + qp.A @ shift, h=qp.h + qp.G @ shift,
+        lb=qp.lb + shift, ub=qp.ub + shift,
+    )  # fmt: skip
+    softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))
+    return [qp, moved, softer, planted("bounds", n=12)[0]]
+
+
+def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
+    before, after = same_answer(form, change, solver)
+    if before is None or after is None:
+        return Result(Grade.PASS)
+    message = f"{after} iterations, {before} as it is"
+    return Result(Grade.PASS, message, after / max(before, 1))
+
+
+def _near(what: str, got: Vector | float, expected: Vector | float, by: float) -> None:
+    error = float(np.max(np.abs(np.subtract(got, expected)), initial=0.0))
+    if not error <= by:
+        raise BrokenError(f"{what} is {error:.1e} off the known one; {by:.1e} is ok")
+
+
+def _buffers(qp: QP) -> Iterator[Vector]:
+    for M in (qp.P, qp.A, qp.G):
+        yield M if isinstance(M, np.ndarray) else M.data
+    yield from (qp.q, qp.b, qp.h, qp.lb, qp.ub)
+
+
+def _all_checks() -> Iterator[tuple[str, Check]]:
+    for shape in SHAPES:
+        for dense in (False, True):
+            stored = "dense" if dense else "sparse"
+            name = f"{FINDS}: {shape}, {stored}"
+            yield name, partial(_finds_the_planted_solution, shape, dense)
+    for shape in SHAPES:
+        for tol in (1e-3, 1e-6):
+            name = f"reaches the tolerance {tol:g}: {shape}"
+            yield name, partial(_reaches_the_tolerance, shape, tol)
+    yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
+    yield "gives multipliers our signs", _multipliers_have_our_signs
+    yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
+    yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike
+    for dense in (False, True):
+        name = f"leaves the problem alone: {'dense' if dense else 'sparse'}"
+        yield name, partial(_the_problem_is_left_alone, dense)
+    yield "refuses a misspelt option", _a_misspelt_option_is_refused
+    yield "claims no success: infeasible", partial(_claims_no_success, infeasible)
+    yield "claims no success: unbounded", partial(_claims_no_success, unbounded)
+    yield "takes or declines an operator", _an_operator_is_taken_or_declined
+    yield "computes in one thread", _runs_in_one_thread
+    yield "solves a sequence", _a_sequence_is_solved
+    for form in FORMS:
+        for change in changes_of(form):
+            yield f"{KEEPS}: {form}, {change}", partial(_keeps_its_answer, form, change)
+
+
+CHECKS: Mapping[str, Check] = dict(_all_checks())

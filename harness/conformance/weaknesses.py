@@ -1,0 +1,95 @@
+"""docs/weaknesses.md: what an equivalent formulation changes, solver by solver."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from harness.conformance.conformance import KEEPS, Grade, Result
+from harness.conformance.equivalence import AS_IT_IS, CHANGES, TOL, UNITS, changes_of
+from harness.conformance.manufactured import FORMS
+
+TOLD = 2.0  #: times the iterations that are worth telling
+
+Results = Mapping[str, Result]  #: of one solver, by the name of the check
+
+HEAD = f"""\
+# What an equivalent formulation changes
+
+Measured by `make weaknesses`, which writes this page; versions are those of
+`constraints.txt`. `mortarbench test-solver NAME` does the same for one solver.
+
+Two strings in contact (`harness.conformance.manufactured.strings`: 42 unknowns, 4
+equality and 23 inequality rows; its dual; its dual with bounds only) are solved at tol
+{TOL:g} without dimensions, then written differently: in other units, in another order,
+with rows scaled by powers of two from 2⁻¹⁰ to 2¹⁰ or written twice, with unknowns
+counted from elsewhere or with the opposite sign. Each is an exact equivalence
+(`harness.conformance.metamorphic`), so verdict and answer should stay.
+
+Units are those of the paper's benchmark, as powers of two. What they multiply:
+
+"""
+
+KEY = """
+"·": every form keeps verdict and answer. ×k: at k times the iterations, at least twice,
+in the worst form. **form**: changed; how, is said below the table. (form): the solver
+declines the changed QP. A blank: it solves no form that this changes.
+"""
+
+
+def weaknesses_page(results: Mapping[str, Results]) -> str:
+    """Tabulate how the checks of equivalent formulations ended, in Markdown."""
+    heads = [change for change in CHANGES if change != AS_IT_IS]
+    lines = [
+        *_units(),
+        KEY,
+        f"| solver | solves | {' | '.join(heads)} |",
+        f"| --- | --- |{' --- |' * len(heads)}",
+    ]
+    for name, checks in results.items():
+        solved = [f for f in FORMS if _grade(checks, f, AS_IT_IS) is Grade.PASS]
+        cells = [
+            ", ".join(solved),
+            *(_cell(checks, solved, change) for change in heads),
+        ]
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    return HEAD + "\n".join([*lines, "", "## How", "", *_told(results)]) + "\n"
+
+
+def line_of(name: str, form: str, change: str) -> str:
+    """Begin the line that tells of a weakness."""
+    return f"- `{name}`, {form}, {change}: "
+
+
+def _units() -> Iterator[str]:
+    yield "| units | K | displacement | force λ | energy |"
+    yield "| --- | --- | --- | --- | --- |"
+    for name, (force, length) in UNITS.items():
+        factors = (force / length, length, force, force * length)
+        yield f"| {name} | {' | '.join(f'{factor:.3g}' for factor in factors)} |"
+
+
+def _grade(checks: Results, form: str, change: str) -> Grade | None:
+    check = checks.get(f"{KEEPS}: {form}, {change}")
+    return check.grade if check else None
+
+
+def _cell(checks: Results, solved: list[str], change: str) -> str:
+    marks = {Grade.WEAK: "**{}**", Grade.DECLINE: "({})"}
+    grades = {f: _grade(checks, f, change) for f in solved if change in changes_of(f)}
+    if not grades:
+        return ""
+    told = [marks[g].format(f) for f, g in grades.items() if g in marks]
+    work = max(checks[f"{KEEPS}: {f}, {change}"].work or 1.0 for f in grades)
+    if work >= TOLD:
+        told.append(f"×{work:.2g}")
+    return ", ".join(told) or "·"
+
+
+def _told(results: Mapping[str, Results]) -> Iterator[str]:
+    """List every weakness with its evidence."""
+    for name, checks in results.items():
+        for form in FORMS:
+            for change in changes_of(form):
+                if _grade(checks, form, change) is Grade.WEAK:
+                    message = checks[f"{KEEPS}: {form}, {change}"].message
+                    yield f"{line_of(name, form, change)}{message}."

@@ -1,0 +1,1 @@
+"""Answers of all solvers held against one another and the truth."""

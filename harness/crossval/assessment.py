@@ -1,0 +1,182 @@
+"""How far an answer is from the truth: numbers that need no other answer.
+
+What is allowed follows from what is claimed. An answer at tolerance t is verified while
+its KKT residuals are at most 10t, and the residual of the gap is g/E with the energy
+E = ‖u*‖². With the identity of Prager and Synge (`harness.verify.certificate`, (2)),
+
+    ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
+
+so that neither the displacement nor the equilibrium u_λ under the contact forces may be
+farther off than √(20t)‖u*‖. The second distance is that of the contact forces in the
+dual norm, ‖Bᵀ(λ − λ*)‖: multipliers themselves need not be unique.
+
+A row is taken to be closed where λᵢDᵢ > gapᵢ with its compliance Dᵢ. That much energy
+moves λᵢDᵢ or gapᵢ by sᵢ = √(20t Dᵢ)‖u*‖: only where both the truth and the answer are
+farther than sᵢ from having neither force nor gap do they contradict each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from harness.mechanics import Exact, Extended, Mechanics, Real
+from harness.qp import QP, Matrix, Vector
+from harness.solution import Solution
+from harness.verify.active_set_refinement import equilibrium
+from harness.verify.kkt import allowed
+from harness.verify.references import ReferencePoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assessment:
+    """One answer, measured; None where the problem has no such thing.
+
+    Energies are relative to ½‖u*‖², lengths in the energy norm to ‖u*‖.
+    """
+
+    error: float  #: ‖u − u*‖
+    equilibrium_error: float | None  #: ‖u_λ − u*‖
+    energy: float  #: J(u) − J(u*)
+    penetration: float | None  #: max (Bu − c)₊ over the mesh size
+    balance: float | None  #: worst force or moment left on a body, of those on it
+    active: int | None  #: rows that are closed
+    rows: tuple[int, ...] = ()  #: closed in truth and open here, or the reverse
+    pulls: tuple[int, ...] = ()  #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ
+
+
+class Deviation(NamedTuple):
+    """Where an answer is, seen from the reference, over ‖u*‖: what pairs need."""
+
+    u: Vector
+    equilibrium: Vector | None
+
+
+def energy_allowed(tol: float) -> float:
+    """Return √(20 tol), the relative error that a verified answer may have."""
+    return float(np.sqrt(2 * allowed(tol)))
+
+
+@np.errstate(all="ignore")  # a point may hold 1e300
+def assess(
+    mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
+) -> tuple[Assessment, Deviation]:
+    """Measure `s`, a finite point of ``mechanics.primal``, against its solution.
+
+    Where that is zero, against what the load would do without contact.
+    """
+    exact, primal = mechanics.exact, mechanics.primal
+    u, lam = s.x.astype(Real), s.z.astype(Real)
+    gap = exact.c - exact.B @ u
+    at_rest, _ = equilibrium(mechanics, exact.f - exact.B.T @ lam)
+    off, off_rest = u - truth.u, at_rest - truth.equilibrium
+    slope = exact.K @ truth.u - exact.f
+    energy = float(slope @ off + 0.5 * (off @ (exact.K @ off)))
+    length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
+    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
+    closed, strict = _closed(exact, lam, gap, small)
+    true_gap = exact.c - exact.B @ truth.u
+    true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
+    contradicted = (closed != true_closed) & strict & true_strict
+    assessment = Assessment(
+        error=_over(mechanics.norm(off), length),
+        equilibrium_error=_over(mechanics.norm(off_rest), length),
+        energy=_over(energy, 0.5 * length**2),
+        penetration=float((-gap).max(initial=Real(0)) / mechanics.mesh_size),
+        balance=_balance(mechanics.rigid, primal, s),
+        active=int(closed.sum()),
+        rows=_numbers(contradicted),
+        pulls=_numbers(lam * exact.loose < -small),
+    )
+    scale = length or 1.0
+    return assessment, Deviation(
+        np.asarray(off / scale, dtype=float), np.asarray(off_rest / scale, dtype=float)
+    )
+
+
+@np.errstate(all="ignore")
+def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Deviation]:
+    """Measure a finite point of a QP without mechanics, in the seminorm ‖·‖_P.
+
+    ‖u*‖² is the larger of xᵀPx and |qᵀx| there. Px is the same for all solutions, x
+    itself where P is positive definite.
+    """
+    norm = point_norm(qp, truth)
+    off = s.x - truth.x
+    P_off = qp.P @ off
+    energy = float((qp.P @ truth.x + qp.q) @ off + 0.5 * (off @ P_off))
+    assessment = Assessment(
+        error=_over(float(np.sqrt(max(off @ P_off, 0.0))), norm),
+        equilibrium_error=None,
+        energy=_over(energy, 0.5 * norm**2),
+        penetration=None, balance=None, active=None,
+    )  # fmt: skip
+    return assessment, Deviation(off / (norm or 1.0), None)
+
+
+def point_norm(qp: QP, s: Solution) -> float:
+    """Return the length that errors of x are relative to."""
+    return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
+
+
+@np.errstate(all="ignore")
+def distances(
+    P: Matrix, kernel: NDArray[np.float64], points: Sequence[Vector]
+) -> NDArray[np.float64]:
+    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf where one is not finite.
+
+    By the Gram matrix of the points, which are small: they are deviations. Two are told
+    apart from 1e-8 of the farther one on.
+
+    kernel : orthonormal rigid motions (n, r), taken out first
+    """
+    V = np.stack(points, axis=1)
+    V = V - kernel @ (kernel.T @ V)
+    gram = V.T @ np.asarray(P @ V)
+    own = np.diag(gram)
+    squares = np.maximum(own[:, None] + own[None, :] - 2 * gram, 0)
+    found = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
+    np.fill_diagonal(found, 0)
+    return np.asarray(found)
+
+
+def _closed(
+    exact: Exact, lam: Extended, gap: Extended, small: Extended
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tell which rows are closed, and which of the answers to that are strict."""
+    force = lam * exact.loose
+    return force > gap, np.maximum(force, gap) > small
+
+
+def _balance(R: NDArray[np.float64], primal: QP, s: Solution) -> float | None:
+    """Return the worst |Rᵀ(f − B_Eᵀy − B_Iᵀz)| of a body, relative to its forces."""
+    if not R.shape[1]:
+        return None
+    forces = (-primal.q, -(primal.A.T @ s.y), -(primal.G.T @ s.z))
+    left = np.abs(R.T @ np.sum(forces, axis=0))
+    acting = np.abs(R).T @ np.sum(np.abs(forces), axis=0)
+    overlap = csr_array(np.abs(R).T @ np.abs(R))
+    _, body = connected_components(overlap, directed=False)
+    per_body = [
+        _over(float(left[body == b].max()), float(acting[body == b].max()))
+        for b in range(body.max() + 1)
+    ]
+    return max(per_body)
+
+
+def _numbers(rows: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(rows).tolist())
+
+
+def _over(value: float, scale: float) -> float:
+    """Divide, where 0/0 = 0 and NaN, of an overflow, is inf."""
+    if value == 0:
+        return 0.0
+    ratio = value / scale if scale else np.inf
+    return float(np.inf if np.isnan(ratio) else ratio)

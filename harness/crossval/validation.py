@@ -1,0 +1,296 @@
+"""Cross-validation of a result folder: its answers are judged anew, case by case.
+
+Nothing that a run concluded is taken over. Cases are built again, stored points read,
+residuals, errors and distances computed from them; what cannot be is listed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from harness.crossval.comparison import Problem, brief, compared
+from harness.crossval.ground_truth import Given
+from harness.crossval.misattribution import recognised, suspects, true_forces
+from harness.errors import InputError
+from harness.files.qpfile import qp_digest
+from harness.files.store import digest_of, is_stored, load_solution, point_arrays
+from harness.plugin import Case, Family, Reference
+from harness.qp import Vector
+from harness.record import Record, Verdict
+from harness.results.journal import read_journal
+from harness.results.rebuild import rebuilt
+from harness.solution import Status
+from harness.verify.verdicts import has_point
+
+_CHANGED = "the stored point is not the one that was measured: its file was changed"
+PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """A measurement that something is to be said of; plain data."""
+
+    run_id: str
+    solver: str
+    case: str
+    tol: float
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validation:
+    """All that the answers of a result folder say of each other; plain data."""
+
+    problems: tuple[Problem, ...]
+    solvers: tuple[str, ...]  #: labels, of all that measured something
+    false_claims: tuple[Listed, ...]  #: without a point: nowhere in `problems`
+    unanswered: tuple[Listed, ...]  #: no claim, no point: died, gave up, ran out
+    not_validated: tuple[Listed, ...]  #: stored points that could not be judged
+    declined: int
+
+    @property
+    def agreed(self) -> bool:
+        """Whether no claim is refuted, and no two answers disagree otherwise."""
+        return not self.false_claims and not any(
+            p.unresolved or any(a.refuted or a.contradiction for a in p.answers)
+            for p in self.problems
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Folder:
+    """Where answers come from, and what they are judged with."""
+
+    path: Path
+    families: Mapping[str, Family]
+    reference: Reference
+    twins: Mapping[tuple[str, str], set[str]]  #: (label, digest) → cases
+
+    @property
+    def references(self) -> Path:
+        return self.path / "references"
+
+
+class _Part(NamedTuple):
+    """What came of one physical case."""
+
+    problems: list[Problem]
+    lost: list[Listed]  #: answers that could not be judged
+    false: list[Listed]  #: claims without a point that are not so
+    suspects: dict[str, Vector]  #: see `harness.crossval.misattribution`
+    truths: dict[str, Vector]
+
+
+def validated(
+    path: Path,
+    families: Mapping[str, Family],
+    reference: Reference,
+    tell: Callable[[str], None],
+) -> Validation:
+    """Judge every answer that a result folder holds.
+
+    reference : the reference solve, none of the solvers
+    tell : is told of each case that begins
+
+    Raises
+    ------
+    InputError
+        When there is no folder, no journal or no stored point.
+
+    """
+    records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
+    if not any(r.vectors and is_stored(path, r.vectors) for r in records):
+        raise InputError(f"{path}: {_pointless(records)}")
+    twins: dict[tuple[str, str], set[str]] = {}
+    for r in records:
+        if r.vectors:
+            twins.setdefault((r.solver, r.vectors), set()).add(r.case)
+    folder = _Folder(path=path, families=families, reference=reference, twins=twins)
+    parts: list[_Part] = []
+    groups = _groups(records)
+    for number, (name, group) in enumerate(groups.items(), 1):
+        tell(f"{name} ({number} of {len(groups)})")
+        parts.append(_group(folder, name, group))
+    false_claims = [claim for part in parts for claim in part.false]
+    refuted = {k: z for part in parts for k, z in part.suspects.items()}
+    truths = {k: z for part in parts for k, z in part.truths.items()}
+    problems = recognised((p for part in parts for p in part.problems), refuted, truths)
+    return Validation(
+        problems=tuple(problems),
+        solvers=tuple(sorted({r.solver for r in records})),
+        false_claims=tuple(false_claims),
+        unanswered=tuple(
+            _listed(r, _ending(r))
+            for r in records
+            if _silent(r) and r.run_id not in {x.run_id for x in false_claims}
+        ),
+        not_validated=tuple(x for part in parts for x in part.lost),
+        declined=sum(r.status is Verdict.DECLINED for r in records),
+    )
+
+
+def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Group what was measured by physical case, in the order of names."""
+    groups: dict[str, list[Record]] = {}
+    for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
+        if r.status is not Verdict.DECLINED:
+            groups.setdefault(_physical(r), []).append(r)
+    return groups
+
+
+def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
+    """Judge the answers to one physical case, and claims that there is none."""
+    cases, lost = _built(folder, records)
+    given, damaged = _given(folder, [r for r in records if r.case in cases], cases)
+    lost += damaged
+    by_numbers: dict[str, list[Given]] = {}
+    for g in given:
+        by_numbers.setdefault(_numbers(g), []).append(g)
+    solve, kept = folder.reference, folder.references
+    problems: list[Problem] = []
+    forces: dict[str, Vector] = {}
+    truths: dict[str, Vector] = {}
+    for same in by_numbers.values():
+        p = compared(_called(name, same, len(by_numbers)), same, solve, kept)
+        problems.append(p)
+        forces |= suspects(p, same)
+        if (known := true_forces(p, same, solve, kept)) is not None:
+            truths[p.name] = known
+    proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
+    solvable = {a.case: p for p in proven for a in p.answers}
+    elastic = next((p for p in proven if p.closed is not None), None)  # of all forms
+    false = [
+        _listed(r, text)
+        for r in records
+        if (text := _falsehood(r, solvable.get(r.case, elastic)))
+    ]
+    return _Part(problems, lost, false, forces, truths)
+
+
+def _pointless(records: Sequence[Record]) -> str:
+    """Say why a folder has nothing to judge."""
+    if any(r.vectors for r in records):
+        return "its stored points are gone; expected vectors/*.npz, which a run writes"
+    statuses = Counter(r.status.value.replace("_", " ") for r in records)
+    ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
+    return f"no solver returned a point ({ends}); expected one that solves a case"
+
+
+def _built(
+    folder: _Folder, records: Sequence[Record]
+) -> tuple[dict[str, Case], list[Listed]]:
+    """Build the forms of a case that have answers; list what cannot be built."""
+    cases: dict[str, Case] = {}
+    lost: list[Listed] = []
+    for first in {r.case: r for r in records if r.vectors}.values():
+        try:
+            cases[first.case] = rebuilt(
+                first, folder.path, folder.families, folder.reference
+            )
+        except InputError as e:
+            answered = [r for r in records if r.case == first.case and r.vectors]
+            lost += [_listed(r, str(e)) for r in answered]
+    return cases, lost
+
+
+def _given(
+    folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
+) -> tuple[list[Given], list[Listed]]:
+    """Read the stored points of claims, each distinct one once."""
+    found: dict[tuple[str, str, float, str], Given] = {}
+    lost: list[Listed] = []
+    for r in records:
+        if not r.vectors or not _stands(r):
+            continue
+        key = (r.solver, r.case, r.tol, r.vectors)
+        if key in found:
+            found[key] = replace(found[key], repeats=found[key].repeats + 1)
+            continue
+        case = cases[r.case]
+        try:
+            s = load_solution(folder.path, r.vectors, Status(r.claimed or "failed"))
+            if (wrong := s.mismatch(case.qp)) or not has_point(s):
+                raise InputError(f"{_file(folder.path, r)}: {wrong or 'NaN or inf'}")
+        except InputError as e:
+            lost.append(_listed(r, str(e)))
+            continue
+        found[key] = Given(
+            record=r, label=r.solver, repeats=1, case=case, solution=s,
+            remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
+            twin=_twin(folder, r),
+        )  # fmt: skip
+    return list(found.values()), lost
+
+
+def _twin(folder: _Folder, r: Record) -> str:
+    """Name another case to which the solver gave the same point; empty if none."""
+    others = folder.twins.get((r.solver, r.vectors or ""), set()) - {r.case}
+    return min(others, default="")
+
+
+def _stands(r: Record) -> bool:
+    """Whether a record has an answer to judge: claimed, or verified all the same."""
+    return r.claimed == Status.SOLVED or r.status is Verdict.VERIFIED
+
+
+def _silent(r: Record) -> bool:
+    """Whether a record neither claims success nor is verified."""
+    return r.claimed != Status.SOLVED and r.status not in (
+        Verdict.VERIFIED,
+        Verdict.DECLINED,
+    )
+
+
+def _falsehood(r: Record, solved: Problem | None) -> str:
+    """Say what is false about a claim without a point; empty where nothing is.
+
+    solved : the problem, where it has a solution that is known
+    """
+    if r.claimed == Status.SOLVED and not r.vectors:
+        return "claims success without a finite point"
+    if r.claimed == Status.INFEASIBLE and solved is not None:
+        return (
+            f"claims that there is no solution; the {solved.truth} is one, with an "
+            f"error of at most {brief(solved.doubt or 0.0)}"
+        )
+    return ""
+
+
+def _ending(r: Record) -> str:
+    words = r.status.value.replace("_", " ")
+    return f"{words}: {r.message}" if r.message else words
+
+
+def _numbers(g: Given) -> str:
+    """Name the problem that an answer is to: equal numbers, whatever the form."""
+    if g.case.mechanics is None:
+        return g.record.case
+    return qp_digest(g.case.mechanics.primal)
+
+
+def _called(name: str, given: Sequence[Given], problems: int) -> str:
+    """Name a problem; with its forms, where not all forms of the case are of it."""
+    if problems == 1:
+        return name
+    return f"{name} ({', '.join(dict.fromkeys(g.record.form for g in given))})"
+
+
+def _physical(r: Record) -> str:
+    return r.case.removesuffix(f"/{r.form}")
+
+
+def _apart(r: Record) -> Record:
+    """Call a solver that drove a sequence by another name than one that began cold."""
+    return r if r.mode == "cold" else r.but(solver=f"{r.solver} ({r.mode})")
+
+
+def _file(path: Path, r: Record) -> Path:
+    return path / "vectors" / f"{r.vectors}.npz"
+
+
+def _listed(r: Record, text: str) -> Listed:
+    return Listed(run_id=r.run_id, solver=r.solver, case=r.case, tol=r.tol, text=text)

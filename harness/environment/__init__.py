@@ -1,0 +1,1 @@
+"""What a machine is, whether it is fit, and how noisy."""

@@ -1,0 +1,266 @@
+"""Is this machine fit for measuring? What was looked at, and what to change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+from rich.text import Text
+
+from harness.environment.environment import digest
+from harness.environment.noise import NoiseFloor
+
+ENOUGH_MEMORY_MIB = 2048
+QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells
+FINE_CLOCK_SECONDS = 1e-6
+STEADY = 0.10  #: one pair of equal measurements differs by less, 19 times out of 20
+EQUAL = 0.01  #: an A/A ratio nearer to 1 than this is as good as 1
+ONE_THREAD = (
+    "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
+    "RAYON_NUM_THREADS=1"
+)
+
+
+class Level(StrEnum):
+    """What a check came to."""
+
+    OK = "ok"
+    WARN = "warn"
+    UNKNOWN = "unknown"  #: the machine does not tell
+
+
+_STYLES = {Level.OK: "green", Level.WARN: "bold yellow", Level.UNKNOWN: "dim"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One thing that was looked at."""
+
+    section: str
+    name: str
+    value: str
+    level: Level = Level.OK
+    advice: str = ""  #: what to change, where the level is WARN
+
+
+def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
+    """Look at everything that times depend on.
+
+    environment : as `harness.environment.environment.capture` returns it
+    """
+    machine, now = environment["machine"], environment["now"]
+    return [
+        _processor(machine),
+        _cpu_limit(machine["cpu_limit"]),
+        _governor(machine),
+        _turbo(machine),
+        _siblings(machine["smt"]),
+        _load(now["load"]),
+        _memory(machine["memory_mib"], now["available_memory_mib"]),
+        *_blas(environment),
+        *_threads(environment["threads"]),
+        *_clock(noise),
+        *_versions(environment),
+    ]
+
+
+def as_json(
+    environment: Mapping[str, Any], noise: NoiseFloor, checks: Sequence[Check]
+) -> dict[str, Any]:
+    """Collect all that `examine` saw and said, as plain data."""
+    return {
+        "digest": digest(environment),
+        "fit": all(check.level is not Level.WARN for check in checks),
+        "checks": [asdict(check) for check in checks],
+        "noise": asdict(noise),
+        "environment": environment,
+    }
+
+
+def load_advice(load: float) -> str:
+    """Say what to do about other programs; empty where they keep quiet."""
+    if load <= QUIET_LOAD:
+        return ""
+    return (
+        "Stop other programs (top lists them) and wait until the load is below "
+        f"{QUIET_LOAD}"
+    )
+
+
+def _check(section: str, name: str, value: object, advice: str = "") -> Check:
+    """Make a check that warns where there is advice; a value None is unknown."""
+    level = Level.WARN if advice else Level.UNKNOWN if value is None else Level.OK
+    shown = "the system does not tell" if value is None else str(value)
+    return Check(section=section, name=name, value=shown, level=level, advice=advice)
+
+
+def _processor(machine: Mapping[str, Any]) -> Check:
+    cores, usable = machine["physical_cores"] or "?", machine["usable_cores"]
+    virtual = ", a virtual machine" if machine["virtual"] else ""
+    value = (
+        f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
+        f"{usable} usable{virtual})"
+    )
+    advice = "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch"
+    return _check("Machine", "processor", value, advice)
+
+
+def _cpu_limit(limit: float | None) -> Check:
+    if limit is None:
+        return _check("Machine", "cpu limit", "none")
+    advice = (
+        "The container is throttled: give it 2 cores or more (docker run --cpus=2)"
+        if limit < 2
+        else ""
+    )
+    return _check("Machine", "cpu limit", f"{limit:g} cores", advice)
+
+
+def _governor(machine: Mapping[str, Any]) -> Check:
+    governor = machine["governor"]
+    advice = "Fix the frequency: sudo cpupower frequency-set -g performance"
+    good = governor in (None, "performance")
+    return _check("Machine", "governor", governor, "" if good else advice)
+
+
+def _turbo(machine: Mapping[str, Any]) -> Check:
+    if not machine["turbo"]:
+        value = None if machine["turbo"] is None else "off"
+        return _check("Machine", "turbo", value)
+    advice = (
+        "Frequencies above the nominal one depend on temperature and on neighbours: "
+        "echo 0 | sudo tee /sys/devices/system/cpu/cpufreq/boost "
+        "(Intel: echo 1 | sudo tee /sys/devices/system/cpu/intel_pstate/no_turbo)"
+    )
+    return _check("Machine", "turbo", "on", advice)
+
+
+def _siblings(smt: bool | None) -> Check:
+    if not smt:
+        return _check("Machine", "hyper-threads", None if smt is None else "off")
+    advice = (
+        "Two programs share a core: keep the machine free of others, or "
+        "echo off | sudo tee /sys/devices/system/cpu/smt/control"
+    )
+    return _check("Machine", "hyper-threads", "on", advice)
+
+
+def _load(load: float) -> Check:
+    return _check("Machine", "load", f"{load:.2f} cores busy", load_advice(load))
+
+
+def _memory(total: int | None, available: int | None) -> Check:
+    if total is None or available is None:
+        return _check("Machine", "memory", None)
+    advice = (
+        f"Make room for {ENOUGH_MEMORY_MIB} MiB, or lower memory_limit in the suite"
+        if available < ENOUGH_MEMORY_MIB
+        else ""
+    )
+    return _check("Machine", "memory", f"{available} of {total} MiB free", advice)
+
+
+def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
+    pools = environment["threads"]["pools"]
+    for owner in ("numpy", "scipy"):
+        yield _check("BLAS", f"of {owner}", _blas_of(owner, pools))
+    blas, version = environment["cholmod"]["blas"], environment["cholmod"]["version"]
+    advice = ""
+    if environment["versions"]["scikit-sparse"] is None:
+        advice = "scikit-sparse is not installed, nothing is factorised: make setup"
+    elif blas == "reference BLAS":
+        link = f"libblas.so.3-{environment['machine']['architecture']}-linux-gnu"
+        advice = (
+            "The reference BLAS is several times slower: "
+            "sudo apt-get install libopenblas0-pthread "
+            f"(if it is there already: sudo update-alternatives --auto {link})"
+        )
+    linked = blas and f"{blas}, linked by CHOLMOD {version or '?'}"
+    yield _check("BLAS", "of CHOLMOD", linked, advice)
+
+
+def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
+    """Name the BLAS in a package's wheel; without one there, that of the system."""
+    for place in (owner, "system"):
+        for pool in pools:
+            if pool["owner"] == place and pool["library"] != "libgomp":
+                return " ".join(filter(None, (pool["library"], pool["version"])))
+    return None
+
+
+def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
+    for pool in threads["pools"]:
+        count = pool["threads"]
+        advice = f"More than one blurs times: {ONE_THREAD}" if count > 1 else ""
+        value = f"{count} thread{'s' if count > 1 else ''}"
+        yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
+    variables = ", ".join(f"{k}={v}" for k, v in threads["variables"].items())
+    yield _check("Threads", "variables", variables or "none set")
+
+
+def _clock(noise: NoiseFloor) -> Iterable[Check]:
+    step = noise.clock_seconds
+    coarse = "" if step <= FINE_CLOCK_SECONDS else "Measure on a machine with a clock"
+    yield _check(
+        "Clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
+    )
+    biased = abs(noise.ratio - 1) > EQUAL and not noise.low <= 1 <= noise.high
+    yield _check(
+        "Clock",
+        "A/A ratio",
+        f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
+        f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
+        "Equal things seem to differ: let the machine rest, then ask again"
+        if biased
+        else "",
+    )
+    yield _check(
+        "Clock",
+        "noise floor",
+        f"two equal measurements differ by up to {noise.one_pair:.1%} (19 of 20)",
+        f"Raise repeats: a single measurement tells nothing below {noise.one_pair:.0%}"
+        if noise.one_pair > STEADY
+        else "",
+    )
+
+
+def _versions(environment: Mapping[str, Any]) -> Iterable[Check]:
+    machine, source = environment["machine"], environment["source"]
+    yield _check("Versions", "system", f"{machine['system']} {machine['kernel']}")
+    for name, number in environment["versions"].items():
+        advice = "" if number else "It is missing: make setup"
+        yield _check("Versions", name, number or "missing", advice)
+    dirty = source is not None and source["dirty"]
+    commit = (source["commit"][:12] if source else "not a checkout") + (
+        " with changes" if dirty else ""
+    )
+    advice = "Commit before you publish, so that others can measure the same code"
+    yield _check("Versions", "commit", commit, advice if dirty else "")
+
+
+def render(checks: Sequence[Check], environment: str) -> Text:
+    """Lay out what `mortarbench doctor` prints: sections, marks, what to change.
+
+    environment : its digest, as records name it
+    """
+    width = max(len(check.name) for check in checks)
+    text, section = Text(), ""
+    for check in checks:
+        if check.section != section:
+            section = check.section
+            text.append(f"{section}\n", "bold")
+        text.append(f"  {check.level:<7}  ", _STYLES[check.level])
+        text.append(f"{check.name:<{width}}  {check.value}\n")
+        if check.advice:
+            text.append(f"{'':{width + 13}}→ {check.advice}\n", "yellow")
+    return text.append(f"\n{_conclusion(checks)} Environment {environment}.")
+
+
+def _conclusion(checks: Sequence[Check]) -> str:
+    warnings = sum(check.level is Level.WARN for check in checks)
+    if not warnings:
+        return "Fit for measuring: nothing to change."
+    things = "thing" if warnings == 1 else "things"
+    return f"{warnings} {things} to change before measuring (marked warn)."

@@ -1,0 +1,116 @@
+"""How well this machine tells two equal things apart, when one times them.
+
+An A/A comparison: a fixed kernel against itself, in pairs, as solvers are compared in
+blocks. What two solvers differ by less than that is noise.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import exp
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array, eye_array, kron
+
+from harness.qp import Vector
+
+_SIDE = 120  #: of the kernel's square grid: its matrix has 14 400 rows
+_PRODUCTS = 10  #: about 1 ms
+_BLOCKS = 20  #: of consecutive pairs, for the bootstrap
+_DRAWS = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseFloor:
+    """What an A/A comparison found; ratios are of times, arm A over arm B."""
+
+    clock_seconds: float  #: smallest step of the clock that was seen
+    kernel_seconds: float  #: median time of the kernel
+    pairs: int
+    ratio: float  #: exp of the median paired log ratio: 1 but for noise
+    low: float  #: of the ratio's 95 % bootstrap interval
+    high: float
+    one_pair: float  #: 95 % of the single pairs lie within ±this, relative
+
+
+def noise_floor(
+    seconds: float = 2.0, clock: Callable[[], float] = time.perf_counter
+) -> NoiseFloor:
+    """Time one kernel against itself, on the CPU and in the manner of a run.
+
+    Pairs are run as AB, BA, AB, …, and two successive pairs are averaged, so that a
+    steady drift of the machine cancels. The interval resamples blocks of consecutive
+    pairs, not single ones, because disturbances last longer than one pair.
+
+    seconds : how long to go on, by `clock`
+    clock : returns seconds
+    """
+    with _on_the_workers_cpu():
+        a, b = _paired_times(seconds, clock)
+    singles = np.log(a / b)
+    balanced = singles.reshape(-1, 2).mean(axis=1)
+    blocks = np.array_split(balanced, min(_BLOCKS, balanced.size))
+    rng = np.random.default_rng(20260)
+    drawn = rng.integers(len(blocks), size=(_DRAWS, len(blocks)))
+    medians = [np.median(np.concatenate([blocks[i] for i in row])) for row in drawn]
+    low, high = np.quantile(medians, (0.025, 0.975))
+    return NoiseFloor(
+        clock_seconds=_clock_step(clock),
+        kernel_seconds=float(np.median(np.concatenate((a, b)))),
+        pairs=a.size,
+        ratio=exp(np.median(balanced)),
+        low=exp(low),
+        high=exp(high),
+        one_pair=exp(np.quantile(np.abs(singles), 0.95)) - 1,
+    )
+
+
+@contextmanager
+def _on_the_workers_cpu() -> Iterator[None]:
+    """Run where `harness.processes.supervisor` binds workers: on the last CPU."""
+    usable = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(usable)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, usable)
+
+
+def _paired_times(seconds: float, clock: Callable[[], float]) -> tuple[Vector, Vector]:
+    """Time arms A and B of the same kernel; returns arrays of one, even length."""
+    K = _laplacian(_SIDE)
+
+    def timed() -> float:
+        v = np.ones(K.shape[0])
+        start = clock()
+        for _ in range(_PRODUCTS):
+            v = K @ v
+            v /= np.abs(v).max()
+        return clock() - start
+
+    timed()  # finds cold caches
+    arms: tuple[list[float], list[float]] = ([], [])
+    end = clock() + seconds
+    while clock() < end or not arms[0]:
+        for first in (0, 1):
+            arms[first].append(timed())
+            arms[1 - first].append(timed())
+    return np.array(arms[0]), np.array(arms[1])
+
+
+def _laplacian(side: int) -> Any:
+    """Make the five-point stencil on a square of `side`² nodes."""
+    one = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(side, side))
+    return csr_array(kron(one, eye_array(side)) + kron(eye_array(side), one))
+
+
+def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:
+    """Find the smallest step between consecutive readings that is not zero."""
+    readings = np.array([clock() for _ in range(tries)])
+    steps = np.diff(readings)
+    return float(steps[steps > 0].min(initial=np.inf))

@@ -1,0 +1,96 @@
+"""What an experiment measured, as plain files that can be read without us.
+
+::
+
+    FOLDER/setting.json     what was measured, where, and which state is which file
+    FOLDER/NAME.csv         one table: a row for each measurement
+    FOLDER/vectors/*.npz    deformed states
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness.errors import InputError
+from harness.files.reading import read_json
+from harness.files.store import load_fields, save_fields
+from harness.plugin import Fields, Value
+
+Row = Mapping[str, Value]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Experiment:
+    """Tables of measurements, deformed states, and under which setting."""
+
+    setting: Mapping[str, Any]  #: what JSON can hold
+    tables: Mapping[str, Sequence[Row]]  #: the rows of a table have the same keys
+    states: Mapping[str, Fields]
+
+
+def save_experiment(experiment: Experiment, folder: Path) -> None:
+    """Write the files above."""
+    folder.mkdir(parents=True, exist_ok=True)
+    states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
+    for name, rows in experiment.tables.items():
+        _write_csv(folder / f"{name}.csv", rows)
+    setting = {
+        "setting": experiment.setting,
+        "tables": list(experiment.tables),
+        "states": states,
+    }
+    (folder / "setting.json").write_text(
+        json.dumps(setting, indent=1, ensure_ascii=False) + "\n", "utf-8"
+    )
+
+
+def load_experiment(folder: Path) -> Experiment:
+    """Read what `save_experiment` wrote, numbers to the last digit.
+
+    Raises
+    ------
+    InputError
+        When a file is missing or damaged.
+
+    """
+    path = folder / "setting.json"
+    try:
+        index = read_json(path)
+        tables = {name: _read_csv(folder / f"{name}.csv") for name in index["tables"]}
+    except OSError as e:
+        raise InputError(f"{e.filename}: cannot be read: {e.strerror}") from None
+    except (ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{path}: not the setting of an experiment: {e}") from None
+    states = {name: load_fields(folder, key) for name, key in index["states"].items()}
+    return Experiment(setting=index["setting"], tables=tables, states=states)
+
+
+def _write_csv(path: Path, rows: Iterable[Row]) -> None:
+    rows = list(rows)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _read_csv(path: Path) -> list[Row]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return [
+            {key: _value(text) for key, text in row.items()}
+            for row in csv.DictReader(file)
+        ]
+
+
+def _value(text: str) -> Value:
+    """Read an integer, a float or else a text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

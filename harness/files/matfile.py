@@ -1,0 +1,249 @@
+"""One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
+
+Vectors ``q, h, b, lb, ub`` are columns, matrices ``P, G, A`` sparse, ``meta`` is a JSON
+text. Next to them lie what a case offers of its own, e.g. F, d, B, c, R of the paper.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat, savemat
+from scipy.sparse import csc_array, issparse
+
+from harness.errors import InputError, shortened
+from harness.files.datafile import check_size, json_object, opened, parsing
+from harness.files.qpfile import (
+    canonical,
+    check_dense,
+    check_symmetric,
+    compressed,
+    explicit_matrices,
+    listed_dense,
+)
+from harness.qp import QP, Matrix, Vector
+
+_EXPECTED = "a .mat file"
+_WRONG = "not a .mat file; expected one saved with -v7 or older"
+_HEADER, _TAG = 128, 8  #: bytes of the head of a version 5 file, and of an element
+_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: kinds of elements, and of their parts
+_TYPES = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
+    13: "u8", 17: "u2", 18: "u4",
+}  # fmt: skip
+_TEXT, _SPARSE = 4, 5  #: classes of variables
+_CLASSES = frozenset((_TEXT, _SPARSE, *range(6, 16)))  #: and numbers of every type
+_COMPLEX = 0x800  #: among the flags of a variable
+_COPIES = 8  #: of a file that its parser may hold
+
+_VECTORS = ("q", "h", "b", "lb", "ub")
+_MATRICES = ("P", "G", "A")
+
+
+def save_mat(
+    path: Path, qp: QP, meta: Mapping[str, Any], more: Mapping[str, Any]
+) -> None:
+    """Write `qp` and the arrays `more` to `path`; `meta` is as in `save_qp`.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+
+    """
+    matrices, dense = explicit_matrices(qp)
+    arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
+    arrays |= {name: getattr(qp, name) for name in _VECTORS}
+    arrays |= {name: csc_array(M) for name, M in matrices.items()}
+    arrays["meta"] = json.dumps({**meta, "dense": dense})
+    try:
+        with path.open("wb") as file:  # given a name, savemat would append .mat to it
+            savemat(file, arrays, do_compression=True, oned_as="column")
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+
+
+def read_mat(path: Path) -> dict[str, Any]:
+    """Read the variables of a .mat file; None stands for what is no number or text.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, is no .mat file of MATLAB 4 to 7.2, or declares more
+        than `harness.files.datafile` allows.
+
+    """
+    with opened(path, _EXPECTED) as file:
+        data = file.read()
+    if b"MATLAB 7.3" in data[:_HEADER] or data.startswith(b"\x89HDF"):
+        raise InputError(f"{path}: a .mat file of version 7.3; save it with -v7")
+    with parsing(path, _WRONG, _COPIES * len(data)):
+        if 0 in data[:4]:  # version 4, in which nothing is compressed
+            return dict(loadmat(BytesIO(data), spmatrix=False))
+        elements = list(_elements(data))
+        size = sum(map(_declared, elements))
+        check_size(f"{path}: what it holds", size)
+    with parsing(path, _WRONG, _COPIES * size):
+        found: dict[str, Any] = {}
+        for element in elements:
+            name, value = _variable(element)
+            if name in found:
+                raise ValueError(f"{name} is there twice")
+            found[name] = value
+        return found
+
+
+class _Element(NamedTuple):
+    """What a file of version 5 is made of, after its head."""
+
+    order: str  #: of bytes, as struct and numpy have it
+    kind: int
+    body: bytes
+
+
+def _elements(data: bytes) -> Iterator[_Element]:
+    """List the elements of a version 5 file."""
+    order = {b"IM": "<", b"MI": ">"}[data[_HEADER - 2 : _HEADER]]
+    at = _HEADER
+    while at < len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, at)
+        begin, at = at + _TAG, at + _TAG + size
+        if at > len(data):
+            raise ValueError("truncated")
+        yield _Element(order, kind, data[begin:at])
+
+
+def _declared(element: _Element) -> int:
+    """Tell how many bytes an element has, or will have; its head says so."""
+    if element.kind != _COMPRESSED:
+        return len(element.body)
+    head = zlib.decompressobj().decompress(element.body, _TAG)
+    return int(struct.unpack(f"{element.order}II", head)[1])
+
+
+def _decompressed(element: _Element) -> _Element:
+    """Decompress an element, and not a byte beyond what its head declares."""
+    inflate = zlib.decompressobj()
+    head = inflate.decompress(element.body, _TAG)
+    kind, size = struct.unpack(f"{element.order}II", head)
+    body = inflate.decompress(inflate.unconsumed_tail, size) if size else b""
+    if len(body) < size or inflate.decompress(inflate.unconsumed_tail, 1):
+        raise ValueError("a compressed variable has not the size that it declares")
+    return _Element(element.order, kind, body)
+
+
+def _variable(element: _Element) -> tuple[str, Any]:
+    """Read a variable: a text, an array, a sparse matrix, or None for anything else.
+
+    scipy's reader is not used: some damaged files crash Python in it (scipy 1.17.1).
+    """
+    if element.kind == _COMPRESSED:
+        element = _decompressed(element)
+    if element.kind != _MATRIX:
+        raise ValueError("an element that is no variable")
+    parts = _parts(element)
+    flags, shape = int(next(parts)[0]), tuple(map(int, next(parts)))
+    name = next(parts).tobytes().decode("latin-1")
+    kind = flags & 0xFF
+    if kind not in _CLASSES or flags & _COMPLEX:
+        return name, None
+    if min(shape) < 0:
+        raise ValueError(f"{name} is of shape {shape}")
+    if kind == _SPARSE:
+        rows, starts, values = (next(parts) for _ in range(3))
+        count = starts[-1]  # room for more may follow
+        return name, compressed(values[:count], rows[:count], starts, shape)
+    values = next(parts)
+    if kind == _TEXT:
+        return name, np.array("".join(map(chr, values.tolist())))
+    return name, values.reshape(shape, order="F")
+
+
+def _parts(element: _Element) -> Iterator[NDArray[Any]]:
+    """List the arrays of numbers that a variable is made of."""
+    order, _, body = element
+    at = 0
+    while at < len(body):
+        (kind,) = struct.unpack_from(f"{order}I", body, at)
+        if kind >> 16:  # four bytes at most, in the tag itself
+            kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
+            at += _TAG
+        else:
+            (size,) = struct.unpack_from(f"{order}I", body, at + 4)
+            begin, at = at + _TAG, at + _TAG + size + -size % _TAG
+        if begin + size > len(body):
+            raise ValueError("truncated")
+        if kind == _UTF_8:
+            text = body[begin : begin + size].decode("utf-8")
+            yield np.array([ord(letter) for letter in text], dtype=np.uint32)
+        else:
+            yield np.frombuffer(body[begin : begin + size], order + _TYPES[kind])
+
+
+def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
+    """Make of the variables that `save_mat` wrote the QP and its meta data.
+
+    Raises
+    ------
+    InputError
+        When one is missing, of the wrong kind, or they make no QP.
+
+    """
+    vectors: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
+    matrices = {name: matrix(arrays, name) for name in _MATRICES}
+    try:
+        text = np.asarray(arrays.get("meta", "{}"))
+        if text.dtype.kind != "U" or text.size != 1:
+            raise ValueError("meta is no text")
+        meta = json_object(str(text.item()))
+        for name in _MATRICES:
+            if not np.isfinite(matrices[name].data).all():
+                raise ValueError(f"{name} holds inf; expected finite numbers")
+        for name in listed_dense(meta):
+            check_dense(name, matrices[name])
+            matrices[name] = matrices[name].toarray()
+        qp = QP(**vectors, **matrices)
+        check_symmetric(qp.P)
+    except (ValueError, TypeError, OverflowError) as e:
+        raise InputError(shortened(" ".join(str(e).split()))) from None
+    return qp, meta
+
+
+def vector(arrays: Mapping[str, Any], name: str) -> Vector:
+    """Take the numbers of a row, a column or a sparse one, (n,)."""
+    M = matrix(arrays, name)
+    if M.size and 1 not in M.shape:
+        raise InputError(f"{name} is of shape {M.shape}; expected one row or column")
+    check_dense(name, M)
+    flat: Vector = M.toarray().ravel()
+    return flat
+
+
+def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
+    """Take a matrix of numbers, dense or sparse, as csc."""
+    if name not in arrays:
+        raise InputError(f"{name} is missing")
+    if getattr(arrays[name], "dtype", np.dtype(object)).kind not in "iufb":
+        raise InputError(f"{name} is no matrix of numbers")
+    given = arrays[name]
+    if given.ndim > 2:
+        raise InputError(f"{name} has {given.ndim} dimensions; expected at most two")
+    check_size(f"{name}, {max(given.shape, default=1)} wide or high,",
+               8 * max(given.shape, default=1))  # fmt: skip
+    try:
+        with np.errstate(over="ignore"):
+            M = csc_array(given, dtype=float)
+    except (ValueError, TypeError, OverflowError, IndexError) as e:
+        raise InputError(f"{name} is no matrix: {shortened(str(e))}") from None
+    M = canonical(M)
+    if np.isnan(M.data).any():
+        raise InputError(f"{name} holds NaN; expected numbers")
+    return M

@@ -1,0 +1,171 @@
+"""npz files whose arrays can be mapped into memory instead of being read.
+
+An npz file is a zip archive of npy files. Here they are stored uncompressed and begin,
+with their values, at multiples of 64 bytes, so that ``np.load`` reads them like any
+others and `mapped` gives arrays that lie in the page cache, shared by all processes.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import zipfile
+from collections.abc import Mapping
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from harness.errors import shortened
+from harness.files.datafile import check_size, opened
+
+EXPECTED = "an npz file"
+ALIGNMENT = 64
+_LOCAL_HEADER = 30  #: bytes before name and extra field of a member
+_PADDING = b"\xfe\xca"  #: an extra field that nobody knows, and all skip
+_ENCRYPTED = 1  #: among the flags of a member
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_KINDS = "biufcSU"  #: of types: neither objects, which are pickles, nor structures
+_PIECE = 2**20  #: bytes that are decompressed at once
+
+
+def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays so that they can be mapped.
+
+    A file that is there is replaced, not written over: whoever has mapped it keeps what
+    it held, while truncating it would kill them by SIGBUS.
+    """
+    new = path.with_name(f".{path.name}.new")
+    new.unlink(missing_ok=True)  # of one that was killed; a link is not followed
+    try:
+        _write(new, arrays)
+        os.replace(new, path)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    with path.open("xb") as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            header = BytesIO()
+            stored = np.ascontiguousarray(array).reshape(array.shape)
+            npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(stored))
+            member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            start = file.tell() + _LOCAL_HEADER + len(member.filename.encode()) + 4
+            lacking = -start % ALIGNMENT  # the npy header is a multiple of 64 itself
+            member.extra = _PADDING + lacking.to_bytes(2, "little") + bytes(lacking)
+            archive.writestr(member, header.getvalue() + stored.tobytes())
+
+
+def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
+    """Map every array of a file; writing to one changes a private copy only.
+
+    limited : whether a file above the limit of `harness.files.datafile` is refused
+
+    Raises
+    ------
+    InputError
+        As `harness.files.datafile.opened`.
+    ValueError, BadZipFile
+        When the file holds something else.
+
+    """
+    with opened(path, EXPECTED, limited=limited) as file:
+        memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+        with zipfile.ZipFile(file) as archive:
+            members = _members(archive)
+        return {name: _array(memory, m) for name, m in members.items()}
+
+
+def read(path: Path) -> dict[str, NDArray[Any]]:
+    """Read every array of a file, never unpickling.
+
+    Raises
+    ------
+    InputError
+        As `harness.files.datafile.opened`, and when the arrays would exceed its limit.
+    ValueError, BadZipFile
+        When the file holds something else.
+
+    """
+    with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
+        members = _members(archive)
+        check_size(f"{path}: what it holds", sum(m.file_size for m in members.values()))
+        return {name: _read_array(archive, m) for name, m in members.items()}
+
+
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """List the arrays by name."""
+    found: dict[str, zipfile.ZipInfo] = {}
+    for member in archive.infolist():
+        name = member.filename.removesuffix(".npy")
+        if name == member.filename or name in found:
+            raise ValueError(f"{shortened(name)!r} is no array, or there twice")
+        if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
+            raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
+        found[name] = member
+    return found
+
+
+def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """View one member; a compressed or unaligned one would be no array of ours."""
+    begin = member.header_offset
+    header = memory[begin : begin + _LOCAL_HEADER]
+    skip = int.from_bytes(header[26:28], "little") + int.from_bytes(
+        header[28:30], "little"
+    )
+    begin += _LOCAL_HEADER + skip
+    if member.compress_type != zipfile.ZIP_STORED or begin % ALIGNMENT:
+        raise ValueError(f"{member.filename} cannot be mapped")
+    start = BytesIO(memory[begin : min(begin + 4096, begin + member.file_size)])
+    shape, fortran, dtype = _header(start)
+    if fortran:
+        raise ValueError(f"{member.filename} is no array in C order")
+    count = _count(shape, dtype, member.file_size - start.tell())
+    if count == 0:
+        return np.empty(shape, dtype)
+    flat = np.frombuffer(memory, dtype, count, begin + start.tell())
+    return flat.reshape(shape)
+
+
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Read one member, and not a byte more than it declared."""
+    with archive.open(member) as file:
+        shape, fortran, dtype = _header(file)
+        count = _count(shape, dtype, member.file_size - file.tell())
+        values = bytearray(count * dtype.itemsize)
+        view, begin = memoryview(values), 0
+        while begin < len(values):
+            piece = file.read(min(_PIECE, len(values) - begin))
+            if not piece:
+                raise ValueError(f"{member.filename} is truncated")
+            view[begin : begin + len(piece)] = piece
+            begin += len(piece)
+        file.read(1)  # the end, where the checksum is compared
+    if count == 0:
+        return np.empty(shape, dtype)
+    return np.frombuffer(values, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Read the header of an npy file: shape, whether in Fortran order, type."""
+    readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    version = npy.read_magic(file)
+    if version not in readers:
+        raise ValueError(f"an npy header of version {version}; expected 1.0 or 2.0")
+    shape, fortran, dtype = readers[version](file)
+    if dtype.kind not in _KINDS or not dtype.itemsize:
+        raise ValueError("no plain array of numbers or text")
+    return shape, fortran, dtype
+
+
+def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
+    """Count the values of an array that has `there` bytes at most."""
+    count = prod(shape)  # in Python's integers, which do not overflow
+    if min(shape, default=0) < 0 or count * dtype.itemsize > there:
+        raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
+    return count

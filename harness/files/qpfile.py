@@ -1,0 +1,315 @@
+"""One QP in one npz file, without pickles, for workers and for other people's solvers.
+
+::
+
+    min ½xᵀPx + qᵀx   s.t.   Gx ≤ h,  Ax = b,  lb ≤ x ≤ ub
+
+holds the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
+``M_data, M_indices, M_indptr, M_shape`` of its compressed sparse columns (P whole, not
+a triangle); and ``meta``, a JSON object. Absent constraints have zero rows, absent
+bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense. The structure of
+a dual, where there is one, follows as matrices ``K, B`` and the vector ``fixed``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array, issparse
+
+from harness.errors import InputError, shortened
+from harness.files.datafile import check_size, json_object
+from harness.files.npz import write_mappable
+from harness.files.store import digest_of, mapped_arrays
+from harness.qp import QP, Matrix, Structure, Vector
+from harness.recipe import Maker, Recipe
+
+SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
+_STRIP = 256  #: rows of a dense matrix that are compared at once
+
+_VECTORS = ("q", "h", "b", "lb", "ub")
+_MATRICES = ("P", "G", "A")
+_STRUCTURE = ("K", "B")
+_PARTS = ("data", "indices", "indptr", "shape")
+_INGREDIENT = "P_from_"  #: of a P that is a recipe
+
+
+def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
+    """Return P, G and A, an operator P multiplied out, and the names of dense ones."""
+    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
+    matrices = {"P": P, "G": qp.G, "A": qp.A}
+    return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
+
+
+def save_qp(
+    path: Path, qp: QP, meta: Mapping[str, Any], *, recipe: bool = False
+) -> str:
+    """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
+
+    Returns 16 hex digits that name its numbers: equal digests, equal QPs. A P that is
+    written as a recipe has another digest than the same one multiplied out.
+
+    meta : plain data; its keys ``dense`` and ``maker`` are filled in here
+    recipe : whether a P that is a `Recipe` is written as such, which only we can read
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+
+    """
+    arrays, dense, maker = _parts(qp, recipe=recipe)
+    digest = digest_of(arrays)
+    arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
+    try:
+        write_mappable(path, arrays)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    return digest
+
+
+def qp_digest(qp: QP, *, recipe: bool = False) -> str:
+    """Name the numbers of a QP by 16 hex digits, as `save_qp` does."""
+    return digest_of(_parts(qp, recipe=recipe)[0])
+
+
+def _parts(
+    qp: QP, *, recipe: bool
+) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
+    """Take a QP apart; also tell which matrices are dense, and who makes P."""
+    P = qp.P
+    if not (recipe and isinstance(P, Recipe)):
+        return *_arrays(qp, structure=recipe), {}
+    arrays, dense = _arrays(replace(qp, P=csc_array(P.shape)), structure=True)
+    arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
+    return arrays, dense, {"maker": P.maker}
+
+
+def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Take a QP apart; also tell which matrices are dense."""
+    matrices, dense = explicit_matrices(qp)
+    arrays = {name: getattr(qp, name) for name in _VECTORS}
+    if structure and qp.structure is not None:
+        matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
+        arrays["fixed"] = qp.structure.fixed
+    for name, M in matrices.items():
+        M = csc_array(M)
+        parts = (M.data, M.indices, M.indptr, np.array(M.shape))
+        arrays |= {f"{name}_{part}": a for part, a in zip(_PARTS, parts, strict=True)}
+    return arrays, dense
+
+
+def load_qp(
+    path: Path, *, operators: Mapping[str, Maker] | None = None
+) -> tuple[QP, dict[str, Any]]:
+    """Read a QP and its meta data.
+
+    operators : makers of operators (`harness.recipe`), for a file that a generator of
+        this very run wrote: it may hold an operator, and is as large as it is. Without
+        them the file may be anybody's: an operator is refused, and so is what exceeds
+        the limit of `harness.files.datafile`, or has no symmetric P
+
+    Raises
+    ------
+    InputError
+        When the file is no npz, lacks an array, or what it holds is no QP.
+
+    """
+    parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
+    own = operators is not None
+    arrays = mapped_arrays(path, (*_VECTORS, *parts, "meta"), limited=not own)
+    try:
+        meta = _meta(arrays["meta"])
+        vectors = {name: _vector(arrays, name) for name in _VECTORS}
+        matrices = {name: _matrix(arrays, name) for name in _MATRICES}
+        dense = listed_dense(meta)
+        if not own:
+            _check_foreign(matrices, dense, meta)
+        structure = _structure(arrays) if "fixed" in arrays else None
+        for name in dense:
+            matrices[name] = _dense(matrices[name])
+        if operators is not None and "maker" in meta:
+            n, maker = vectors["q"].size, str(meta["maker"])
+            matrices["P"] = Recipe(n, maker, _ingredients(arrays), operators)
+        qp = QP(**vectors, **matrices, structure=structure)
+        if not own:
+            check_symmetric(qp.P)
+    except (ValueError, TypeError, OverflowError) as e:
+        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
+    except InputError as e:
+        raise InputError(f"{path}: {e}") from None
+    return qp, meta
+
+
+def listed_dense(meta: Mapping[str, Any]) -> set[str]:
+    """Take the names of dense matrices from meta data.
+
+    Raises
+    ------
+    ValueError
+        When they are no list of texts.
+
+    """
+    names = meta.get("dense", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError("meta: dense is no list of names")
+    return set(_MATRICES).intersection(names)
+
+
+def check_dense(name: str, M: Matrix) -> None:
+    """Refuse a matrix that would be too large if it were dense.
+
+    Raises
+    ------
+    InputError
+        As `harness.files.datafile.check_size`.
+
+    """
+    check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
+
+
+def check_symmetric(P: Matrix) -> None:
+    """Refuse a P that is not symmetric up to rounding: solvers would read another one.
+
+    Raises
+    ------
+    ValueError
+        With the entries that differ most.
+
+    """
+    where, worst = _asymmetry(P)
+    largest = abs(P).max() if prod(P.shape) else 0.0
+    if worst > SYMMETRIC * largest:
+        i, j = where
+        raise ValueError(
+            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
+        )
+
+
+def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
+    """Find the largest entry of |P − Pᵀ|; of a dense one in strips."""
+    if issparse(P):
+        difference = coo_array(abs(P - P.T))
+        if not difference.nnz:
+            return (0, 0), 0.0
+        at = int(difference.data.argmax())
+        i, j = (int(k[at]) for k in difference.coords)
+        return (i, j), float(difference.data[at])
+    found = (0, 0), 0.0
+    for begin in range(0, len(P), _STRIP):
+        strip = slice(begin, begin + _STRIP)
+        difference = abs(P[strip] - P[:, strip].T)
+        i, j = np.unravel_index(difference.argmax(), difference.shape)
+        if difference[i, j] > found[1]:
+            found = (begin + int(i), int(j)), float(difference[i, j])
+    return found
+
+
+def _check_foreign(
+    matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
+) -> None:
+    """Refuse what only our own runs write, and what would be too large."""
+    if "maker" in meta:
+        raise ValueError(
+            "holds P as an operator, which is read only where the run itself wrote it; "
+            "expected P as a matrix, as export writes it"
+        )
+    for name in dense:
+        check_dense(name, matrices[name])
+
+
+def _meta(array: NDArray[Any]) -> dict[str, Any]:
+    if array.dtype.kind != "U" or array.size != 1:
+        raise ValueError("meta is no text")
+    return json_object(str(array.item()))
+
+
+def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
+    parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
+    if missing := [name for name in parts if name not in arrays]:
+        raise ValueError(f"{', '.join(missing)} missing beside fixed")
+    if arrays["fixed"].dtype.kind not in "iu":
+        raise ValueError("fixed must hold integers")
+    fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
+    K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
+    N = K.shape[0]
+    if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
+        raise ValueError("K, B and fixed do not fit each other, or q")
+    if ((fixed < 0) | (fixed >= N)).any():
+        raise ValueError(f"fixed holds indices out of range; expected 0 … {N - 1}")
+    return Structure(K=K, B=B, fixed=fixed)
+
+
+def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    return {
+        name.removeprefix(_INGREDIENT): array
+        for name, array in arrays.items()
+        if name.startswith(_INGREDIENT)
+    }
+
+
+def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
+    if arrays[name].dtype.kind not in "iuf":
+        raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
+    with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
+        return arrays[name].astype(float, copy=False)
+
+
+def _dense(M: Any) -> Matrix:
+    """Make a dense matrix; the values of a full one are viewed, not copied."""
+    rows, columns = M.shape
+    full = M.nnz == rows * columns and M.has_canonical_format
+    return M.data.reshape(columns, rows).T if full else M.toarray()
+
+
+def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
+    """Put a matrix together; unchecked, an index out of range crashes a product."""
+    data = _vector(arrays, f"{name}_data")
+    if not np.isfinite(data).all():
+        raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
+    indices, indptr, shape = (arrays[f"{name}_{part}"] for part in _PARTS[1:])
+    if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
+        raise ValueError(f"{name}_indices, _indptr and _shape must hold integers")
+    try:
+        return compressed(data, indices, indptr, tuple(shape.tolist()))
+    except (ValueError, TypeError, OverflowError) as e:
+        raise ValueError(f"{name} is no matrix in CSC parts: {e}") from None
+
+
+def compressed(
+    data: NDArray[Any], indices: NDArray[Any], indptr: NDArray[Any], shape: Any
+) -> Matrix:
+    """Make a matrix of its compressed columns; a wrong index would crash a product.
+
+    Raises
+    ------
+    ValueError, TypeError, OverflowError
+        When they fit neither each other nor `shape`.
+
+    """
+    if (
+        indptr[1:] < indptr[:-1]
+    ).any():  # scipy (1.17.1) looks at differences: overflow
+        raise ValueError("indptr decreases")
+    M = csc_array((data, indices, indptr), shape=shape)
+    M.check_format(full_check=True)
+    return canonical(M)
+
+
+def canonical(M: Matrix) -> Matrix:
+    """Sort the entries of a sparse matrix and add up those of one place.
+
+    Somebody else's need not be so, and what is frozen cannot be made so later.
+    """
+    if M.has_canonical_format:
+        return M
+    M = M.copy()
+    M.sum_duplicates()
+    return M

@@ -1,0 +1,245 @@
+"""Arrays of a result folder, stored once by content: ``FOLDER/vectors/DIGEST.npz``."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import InputError, shortened
+from harness.files import npz
+from harness.files.durable import replace_file
+from harness.history import History, checked
+from harness.plugin import Fields
+from harness.solution import Solution, Status
+
+Arrays = Mapping[str, NDArray[Any]]
+
+_DIGEST = re.compile("[0-9a-f]{16}")
+_POINT = ("x", "y", "z", "z_box")
+_ALWAYS = ("points", "cells", "bodies", "displacement")
+_OPTIONAL = ("contact_nodes", "contact_forces")
+_NODAL = "nodal_"
+_HISTORY = "history_"
+
+
+def save_solution(folder: Path, solution: Solution) -> str:
+    """Store a primal-dual point and its history; return the digest of both."""
+    return save(folder, point_arrays(solution))
+
+
+def load_solution(folder: Path, digest: str, status: Status) -> Solution:
+    """Load a stored point as a `Solution` that claims `status`.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged.
+
+    """
+    with _restorable():
+        return read_point(_path(folder, digest), status)
+
+
+def load_history(folder: Path, digest: str) -> History:
+    """Load the history of a stored point, without the point; empty if it has none.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged, or its content is not that of the digest.
+
+    """
+    with _restorable():
+        path, arrays = _as_stored(folder, digest, ())
+        return _history(path, arrays)
+
+
+def save_fields(folder: Path, fields: Fields) -> str:
+    """Store a deformed state and return its digest."""
+    return save(folder, field_arrays(fields))
+
+
+def field_arrays(fields: Fields) -> Arrays:
+    """List the arrays of a deformed state by name."""
+    arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
+    arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
+    return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
+
+
+def load_fields(folder: Path, digest: str) -> Fields:
+    """Load a stored deformed state.
+
+    Raises
+    ------
+    InputError
+        When it is missing or damaged, or its content is not that of the digest.
+
+    """
+    with _restorable():
+        _, arrays = _as_stored(folder, digest, _ALWAYS)
+    nodal = _with_prefix(_NODAL, arrays)
+    known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
+    return Fields(nodal=nodal, **known)
+
+
+def write_point(path: Path, solution: Solution) -> None:
+    """Write the point of a solution, and its history, to a file of its own."""
+    write_arrays(path, point_arrays(solution))
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write arrays to a file of their own."""
+    with path.open("wb") as file:  # given a name, savez would append .npz to it
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_point(path: Path, status: Status) -> Solution:
+    """Read what `write_point` wrote, as a `Solution` that claims `status`."""
+    arrays = read_arrays(path, _POINT)
+    x, y, z, z_box = (arrays[name] for name in _POINT)
+    history = _history(path, arrays)
+    return Solution(status=status, x=x, y=y, z=z, z_box=z_box, history=history)
+
+
+def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Read an npz file, never unpickling.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no npz, is larger than `harness.files.datafile`
+        allows, or lacks one of the `expected` arrays.
+
+    """
+    return _expected(path, npz.read, expected)
+
+
+def mapped_arrays(
+    path: Path, expected: tuple[str, ...], *, limited: bool = True
+) -> dict[str, NDArray[Any]]:
+    """Do as `read_arrays`, but map what can be mapped; see `harness.files.npz`.
+
+    limited : whether the size of a file that can be mapped has the limit, too
+
+    Raises
+    ------
+    InputError
+        As `read_arrays`.
+
+    """
+
+    def mapped(path: Path) -> dict[str, NDArray[Any]]:
+        try:
+            return npz.mapped(path, limited=limited)
+        except ValueError:  # an npz file of somebody else
+            return npz.read(path)
+
+    return _expected(path, mapped, expected)
+
+
+def _expected(
+    path: Path,
+    read: Callable[[Path], dict[str, NDArray[Any]]],
+    expected: tuple[str, ...],
+) -> dict[str, NDArray[Any]]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            arrays = read(path)
+    except InputError:
+        raise
+    except Exception:  # what a text, a pickle, a damaged archive lead zipfile to raise
+        raise InputError(
+            f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
+        ) from None
+    if missing := [name for name in expected if name not in arrays]:
+        raise InputError(f"{path}: {', '.join(missing)} missing")
+    return arrays
+
+
+def point_arrays(solution: Solution) -> Arrays:
+    """List the four vectors of a point, and the columns of its history, by name."""
+    point = {name: getattr(solution, name) for name in _POINT}
+    return point | {_HISTORY + name: v for name, v in solution.history.items()}
+
+
+def _history(path: Path, arrays: Arrays) -> History:
+    """Find the history among the arrays of a point; none in files of old."""
+    try:
+        return checked(_with_prefix(_HISTORY, arrays))
+    except ValueError as e:
+        raise InputError(f"{path}: malformed history: {e}") from None
+
+
+def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
+    """Select by the start of a name, and cut it off."""
+    return {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }
+
+
+@contextmanager
+def _restorable() -> Iterator[None]:
+    """Say of a file of a result folder what can be done."""
+    try:
+        yield
+    except InputError as e:
+        raise InputError(f"{e}; restore the file, or run with --fresh") from None
+
+
+def _as_stored(
+    folder: Path, digest: str, expected: tuple[str, ...]
+) -> tuple[Path, dict[str, NDArray[Any]]]:
+    """Read arrays whose content must be that of the digest."""
+    path = _path(folder, digest)
+    arrays = read_arrays(path, expected)
+    if digest_of(arrays) != digest:
+        raise InputError(f"{path}: its content is not what was stored")
+    return path, arrays
+
+
+def is_stored(folder: Path, digest: str) -> bool:
+    """Whether a folder has arrays of that digest."""
+    return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
+
+
+def _path(folder: Path, digest: str) -> Path:
+    """Locate stored arrays; what is no digest could lead out of the folder."""
+    if not _DIGEST.fullmatch(digest):
+        raise InputError(
+            f"{folder}: {shortened(digest)!r} is no digest; expected 16 hex digits"
+        )
+    return folder / "vectors" / f"{digest}.npz"
+
+
+def save(folder: Path, arrays: Arrays) -> str:
+    """Write arrays under the digest of their content, unless a folder has them."""
+    digest = digest_of(arrays)
+    path = _path(folder, digest)
+    if path.exists():
+        return digest
+    archive = BytesIO()
+    np.savez(archive, **arrays)  # type: ignore[arg-type]
+    replace_file(path, archive.getbuffer())  # before the line that will refer to it
+    return digest
+
+
+def digest_of(arrays: Arrays) -> str:
+    """Hash names, types, shapes and values, not the archive, which holds dates."""
+    content = sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
+        content.update(array.tobytes())
+    return content.hexdigest()[:16]

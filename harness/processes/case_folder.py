@@ -1,0 +1,136 @@
+"""Built cases on disk: ``FOLDER/DIGEST.npz``, a QP under the digest of its content.
+
+``FOLDER/KEY.json`` says which QP a case is: the key names the case and the environment
+that it was built in, so that another version of the code builds its own. Several
+processes may use one folder. An entry whose content is not that of its digest is built
+anew, and so is one that another user wrote: a folder that somebody sent could else hold
+another QP under the name of a case, with verdicts that are true of that one. So entries
+are signed with a key that lies outside, ``~/.local/state/mortarbench/key``.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from hashlib import blake2b, file_digest, sha256
+from hmac import compare_digest
+from pathlib import Path
+from secrets import token_bytes
+from tempfile import NamedTemporaryFile
+from typing import Any
+
+from harness.files.durable import replace_file
+from harness.names import CaseName
+
+_KEY_BYTES = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """A built case."""
+
+    qp: Path  #: see `harness.files.qpfile`
+    digest: str  #: of the content of that file
+    meta: Mapping[str, Any]  #: of the case, as the generator told it
+
+
+def entry(
+    folder: Path,
+    name: CaseName,
+    environment: str,
+    make: Callable[[Path], Mapping[str, Any]],
+) -> Entry:
+    """Find a case, or have it built by the one process that comes first.
+
+    folder : made if need be, in one that is there
+    environment : digest of what the case is built with
+    make : writes the QP to a file and returns the meta data; what it raises comes
+        through and leaves no entry
+    """
+    folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
+    identity = [name.family, name.params, name.form, environment]
+    key = sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+    with _held(folder / f"{key}.lock"):
+        found = _found(folder, key)
+        if found is not None:
+            return found
+        new = folder / f"{key}.new"
+        try:
+            meta = make(new)
+            digest = content_digest(new)
+            os.replace(new, folder / f"{digest}.npz")
+        finally:
+            new.unlink(missing_ok=True)
+        index = {"digest": digest, "name": identity, "meta": meta}
+        text = json.dumps({**index, "signature": _signature(index)})
+        replace_file(folder / f"{key}.json", text.encode())
+        return Entry(qp=folder / f"{digest}.npz", digest=digest, meta=meta)
+
+
+def content_digest(path: Path) -> str:
+    """Hash the content of a file."""
+    with path.open("rb") as file:
+        return file_digest(file, lambda: blake2b(digest_size=12)).hexdigest()
+
+
+def _found(folder: Path, key: str) -> Entry | None:
+    """Look up an entry; None where there is none, or none that can be trusted."""
+    try:
+        index = json.loads((folder / f"{key}.json").read_text("utf-8"))
+        signature = index.pop("signature")
+        if not compare_digest(signature, _signature(index)):
+            return None
+        path = folder / f"{index['digest']}.npz"
+        if content_digest(path) != index["digest"]:
+            return None
+        return Entry(qp=path, digest=index["digest"], meta=index["meta"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def _signature(index: Mapping[str, Any]) -> str:
+    """Sign an entry, so that no other user can have written it."""
+    text = json.dumps(index, sort_keys=True).encode()
+    return blake2b(text, key=user_key(), digest_size=16).hexdigest()
+
+
+@cache
+def user_key() -> bytes:
+    """Read the key of this user, made at the first time.
+
+    Where no file can keep it, it is another one in every process: entries of earlier
+    runs are built again.
+    """
+    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    path = Path(os.path.expanduser(state)) / "mortarbench" / "key"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.exists():
+            with NamedTemporaryFile(dir=path.parent) as new:
+                new.write(token_bytes(_KEY_BYTES))
+                new.flush()
+                with suppress(FileExistsError):  # another process was first
+                    os.link(new.name, path)
+        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with os.fdopen(fd, "rb") as file:
+            private = os.fstat(fd).st_uid == os.getuid()
+            key = file.read(_KEY_BYTES)
+    except OSError:
+        return token_bytes(_KEY_BYTES)
+    return key if private and len(key) == _KEY_BYTES else token_bytes(_KEY_BYTES)
+
+
+@contextmanager
+def _held(lock: Path) -> Iterator[None]:
+    """Have one process at a time look up or build a case."""
+    fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)  # which unlocks

@@ -1,0 +1,170 @@
+"""The process that builds cases: the code of families, away from what counts.
+
+It answers the requests of `harness.processes.protocol` with these of its own:
+
+* ``{"build": NAME, "qp": PATH, "keep": N}``: it builds the case, writes its QP to PATH
+  and says ``{"event": "done", "meta": {…}}``, with the digest of its numbers
+* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
+  point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
+  with bounds of its error, and the deformed state in ``fields`` where there is one
+* ``{"solve": PATH, "point": PATH}``: the reference solve of the QP in the first file,
+  for verdicts that residuals cannot give; it writes a point to the second, and says
+  ``{"event": "done", "found": true}``, or false where it finds none
+
+or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME
+is ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to
+stay in memory. What leads back from a point to the bodies is code, which no file can
+hold: a case that is on file is built again when a point of it comes.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from harness.build import build, unbuilt
+from harness.files.qpfile import load_qp, save_qp
+from harness.files.store import (
+    digest_of,
+    field_arrays,
+    point_arrays,
+    read_point,
+    write_arrays,
+    write_point,
+)
+from harness.names import CaseName, canonical
+from harness.plugin import Case, Family, Reference
+from harness.processes.protocol import Events, answer_requests
+from harness.qp import QP
+from harness.recipe import NO_MAKERS, Maker
+from harness.record import finite
+from harness.solution import Solution, Status
+from harness.verify.verdicts import certified, note_of, plain, quantities_of
+
+MOST_CERTIFIED = 10_000  #: points whose bounds are kept
+
+
+class Generator:
+    """Builds cases of `families`, with the injected `reference` solve."""
+
+    def __init__(
+        self,
+        families: Mapping[str, Family],
+        reference: Reference,
+        operators: Mapping[str, Maker] = NO_MAKERS,
+    ) -> None:
+        self._families = families
+        self._operators = operators
+        self._reference = reference
+        self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
+        self._build_seconds = 0.0  # of the last case that was built
+        self._bounds: dict[
+            tuple[str, str], tuple[dict[str, Any], str]
+        ] = {}  # certified
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Answer one request, whatever the family's code does."""
+        if "solve" in request:
+            return self._solved(Path(request["solve"]), Path(request["point"]))
+        name = CaseName(**(request.get("build") or request["describe"]))
+        try:
+            case = self._case(name, request["keep"])
+        except (Exception, SystemExit) as e:  # the family's code
+            text = unbuilt(canonical(name, self._families[name.family]), e)
+            return {"unbuilt": text, "trace": traceback.format_exc()}
+        if "build" in request:
+            return self._written(case, name, Path(request["qp"]))
+        return self._described(case, name, request)
+
+    def _described(
+        self, case: Case, name: CaseName, request: dict[str, Any]
+    ) -> dict[str, Any]:
+        s = read_point(Path(request["point"]), Status.SOLVED)
+        start = perf_counter()
+        quantities, note = quantities_of(case, s)
+        seconds = perf_counter() - start
+        bounds, objection = self._certified(case, name, s)
+        notes = [text for text in (note, objection) if text]
+        if request["fields"] is not None and case.fields is not None:
+            try:
+                fields = field_arrays(case.fields(s))
+            except Exception as e:  # the family's code; it must not lose the record
+                notes.append(note_of("fields", e))
+            else:
+                write_arrays(Path(request["fields"]), fields)
+        return {
+            "quantities": quantities,
+            "bounds": finite(bounds),
+            "notes": notes,
+            "seconds": seconds,
+        }
+
+    def _certified(
+        self, case: Case, name: CaseName, s: Solution
+    ) -> tuple[dict[str, Any], str]:
+        """Bound the error of a point; one that came before is not certified again.
+
+        Most solvers give the same digits at each repeat. Only the first takes time, and
+        only its record has a `certify_seconds`.
+        """
+        key = canonical(name, self._families[name.family]), digest_of(point_arrays(s))
+        if key in self._bounds:
+            bounds, objection = self._bounds[key]
+            return {
+                k: v for k, v in bounds.items() if k != "certify_seconds"
+            }, objection
+        while len(self._bounds) >= MOST_CERTIFIED:
+            del self._bounds[next(iter(self._bounds))]
+        self._bounds[key] = certified(case, s)
+        return self._bounds[key]
+
+    def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
+        try:
+            write_point(point, self._reference(self._loaded(qp)))
+        except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+            return {"found": False}
+        return {"found": True}
+
+    def _loaded(self, qp: Path) -> QP:
+        return load_qp(qp, operators=self._operators)[0]
+
+    def _case(self, name: CaseName, keep: int) -> Case:
+        family = self._families[name.family]
+        key = canonical(name, family)
+        case = self._cases.pop(key, None)
+        while len(self._cases) >= keep:  # before building: two may be too large
+            del self._cases[next(iter(self._cases))]
+        if case is None:
+            start = perf_counter()
+            case = build(name, family, self._reference)
+            self._build_seconds = perf_counter() - start
+        self._cases[key] = case
+        return case
+
+    def _written(self, case: Case, name: CaseName, path: Path) -> dict[str, Any]:
+        meta = {
+            "name": canonical(name, self._families[name.family]),
+            "scale": case.scale,
+            "constant": case.constant,
+        }
+        digest = save_qp(path, case.qp, plain(meta), recipe=True)
+        seconds = {
+            "build_seconds": self._build_seconds,
+            "dualise_seconds": case.dualise_seconds,
+        }
+        return {"meta": {**meta, **seconds, "qp": digest}}
+
+
+def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
+    """Answer requests until there are no more."""
+
+    def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:
+        events.start()
+        return generator.answer(request)
+
+    answer_requests(handle, lambda: None, request_fd, reply_fd)

@@ -1,0 +1,345 @@
+"""One measurement by a worker process, judged: what `run` and `solve` share."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import stat
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from io import BytesIO
+from math import inf, isinf
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from typing import Any
+from zipfile import ZIP_STORED, ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.errors import FaultError
+from harness.files.qpfile import save_qp
+from harness.files.store import write_point
+from harness.history import checked
+from harness.plugin import Case, Reference
+from harness.processes.case_folder import content_digest
+from harness.processes.protocol import MOST_ECHOED
+from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
+from harness.qp import QP
+from harness.record import Record, Verdict
+from harness.solution import Solution, Status
+from harness.verify.measure import Measurement, one_line
+from harness.verify.optimum import Proves, proves
+from harness.verify.verdicts import certified, has_point, judged, noted, quantities_of
+
+MOST_HISTORY = 2**28  #: bytes of a history, and of what a file has around its arrays
+OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
+OWN_SECONDS_PER_REPEAT = (
+    3e-4  #: 0.12 ms on a busy machine, so that none is accused of it
+)
+FAR_LESS = 20.0  #: a repeat that is so many times faster …
+LEAST_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
+LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
+
+_SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
+_POINT = ("x", "y", "z", "z_box")
+_HISTORY = "history_"
+_KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "FIFO", stat.S_IFLNK: "symbolic link"}
+
+_MEASURED = (
+    "prepare_seconds",
+    "solve_seconds",
+    "total_seconds",
+    "prepare_peak_mib",
+    "solve_peak_mib",
+    "inner",
+    "first_seconds",
+)
+
+
+def measured(
+    worker: WorkerProcess,
+    qp: QP,
+    record: Record,
+    request: Mapping[str, Any],
+    *,
+    time_limit: float,
+    memory_limit: float,
+    prove: Proves,
+) -> tuple[Record, Solution | None]:
+    """Fill in `record` by one measurement; no solution where the worker ended.
+
+    request : to the worker, see `harness.processes.worker`; less what stands in the
+        record. The point is in the file ``out`` afterwards, as we have read it
+    time_limit, memory_limit : s and MiB
+    prove : finds the optimum where residuals cannot decide, see
+        `harness.verify.optimum`
+
+    Raises
+    ------
+    FaultError
+        When the measurement failed for a reason that is not the solver's: a worker that
+        was not started or was killed before its solve, a full disk, a lost file.
+
+    """
+    limited = {} if isinf(memory_limit) else {"memory_limit": memory_limit}
+    started = datetime.now(UTC).isoformat(timespec="milliseconds")
+    out = Path(request["out"])
+    returned = out.with_name(f"{out.name}.returned")
+    try:
+        _clear(out, returned)
+        reply = worker.ask(
+            {**request, **limited, "out": str(returned), "tol": record.tol},
+            time_limit=time_limit,
+            memory_limit=memory_limit,
+        )
+        if reply.fault:
+            raise FaultError(f"{record.solver} on {record.case}: {reply.message}")
+        record = record.but(
+            sizes=qp.sizes,
+            started=started,
+            message=reply.message,
+            peak_mib=reply.peak_mib,
+            threads=reply.threads,
+            cpu=reply.cpu,
+        )
+        if reply.answer is None:
+            return record.but(status=reply.verdict), None
+        solution = _solution(returned, qp, reply.answer)
+        _clear(out, returned)
+        if has_point(solution):
+            write_point(out, solution)
+    except OSError as e:
+        what = f"{e.filename or out}: {e.strerror or e}"
+        raise FaultError(f"{record.solver} on {record.case}: {what}") from None
+    measurement, *notes = _believed(reply, solution)
+    if not notes:
+        notes = _cached(measurement, worker.first_seconds, (record.qp, record.tol))
+    record = noted(judged(record, qp, measurement, prove), reply.message, *notes)
+    return _within(memory_limit, record).but(
+        canary_seconds=reply.answer["canary_seconds"]
+    ), solution
+
+
+def _clear(*paths: Path) -> None:
+    """Remove what lies there, whatever a solver has made of it."""
+    for path in paths:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+
+
+def _solution(path: Path, qp: QP, answer: Mapping[str, Any]) -> Solution:
+    """Read what a worker says that its solver returned; it fits `qp`, or has failed."""
+    claimed = Status(answer["claimed"])
+    try:
+        point = _point(path, qp)
+    except _ForeignPointError as e:
+        message = f"its point came back as {e}"
+        return Solution.without_point(qp, Status.FAILED, message)
+    return replace(
+        point,
+        status=claimed,
+        iterations=answer["iterations"],
+        counts=answer["counts"],
+        reported={
+            k: one_line(v) if isinstance(v, str) else v
+            for k, v in answer["reported"].items()
+            if v is not None
+        },
+        message=one_line(answer["message"]),
+    )
+
+
+class _ForeignPointError(Exception):
+    """A file is no point of the QP; the message says what it is."""
+
+
+def _point(path: Path, qp: QP) -> Solution:
+    """Read a point that somebody else wrote: nothing is opened that could block.
+
+    Raises
+    ------
+    _ForeignPointError
+        When it is no file, too large, or holds anything but vectors that fit `qp` and a
+        history.
+
+    """
+    try:
+        at = path.lstat()
+        if not stat.S_ISREG(at.st_mode):
+            kind = _KINDS.get(stat.S_IFMT(at.st_mode), "device")
+            raise _ForeignPointError(f"a {kind}")
+        most = 8 * (2 * qp.q.size + qp.b.size + qp.h.size) + MOST_HISTORY
+        if at.st_size > most:
+            raise _ForeignPointError(f"{at.st_size} bytes, expected at most {most}")
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        with os.fdopen(os.open(path, flags), "rb") as file:
+            content = file.read(most + 1)
+    except FileNotFoundError:
+        raise _ForeignPointError("no file") from None
+    try:
+        arrays = _arrays(content)
+        history = {k[len(_HISTORY) :]: v for k, v in arrays.items() if k not in _POINT}
+        x, y, z, z_box = (arrays[name] for name in _POINT)
+        point = Solution(
+            status=Status.FAILED, x=x, y=y, z=z, z_box=z_box, history=checked(history)
+        )
+    except Exception as e:  # bytes of any kind meet numpy's and zipfile's parsers
+        raise _ForeignPointError(f"no point: {one_line(e)[:MOST_ECHOED]}") from None
+    if (mismatch := point.mismatch(qp)) is not None:
+        raise _ForeignPointError(f"another one: {mismatch}")
+    return point
+
+
+def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
+    """Read arrays as `harness.files.store` writes points: as they are, in a zip."""
+    with ZipFile(BytesIO(content)) as archive:
+        for member in archive.infolist():
+            name = member.filename.removesuffix(".npy")
+            if name not in _POINT and not name.startswith(_HISTORY):
+                raise ValueError(f"it holds {name!r}")
+            if member.file_size > len(content) or member.compress_type != ZIP_STORED:
+                raise ValueError(f"{name} is compressed")
+    with np.load(BytesIO(content), allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    for name in _POINT:
+        if arrays[name].dtype != np.float64:
+            raise ValueError(f"{name} has dtype {arrays[name].dtype}")
+    return arrays
+
+
+def _believed(reply: Reply, solution: Solution) -> tuple[Measurement, *tuple[str, ...]]:
+    """Take the worker's times where they agree with our clock; else ours, and say so.
+
+    It may have used no more time than passed between request and end, and no less than
+    the CPU time that the kernel counted, but for what we do ourselves meanwhile.
+    """
+    answer, clock = reply.answer, reply.clock
+    assert answer is not None
+    told = {name: answer[name] for name in _MEASURED}
+    if clock is None or told["total_seconds"] is None:
+        return (Measurement(solution=solution, **told),)
+    inner = told["inner"]
+    times = inner + (told["first_seconds"] is not None)
+    reported = (told["first_seconds"] or 0.0) + inner * told["total_seconds"]
+    phases = told["prepare_seconds"] + told["solve_seconds"]
+    least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
+    adds_up = abs(phases - told["total_seconds"]) <= 1e-6 * phases + 1e-9
+    possible = adds_up and min(told["prepare_seconds"], told["solve_seconds"]) >= 0
+    if possible and least <= reported <= clock.most:
+        return (Measurement(solution=solution, **told),)
+    ours = dict.fromkeys(("prepare_seconds", "solve_seconds", "first_seconds"))
+    told |= {**ours, "total_seconds": clock.seen / times}
+    return Measurement(solution=solution, **told), (
+        f"the worker told of {reported:.3g} s of work; by our clock it was busy for "
+        f"{clock.least:.3g} s, and done after {clock.seen:.3g} s: the time is ours"
+    )
+
+
+def _cached(
+    m: Measurement, first_seconds: dict[Hashable, float], what: Hashable
+) -> list[str]:
+    """Say so where a repeat took far less than the first time.
+
+    first_seconds : of each QP and tolerance, in the first measurement; `what` is added
+    """
+    if m.total_seconds is None:
+        return []
+    first = m.first_seconds or m.total_seconds
+    before = first_seconds.setdefault(what, first)
+    compared = [
+        (first, m.total_seconds, LEAST_GAIN_SECONDS, "solves"),
+        (before, first, LEAST_GAIN_BETWEEN_SECONDS, "measurements"),
+    ]
+    return [
+        f"took {slow:.3g} s the first time and {fast:.3g} s later: something is kept "
+        f"between {these}, or was loaded at the first"
+        for slow, fast, gain, these in compared
+        if slow > FAR_LESS * fast and slow - fast > gain
+    ]
+
+
+def _within(limit: float, record: Record) -> Record:
+    """Say so where an answer went beyond the memory limit, or failed because of it."""
+    if record.status is Verdict.DECLINED:
+        return record
+    peak = record.peak_mib
+    if peak is not None and peak > limit:
+        message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
+        return noted(record.but(status=Verdict.MEMORY_LIMIT), message)
+    succeeded = record.status in (Verdict.VERIFIED, Verdict.INACCURATE)
+    if not succeeded and out_of_memory(record.message, peak, limit):
+        return record.but(status=Verdict.MEMORY_LIMIT)
+    return record
+
+
+def measured_once(
+    command: list[str], case: Case, record: Record, reference: Reference
+) -> tuple[Record, Solution | None]:
+    """Do as `measured`, with a worker for this one measurement and without limits.
+
+    command : starts the worker; two file descriptors are appended to it
+    reference : solves the QP where residuals cannot decide
+
+    Raises
+    ------
+    FaultError
+        As `measured`, after a second try.
+
+    """
+    with ExitStack() as stack:
+        scratch = stack.enter_context(scratch_folder())
+        worker = WorkerProcess(command, scratch / "worker.log")
+        stack.callback(worker.close)
+        qp_file = scratch / "qp.npz"
+        digest = save_qp(qp_file, case.qp, {"name": record.case}, recipe=True)
+        record = record.but(qp=digest)
+        request = {
+            "qp": str(qp_file),
+            "digest": content_digest(qp_file),
+            "out": str(scratch / "point.npz"),
+        }
+        once = partial(
+            measured, worker, case.qp, record, request,
+            time_limit=inf, memory_limit=inf, prove=proves(reference),
+        )  # fmt: skip
+        try:
+            record, solution = once()
+        except FaultError:
+            record, solution = once()
+    if solution is None or record.status is Verdict.DECLINED:
+        return record, solution
+    quantities, note = quantities_of(case, solution)
+    bounds, objection = certified(case, solution)
+    record = noted(record, note, objection).but(quantities=quantities, **bounds)
+    return record, solution
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder for temporary files, which goes when it is left.
+
+    Those that a killed process could not remove go first: who uses one holds a lock in
+    it, which ends with the process.
+    """
+    for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError):
+            if stale.lstat().st_uid == os.getuid() and not stale.is_symlink():
+                lock = os.open(stale / _LOCK, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(stale)
+                finally:
+                    os.close(lock)
+    with TemporaryDirectory(prefix=_SCRATCH) as name:
+        lock = os.open(Path(name) / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield Path(name)
+        finally:
+            os.close(lock)

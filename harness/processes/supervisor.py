@@ -1,0 +1,581 @@
+"""The parent's side of a worker process: ask it, limit it, and tell how it died.
+
+Only SIGKILL to all processes that it started stops every solver: C code ignores alarms,
+and some ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
+keeps them together. Memory is limited by looking at what is held, since a limit on
+address space counts what libraries reserve and never touch. Needs Linux's /proc.
+
+What a worker says is not believed (`harness.processes.protocol`), its times least of
+all: they must agree with the clock of the parent and with the CPU time that the kernel
+counts. While one worker is asked, those that share its CPU are stopped by SIGSTOP:
+nothing that a solver leaves running in its process disturbs another's measurement.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from select import select
+from threading import Lock
+from typing import Any, ClassVar
+from weakref import WeakSet
+
+from harness import limits
+from harness.processes import reaper
+from harness.processes.footprint import Footprint
+from harness.processes.protocol import (
+    LONGEST_REPLY,
+    ForeignReplyError,
+    checked_answer,
+    event_of,
+    measures,
+)
+from harness.record import Verdict
+from harness.verify.measure import one_line
+
+POLL_SECONDS = 0.02
+START_SECONDS = 120.0  #: for imports, and for loading a QP
+WARM_UP_SECONDS = 60.0
+POINT_SECONDS = 120.0  #: to write the point of an answer
+CLOSE_SECONDS = 1.0
+END_SECONDS = 1.0  #: for the sub-reaper to end when all below it are dead
+SETTLE_SECONDS = 0.5  #: after an answer: threads of pools go to sleep within that
+BUSY = 0.5  #: share of the time between answer and request that is too much CPU time
+LEAST_BUSY_SECONDS = 0.01  #: CPU time between answer and request that is nothing
+LOG_BYTES = 2**20  #: what a solver may print before we drop it
+LAST_WORDS = 300  #: characters of its last line that a message holds
+NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
+
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
+REPLACED = "the worker was busy while idle, and was replaced"
+
+_CPUCLOCK_SCHED = 2  #: with a process number, names its clock; see clock_getcpuclockid
+#: signals that solvers do not end by; before a solve, somebody else sent them
+_FROM_OUTSIDE = {
+    signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT,
+}  # fmt: skip
+#: last words of a process that the machine let down before it solved anything
+_MACHINE = re.compile(
+    r"No space left on device|Disk quota exceeded|Too many open files"
+    r"|Read-only file system|Input/output error|cannot be started"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clock:
+    """What the parent knows by itself of a time that a worker reports, in seconds."""
+
+    least: float  #: of CPU time, or between events less what it waited for a CPU
+    seen: float  #: from one event to the other, as they were read
+    most: float  #: from the request to the end
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reply:
+    """What came of a request: the worker's own answer, or how the worker ended."""
+
+    answer: Mapping[str, Any] | None = None
+    verdict: Verdict | None = None  #: None where there is an answer, or a fault
+    fault: bool = False  #: ours or the machine's, which `message` tells
+    message: str = ""
+    peak_mib: float | None = None  #: most memory seen from outside
+    clock: Clock | None = None  #: where a measurement was made
+    threads: int | None = None  #: of the worker, as it found by itself
+    cpu: int | None = None
+
+
+class WorkerProcess:
+    """One worker, started when it is first asked, and anew after each death.
+
+    `command` is what starts it, to which two file descriptors are appended: where it
+    reads requests, where it replies. It runs in a session of its own, on one CPU (the
+    last one that we may use), with one thread in every library that obeys its
+    environment variable. What it prints goes to the file `log`.
+    """
+
+    first_seconds: dict[Hashable, float]  #: for who asks: what took how long at first
+
+    _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
+    _listing: ClassVar[Lock] = Lock()
+
+    def __init__(self, command: list[str], log: Path) -> None:
+        self.first_seconds = {}
+        self._command = command
+        self._log = log
+        self._process: subprocess.Popen[bytes] | None = None  # the sub-reaper
+        self._worker = 0  # its child
+        self._mark = ""
+        self._cpu = -1
+        self._requests = self._replies = -1  # our ends of the two pipes
+        self._unread = bytearray()
+        self._looked = 0.0  # when nothing had come yet, by our clock
+        self._warms_up = True
+        self._is_stopped = self._was_busy = False
+        self._idle_since: tuple[float, float] | None = None  # our clock, its CPU time
+        self._facts: dict[str, Any] = {}  # what it told of its warm-up
+        self._footprint = Footprint()
+        self._peak_mib = 0.0
+        with self._listing:
+            self._all.add(self)
+
+    def ask(
+        self, request: Mapping[str, Any], *, time_limit: float, memory_limit: float
+    ) -> Reply:
+        """Have one measurement made.
+
+        What a solver does to its process before it is asked to solve is no fault of the
+        solve: the request goes to a new process then, once.
+
+        time_limit : s, from the worker's "start" on: neither its imports nor its
+            warm-up nor loading the QP count
+        memory_limit : MiB, of all its processes together
+        """
+        self._peak_mib = 0.0
+        self._stop_others()
+        was_busy = self._resume()
+        notes = [REPLACED] if was_busy else []
+        while True:
+            is_new = self._process is None
+            try:
+                if is_new:
+                    self._start(memory_limit)
+                answer, clock = self._asked(request, time_limit, memory_limit)
+                break
+            except _EndedError as end:
+                self._kill()
+                if end.is_early and not is_new:
+                    continue
+                return self._ended(end, memory_limit)
+            except OSError as e:  # no process, no pipe, no log: ours, or the machine's
+                self._kill()
+                return Reply(fault=True, message=one_line(e))
+        peak = self._peak_mib or None
+        facts = self._facts
+        if self._others():  # they would disturb the next measurement
+            self._kill()
+        elif self._stays_busy():
+            self._kill()
+            notes.append(REPLACED)
+        else:
+            self._idle_since = (time.monotonic(), self._cpu_seconds())
+        return Reply(
+            answer=answer,
+            message="; ".join(dict.fromkeys(notes)),
+            clock=clock,
+            peak_mib=peak,
+            **facts,
+        )
+
+    def close(self) -> None:
+        """Let the worker end by itself, soon; its children end with it."""
+        if self._process is None:
+            return
+        self._resume()
+        if self._process is None:
+            return
+        os.close(self._requests)
+        self._requests = -1
+        deadline = time.monotonic() + CLOSE_SECONDS
+        while time.monotonic() < deadline and not self._is_dead():
+            time.sleep(POLL_SECONDS / 4)
+        self._kill()
+
+    def _asked(
+        self, request: Mapping[str, Any], time_limit: float, memory_limit: float
+    ) -> tuple[dict[str, Any], Clock | None]:
+        nonce = secrets.token_hex(8)
+        with suppress(OSError):
+            self._log.write_bytes(b"")
+        asked = time.monotonic()
+        self._send({**request, "nonce": nonce})
+        self._await("start", START_SECONDS, memory_limit, nonce)
+        started, used = time.monotonic(), self._cpu_seconds()
+        waited = self._waiting_seconds()
+        oom_kills = _oom_kills()
+        try:
+            clock = None
+            if measures(request):
+                self._looked = started
+                self._await("timed", time_limit, memory_limit, nonce)
+                ended = time.monotonic()
+                used = min(self._cpu_seconds() - used, ended - started)
+                took = self._looked - started - (self._waiting_seconds() - waited)
+                clock = Clock(
+                    least=max(used, took - POLL_SECONDS),
+                    seen=ended - started,
+                    most=ended - asked,
+                )
+                self._footprint.notice(self._tree())
+                self._send({"go": nonce})
+                time_limit = POINT_SECONDS
+            answer = self._await("done", time_limit, memory_limit, nonce)
+            checked_answer(request, answer)
+        except ForeignReplyError as e:
+            raise _EndedError("done", Verdict.FAILED, str(e)) from None
+        except _EndedError as end:
+            end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
+            raise
+        self._trim_log()
+        return answer, clock
+
+    def _ended(self, end: _EndedError, memory_limit: float) -> Reply:
+        """Tell a solver's end from one that the machine or somebody brought about."""
+        peak, message, verdict = self._peak_mib or None, str(end), end.verdict
+        is_fault = end.is_fault or (
+            end.is_early
+            and (end.signal in _FROM_OUTSIDE or _MACHINE.search(message) is not None)
+        )
+        if out_of_memory(message, peak, memory_limit):
+            verdict, is_fault = Verdict.MEMORY_LIMIT, False
+        elif end.is_oom:
+            message = f"{message}: the machine ran out of memory"
+            verdict = Verdict.MEMORY_LIMIT
+            is_fault = (peak or 0.0) < limits.memory_limit_mib() / 2
+        return Reply(
+            verdict=None if is_fault else verdict,
+            fault=is_fault,
+            message=message,
+            peak_mib=peak,
+            **self._facts,
+        )
+
+    def _start(self, memory_limit: float) -> None:
+        """Start and warm up; a solver that dies of the warm-up does without one.
+
+        Who is killed from outside meanwhile is warmed up once more.
+        """
+        self._spawn(memory_limit)
+        for is_last in (False, True):
+            if not self._warms_up:
+                return
+            nonce = secrets.token_hex(8)
+            try:
+                self._send({"warm_up": True, "nonce": nonce})
+                told = self._await("warm", WARM_UP_SECONDS, memory_limit, nonce)
+                self._facts = _facts(told)
+                return
+            except _EndedError as end:
+                if end.is_fault:
+                    raise
+                self._warms_up = end.signal in _FROM_OUTSIDE and not is_last
+                self._kill()
+                self._spawn(memory_limit)
+
+    def _spawn(self, memory_limit: float) -> None:
+        usable = os.sched_getaffinity(0)
+        self._cpu, self._mark = max(usable), secrets.token_hex(16)
+        self._footprint = Footprint()
+        self._unread = bytearray()
+        their_requests, self._requests = os.pipe()
+        self._replies, their_replies = os.pipe()
+        try:
+            self._log.write_bytes(b"")
+            # appending: it survives our truncating it
+            with self._log.open("ab") as log:
+                self._process = subprocess.Popen(
+                    [
+                        sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
+                        str(their_requests), str(their_replies), *self._command,
+                    ],
+                    stdin=subprocess.PIPE,  # closed when we die: the tree dies, too
+                    stdout=log,
+                    stderr=log,
+                    env=os.environ
+                    | ONE_THREAD
+                    | {limits.VARIABLE: str(memory_limit), reaper.MARK: self._mark},
+                    pass_fds=(their_requests, their_replies),
+                    start_new_session=True,
+                )  # fmt: skip
+        finally:
+            os.close(their_requests)
+            os.close(their_replies)
+        self._await("ready", START_SECONDS, memory_limit)
+        tree = self._tree()
+        if not tree:
+            raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
+        self._worker = tree[0]  # what comes later is listed later
+
+    def _send(self, request: Mapping[str, Any]) -> None:
+        with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
+            os.write(self._requests, (json.dumps(request) + "\n").encode())
+
+    def _await(
+        self, event: str, limit: float, memory_limit: float, nonce: str = ""
+    ) -> dict[str, Any]:
+        """Wait for an event; whatever else happens is raised as `_EndedError`."""
+        deadline = time.monotonic() + limit
+        while True:
+            dead = self._is_dead()  # before reading: it may reply and then die
+            has_more = self._read(0 if dead else POLL_SECONDS)
+            if (line := self._next_line()) is not None:
+                return self._understood(line, event, nonce)
+            if len(self._unread) > LONGEST_REPLY:
+                how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
+                raise _EndedError(event, Verdict.FAILED, how)
+            self._looked = time.monotonic()
+            if dead and not has_more:
+                raise _EndedError(event, Verdict.CRASHED, *self._death())
+            if self._looked > deadline:
+                raise _EndedError(
+                    event, Verdict.TIME_LIMIT, f"killed after {limit:g} s"
+                )
+            self._check_memory(event, memory_limit)
+            self._trim_log()
+
+    def _understood(self, line: bytes, event: str, nonce: str) -> dict[str, Any]:
+        try:
+            reply = event_of(line, nonce, event)
+        except ForeignReplyError as e:
+            raise _EndedError(event, Verdict.FAILED, str(e)) from None
+        if reply.pop("event") == "fault":
+            how = one_line(reply.get("what", ""))
+            raise _EndedError(event, Verdict.FAILED, how, is_fault=True)
+        return reply
+
+    def _trim_log(self) -> None:
+        with suppress(OSError):  # the folder is gone: whoever writes there will say so
+            if self._log.stat().st_size > LOG_BYTES:
+                os.truncate(self._log, 0)
+
+    def _read(self, timeout: float) -> bool:
+        """Take in what the worker has replied, waiting at most `timeout` seconds.
+
+        Returns whether anything is there to be looked at.
+        """
+        if b"\n" in self._unread:  # two replies came at once
+            return True
+        has_more = False
+        while select([self._replies], [], [], 0 if has_more else timeout)[0]:
+            chunk = os.read(self._replies, 2**16)
+            if not chunk:  # closed: the worker is dying, or its solver closed all
+                time.sleep(timeout)
+                break
+            self._unread += chunk
+            has_more = True
+            if b"\n" in chunk or len(self._unread) > LONGEST_REPLY:
+                break
+        return has_more
+
+    def _next_line(self) -> bytes | None:
+        line, newline, rest = self._unread.partition(b"\n")
+        if not newline:
+            return None
+        self._unread = rest
+        return bytes(line)
+
+    def _check_memory(self, event: str, limit: float) -> None:
+        held = self._footprint.mib(self._tree(), limit)
+        self._peak_mib = max(self._peak_mib, held)
+        if held > limit:
+            how = f"killed at {held:.0f} MiB, above the limit of {limit:g} MiB"
+            raise _EndedError(event, Verdict.MEMORY_LIMIT, how)
+
+    def _tree(self) -> list[int]:
+        """List the worker, what it has started, and what these have."""
+        return [] if self._process is None else reaper.descendants(self._process.pid)
+
+    def _others(self) -> list[int]:
+        return [process for process in self._tree() if process != self._worker]
+
+    def _cpu_seconds(self) -> float:
+        """Give the CPU time of the worker, all its threads, as the kernel counts it."""
+        with suppress(OSError):  # it may have ended
+            return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
+        return 0.0
+
+    def _waiting_seconds(self) -> float:
+        """Give for how long the worker's main thread could have run, but had no CPU."""
+        with suppress(OSError, IndexError):  # no such statistics in this kernel
+            text = Path(f"/proc/{self._worker}/schedstat").read_text()
+            return int(text.split()[1]) * 1e-9
+        return 0.0
+
+    def _stop_others(self) -> None:
+        """Stop the workers that share our CPU until they are asked again."""
+        cpu = max(os.sched_getaffinity(0))
+        with self._listing:
+            others = [w for w in self._all if w is not self and w._cpu == cpu]
+        for worker in others:
+            worker._stop()
+
+    def _stop(self) -> None:
+        if self._process is None or self._is_stopped:
+            return
+        if self._others():
+            self._kill()  # started since it answered
+            return
+        self._was_busy = self._was_busy or self._has_been_busy()
+        with suppress(ProcessLookupError):
+            os.kill(self._worker, signal.SIGSTOP)
+        self._is_stopped = True
+
+    def _resume(self) -> bool:
+        """Go on where `_stop` stopped; tell if the worker was busy while it was idle.
+
+        Who was, and who has died meanwhile, is replaced when it is asked.
+        """
+        if self._process is None:
+            return False
+        if self._is_stopped:
+            with suppress(ProcessLookupError):
+                os.kill(self._worker, signal.SIGCONT)
+            self._is_stopped = False
+        else:
+            self._was_busy = self._has_been_busy()
+        was_busy, self._was_busy = self._was_busy, False
+        if was_busy or self._is_dead():
+            self._kill()
+        return was_busy
+
+    def _has_been_busy(self) -> bool:
+        if self._idle_since is None:
+            return False
+        since, used = self._idle_since
+        allowed = max(LEAST_BUSY_SECONDS, BUSY * (time.monotonic() - since))
+        return self._cpu_seconds() - used > allowed
+
+    def _stays_busy(self) -> bool:
+        """Whether threads of the worker run on although it has answered.
+
+        Threads of pools spin for a while before they sleep. One that only waits for a
+        CPU, on a machine that is not ours alone, uses none.
+        """
+        deadline = time.monotonic() + SETTLE_SECONDS
+        pause, used = POLL_SECONDS / 100, self._cpu_seconds()
+        while self._runs():
+            if time.monotonic() > deadline:
+                return self._cpu_seconds() - used > LEAST_BUSY_SECONDS
+            time.sleep(pause)
+            pause = min(2 * pause, POLL_SECONDS)
+        return False
+
+    def _runs(self) -> bool:
+        with suppress(OSError):
+            tasks = os.listdir(f"/proc/{self._worker}/task")
+            return any(reaper.state(self._worker, int(t)) == "R" for t in tasks)
+        return False
+
+    def _is_dead(self) -> bool:
+        """Look without reaping: until then nobody else can get its number."""
+        assert self._process is not None
+        look = os.WEXITED | os.WNOHANG | os.WNOWAIT
+        return os.waitid(os.P_PID, self._process.pid, look) is not None
+
+    def _death(self) -> tuple[str, int]:
+        """How a dead worker ended, its last words included, and by which signal."""
+        assert self._process is not None
+        end = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
+        assert end is not None
+        number = 0
+        if end.si_code == os.CLD_EXITED:
+            how = f"exit code {end.si_status}"
+        else:
+            number = end.si_status
+            names = {s.value: s.name for s in signal.Signals}
+            how = names.get(number, f"signal {number}")
+        last = ""
+        with suppress(OSError):
+            text = self._log.read_text(errors="replace")
+            last = text.strip().rpartition("\n")[2][-LAST_WORDS:]
+        return (f"{how}: {last}" if last else how), number
+
+    def _kill(self) -> None:
+        """End all processes, and remove what they left in shared memory."""
+        if self._process is not None:
+            reaper.end_all(self._process.pid, mark=self._mark)
+            if self._process.stdin is not None:
+                self._process.stdin.close()  # the sub-reaper collects the dead and ends
+            try:
+                self._process.wait(END_SECONDS)
+            except subprocess.TimeoutExpired:  # a solver has stopped it
+                self._process.kill()
+                self._process.wait()
+            self._footprint.remove_files()
+        self._process = None
+        self._worker, self._is_stopped, self._was_busy = 0, False, False
+        self._idle_since = None
+        for fd in (self._replies, self._requests):
+            if fd != -1:
+                os.close(fd)
+        self._replies = self._requests = -1
+
+
+class _EndedError(Exception):
+    """A worker that did not come to the event we waited for.
+
+    event : that
+    verdict : on the solver, if it was after the start
+    number : of the signal that ended it, or 0
+    is_fault : it says itself that our own code failed
+    """
+
+    def __init__(
+        self,
+        event: str,
+        verdict: Verdict,
+        how: str,
+        number: int = 0,
+        *,
+        is_fault: bool = False,
+    ) -> None:
+        self.is_early = event not in ("timed", "done")
+        super().__init__(f"before solving: {how}" if self.is_early else how)
+        self.verdict = _BEFORE.get(verdict, verdict) if self.is_early else verdict
+        self.signal = number
+        self.is_fault = is_fault
+        self.is_oom = False
+
+
+def _facts(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Take what a worker says of itself, where that can be so."""
+    threads, cpus = told.get("threads"), told.get("cpus")
+    is_one = isinstance(cpus, list) and len(cpus) == 1 and type(cpus[0]) is int
+    return {
+        "threads": threads if type(threads) is int and threads > 0 else None,
+        "cpu": cpus[0] if is_one and cpus is not None else None,
+    }
+
+
+def _oom_kills() -> int:
+    """Count the processes that the kernel has killed for want of memory."""
+    with suppress(OSError), open("/proc/vmstat") as lines:
+        for line in lines:
+            if line.startswith("oom_kill "):
+                return int(line.split()[1])
+    return 0
+
+
+_EXHAUSTION = re.compile(
+    r"MemoryError|bad_?alloc|out of memory|(un|can ?not |not )(able to )?allocate"
+    r"|memory allocation|allocation (error|fail)",
+    re.IGNORECASE,
+)
+
+
+def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
+    """Tell whether what failed did so for want of memory.
+
+    Solvers answer exhaustion by an exception, an abort, a segmentation fault, a hang or
+    a false result. What gives them away is their peak or, where a single allocation
+    was refused, what the library says.
+
+    message : of the failure, its last words included
+    limit : MiB
+    """
+    near = peak_mib is not None and peak_mib >= NEAR * limit
+    return near or _EXHAUSTION.search(message) is not None
+
+
+#: running out of time before the clock started is no fault of the solver's speed
+_BEFORE = {Verdict.TIME_LIMIT: Verdict.FAILED}

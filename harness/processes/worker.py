@@ -1,0 +1,241 @@
+"""The process that one solver lives in, between measurements too.
+
+It answers the requests of `harness.processes.protocol` with these of its own:
+
+* the warm-up solves tiny QPs, so that imports which a solver puts off until its first
+  solve are not timed
+* ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
+  writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
+  without which the file may hold no operator; ``memory_limit`` in MiB;
+  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence
+* ``{"check": NAME}``: it runs one of `harness.conformance.conformance.CHECKS`
+
+Every measurement loads its QP afresh, so that nothing that a solver did to the last one
+is left.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import random
+import resource
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from harness.conformance.conformance import run_check
+from harness.files.qpfile import load_qp
+from harness.files.store import point_arrays
+from harness.plugin import Solver
+from harness.processes.case_folder import content_digest
+from harness.processes.protocol import Events, answer_requests
+from harness.qp import QP, Vector, no_rows
+from harness.recipe import NO_MAKERS, Maker
+from harness.record import finite
+from harness.solution import Solution
+from harness.verify.measure import Measurement, Prepare, measure, memory_mib
+
+_MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
+
+
+def serve(
+    solver: Solver,
+    request_fd: int,
+    reply_fd: int,
+    operators: Mapping[str, Maker] = NO_MAKERS,
+) -> None:
+    """Answer requests until there are no more.
+
+    operators : what puts an operator P of a request together, see `harness.recipe`
+    """
+    bench = _Bench(solver, operators)
+    answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
+
+
+class _Bench:
+    """One solver, what it was handed last, and the sequence that it is in."""
+
+    def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
+        self._solver = solver
+        self._operators = operators
+        self._chain: Prepare | None = None
+        self._at = -1  # the step of the sequence that came last
+        self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
+        self._ballast = np.empty(0)
+
+    def warm_up(self) -> dict[str, Any]:
+        """Solve a QP with bounds and one with rows; how that ends will show later.
+
+        A chain of springs, long enough for every branch of a solver to be taken once:
+        what is compiled, or loaded, at its first use must not be timed.
+        """
+        n = 32
+        P = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+        pull: dict[str, Any] = dict(
+            q=np.cos(np.arange(n)), lb=np.zeros(n), ub=np.full(n, np.inf)
+        )
+        one, ones = np.eye(n)[:1], np.ones((1, n))
+        no_row = dict(A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0))
+        one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
+        for rows in (no_row, one_row_each):
+            _measured_here(self._solver, QP(P=P, **pull, **rows), 1e-6)
+        canary_seconds()
+        gc.freeze()  # the modules that are loaded by now need no further collecting
+        return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
+
+    def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
+        """Measure once, or run one check."""
+        if "check" in request:
+            events.start()
+            return dict(run_check(request["check"], self._solver)._asdict())
+        path, out = Path(request["qp"]), Path(request["out"])
+        out.unlink(missing_ok=True)
+        self._shift_heap()
+        self._check(path, request.get("digest"))
+        vouched = "digest" in request  # or it may be anybody's
+        qp, _ = load_qp(path, operators=self._operators if vouched else None)
+        canary = canary_seconds()
+        _limit_memory(request.get("memory_limit"))
+        m = _measured_here(
+            self._solver,
+            qp,
+            request["tol"],
+            prepare=self._step(request),
+            sample_seconds=request.get("sample_seconds", 0.0),
+            starts=events.start,
+            ends=events.timed,
+        )
+        _limit_memory(None)
+        s = m.solution
+        _write_new(out, s)
+        return {
+            "claimed": s.status,
+            "message": s.message,
+            "iterations": s.iterations,
+            "counts": s.counts,
+            "reported": finite(dict(s.reported)),
+            "prepare_seconds": m.prepare_seconds,
+            "solve_seconds": m.solve_seconds,
+            "total_seconds": m.total_seconds,
+            "first_seconds": m.first_seconds,
+            "peak_mib": m.peak_mib,
+            "prepare_peak_mib": m.prepare_peak_mib,
+            "solve_peak_mib": m.solve_peak_mib,
+            "inner": m.inner,
+            "canary_seconds": canary,
+        }
+
+    def _shift_heap(self) -> None:
+        """Have arrays lie elsewhere than they did during the last measurement.
+
+        Where they begin relative to a cache line is chance, but would be the same for
+        as long as the process lives: two processes of one solver then differ by 10 %
+        and more, however often they are measured (Mytkowicz et al., ASPLOS 2009).
+        Varied, it is scatter, which intervals know.
+        """
+        self._ballast = np.empty(0)
+        with suppress(AttributeError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
+        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
+
+    def _step(self, request: dict[str, Any]) -> Prepare | None:
+        """Begin a sequence at its first step, and go on with it at the others."""
+        step = request.get("step")
+        if step is None or not hasattr(self._solver, "chain"):
+            return None
+        if step and self._at != step - 1:
+            raise LookupError("the process that drove the sequence so far has gone")
+        self._at = step
+        if step == 0:
+            self._chain = None
+            chain, tol = self._solver.chain, request["tol"]
+
+            def begin(qp: QP) -> Callable[[], Solution]:  # on the clock, as its step is
+                self._chain = chain(tol)
+                return self._chain(qp)
+
+            return begin
+        return self._chain
+
+    def _check(self, path: Path, digest: str | None) -> None:
+        """Refuse a file that is not what it was; one that has not changed is known."""
+        if digest is None:
+            return
+        at = path.stat()
+        seen = (at.st_ino, at.st_size, at.st_mtime_ns)
+        if self._trusted.get(digest) != seen:
+            if content_digest(path) != digest:
+                raise ValueError(f"{path.name} was changed on disk")
+            self._trusted[digest] = seen
+
+
+def canary_seconds() -> float:
+    """Time a fixed small kernel, the median of five: a drift of it is the machine's."""
+    matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
+    times = []
+    for _ in range(5):
+        start = perf_counter()
+        for _ in range(10):
+            matrix @ vector
+        times.append(perf_counter() - start)
+    return median(times)
+
+
+def _aligned(count: int) -> Vector:
+    """Make ones that begin with a cache line, so that chance does not move them."""
+    room = np.ones(count + 8)
+    start = -room.ctypes.data % 64 // 8
+    return room[start : start + count]
+
+
+def _one_thread() -> int:
+    """Return the most threads of any library, after setting those that can be set."""
+    threadpool_limits(limits=1)
+    return max((pool["num_threads"] for pool in threadpool_info()), default=1)
+
+
+def _limit_memory(mib: float | None) -> None:
+    """Have allocations fail that would exceed `mib`; None lifts the limit.
+
+    The parent looks at what is resident and kills; that comes too late for a single
+    allocation beyond all memory. RLIMIT_DATA counts what is there already as well.
+    """
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+    soft = hard
+    if mib is not None and (data := memory_mib("VmData")) is not None:
+        soft = int((data + mib) * 2**20)
+        if hard != resource.RLIM_INFINITY:
+            soft = min(soft, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+
+def _measured_here(
+    solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
+    **how: Any,
+) -> Measurement:  # fmt: skip
+    """Measure; a child that the solver forked and let return to us ends here."""
+    process = os.getpid()
+
+    def ends_here() -> None:
+        if os.getpid() != process:
+            os._exit(0)
+        ends()
+
+    return measure(solver, qp, tol, ends=ends_here, **how)
+
+
+def _write_new(path: Path, solution: Solution) -> None:
+    """Write a point to a file that is not there yet.
+
+    Where there is something, the solver put it there: the parent will say what.
+    """
+    with suppress(FileExistsError), path.open("xb") as file:
+        np.savez(file, **point_arrays(solution))  # type: ignore[arg-type]

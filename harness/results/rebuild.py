@@ -1,0 +1,46 @@
+"""The case of a stored measurement, built again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from harness.build import build, unbuilt
+from harness.errors import InputError
+from harness.files.qpfile import qp_digest
+from harness.names import assemble
+from harness.plugin import Case, Family, Reference
+from harness.record import Record
+from harness.results.folder import environment_of
+from harness.results.stored_run import plugins_needed
+
+
+def rebuilt(
+    r: Record, folder: Path, families: Mapping[str, Family], reference: Reference
+) -> Case:
+    """Build the case of a record.
+
+    Raises
+    ------
+    InputError
+        When its family is not known, or fails, or builds another QP than then.
+
+    """
+    if r.family not in families:
+        try:
+            needs = plugins_needed(environment_of(folder, r.environment))
+        except InputError:
+            needs = ""
+        raise InputError(f"unknown family {r.family!r}{needs}")
+    family = families[r.family]
+    name = assemble(family, r.params, r.form)
+    try:
+        case = build(name, family, reference)
+    except (Exception, SystemExit) as e:  # the family's code
+        raise InputError(unbuilt(r.case, e)) from None
+    if r.qp is not None and (now := qp_digest(case.qp, recipe=True)) != r.qp:
+        raise InputError(
+            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
+            "the same version of the code, of its libraries and of plug-ins"
+        )
+    return case

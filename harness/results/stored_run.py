@@ -1,0 +1,157 @@
+"""What a result folder keeps of one measurement, enough to make it again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from harness.errors import InputError
+from harness.names import CaseName, assemble, canonical
+from harness.plugin import Family, Solver
+from harness.record import Record
+from harness.registry import SolverSpec, options_of, resolve
+from harness.results.folder import environment_of, suite_text
+from harness.results.journal import read_journal
+from harness.results.work_unit import Block
+from harness.suite.suite import asked_solvers, limits, steps_up_to
+from harness.verify.verdicts import blank, plain
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capsule:
+    """One stored measurement, and what it takes to repeat it."""
+
+    record: Record
+    repeats: list[Record]  #: of the same cell: other repeats, and itself
+    cases: tuple[CaseName, ...]  #: its own is the last; of a sequence those before
+    spec: SolverSpec
+    environment: Mapping[str, Any]
+    time_limit: float  #: s
+    memory_limit: float  #: MiB
+
+
+def open_capsule(
+    folder: Path,
+    run_id: str,
+    families: Mapping[str, Family],
+    solvers: Mapping[str, Solver],
+) -> Capsule:
+    """Find one measurement and resolve its case and solver in today's registries.
+
+    run_id : or the beginning of one, if it is the only one to begin so
+
+    Raises
+    ------
+    InputError
+        When there is no such measurement, or its family, solver or one of their keys
+        is not known, or not loaded, or a file that its case rests on has changed.
+
+    """
+    records = read_journal(folder)
+    record = _found(folder, run_id, records)
+    environment, text = environment_of(folder, record.environment), suite_text(folder)
+    spec = asked_solvers(text).get(
+        record.solver, SolverSpec(name=record.solver, label=record.solver)
+    )
+    try:
+        name = assemble(_family(record, families), record.params, record.form)
+        in_sequence = record.mode == "sequence"
+        cases = steps_up_to(text, name, families) if in_sequence else (name,)
+        spec = _with_options(record, spec, solvers)
+    except InputError as e:
+        raise InputError(f"{record.run_id}: {e}{plugins_needed(environment)}") from None
+    time_limit, memory_limit = limits(text)
+    return Capsule(
+        record=record,
+        repeats=[r for r in records if _cell(r) == _cell(record)],
+        cases=cases,
+        spec=spec,
+        environment=environment,
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+    )
+
+
+def block_of(
+    capsule: Capsule,
+    families: Mapping[str, Family],
+    solvers: Mapping[str, Solver],
+    environment: str,
+) -> Block:
+    """Make the block that measures a capsule again; its last result is that.
+
+    environment : digest
+    """
+    record = capsule.record
+    turn = tuple(
+        blank(
+            name,
+            canonical(name, families[name.family]),
+            capsule.spec,
+            options=options_of(resolve(capsule.spec, solvers)),
+            tol=record.tol,
+            repeat=record.repeat,
+            environment=environment,
+            mode=record.mode,
+            accuracy=record.accuracy,
+        )
+        for name in capsule.cases
+    )
+    return Block(
+        number=0,
+        cases=capsule.cases,
+        turns=(turn,),
+        time_limit=capsule.time_limit,
+        memory_limit=capsule.memory_limit,
+    )
+
+
+def _cell(r: Record) -> tuple[Any, ...]:
+    return r.mode, r.case, r.solver, r.options, r.tol, r.accuracy
+
+
+def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
+    by_id = {r.run_id: r for r in records}
+    candidates = [name for name in by_id if run_id and name.startswith(run_id)]
+    if run_id in by_id or len(candidates) == 1:
+        return by_id[run_id if run_id in by_id else candidates[0]]
+    if candidates:
+        first = ", ".join(sorted(candidates)[:3])
+        raise InputError(
+            f"{folder} holds {len(candidates)} measurements whose run_id begins with "
+            f"{run_id!r} ({first}); give more digits"
+        )
+    near = get_close_matches(run_id, by_id, n=1, cutoff=0.0)
+    hint = f"; the nearest is {near[0]}" if near else ""
+    count = f"{len(by_id)} measurement{'s' * (len(by_id) != 1)}"
+    raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
+
+
+def _family(record: Record, families: Mapping[str, Family]) -> Family:
+    if record.family not in families:
+        raise InputError(f"unknown family {record.family!r}")
+    return families[record.family]
+
+
+def _with_options(
+    record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
+) -> SolverSpec:
+    """Ask for those stored options that are not today's defaults."""
+    asked = replace(spec, options={})
+    if spec.name not in solvers and f"{spec.name.partition(':')[0]}:*" not in solvers:
+        raise InputError(f"unknown solver {spec.name!r}")
+    today = plain(options_of(resolve(asked, solvers)))
+    options = {k: v for k, v in record.options.items() if today.get(k, ...) != v}
+    changed = replace(spec, options=options)
+    resolve(changed, solvers)
+    return changed
+
+
+def plugins_needed(environment: Mapping[str, Any]) -> str:
+    """Remind of the plug-ins that a measurement was made with."""
+    plugins = environment.get("plugins") or ()
+    options = " ".join(f"--plugin {name}" for name in plugins)
+    return f"; it was measured with plug-ins, give {options}" if options else ""

@@ -1,0 +1,415 @@
+"""More than one machine: the blocks of a run as tasks of Dask distributed.
+
+Every Dask worker carries out one block at a time, with the supervisor that a run on one
+machine uses, and gives back each measurement as soon as it is made, before it makes the
+next. What a worker that is lost has not given back is done by another one, as a block
+of its own. The parent alone writes the result folder.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+from harness.errors import InputError, some
+from harness.recipe import Maker
+from harness.results.folder import differences
+from harness.results.work_unit import (
+    Block,
+    Commands,
+    Engine,
+    Opens,
+    Outcome,
+    Result,
+    Unbuilt,
+    Unmade,
+)
+
+if TYPE_CHECKING:  # it needs the package distributed
+    from harness.running.dask_worker import Delivery
+
+LOCAL = "local"
+CONNECT_SECONDS = 10
+LOOK_SECONDS = 2.0  #: for workers that joined or were lost
+MOST_LOST = 4  #: workers that a block may cost
+
+Keep = Callable[[str, Mapping[str, Any]], None]
+
+#: of an environment: nodes that differ here do not run the same code
+_CODE = ("source", "versions.mortarbench", "plugins")
+
+
+def on_cluster(
+    address: str,
+    *,
+    plugins: Sequence[Path],
+    operators: Mapping[str, Maker],
+    environment: Mapping[str, Any],
+    keep: Keep,
+    warn: Callable[[str], None],
+) -> Opens:
+    """Make what opens the engine of a run on a Dask cluster.
+
+    address : of a scheduler, or "local" for one with a worker for each CPU of this
+        machine
+    plugins : files that nodes find under the same paths
+    operators : what puts an operator P together, less what is in `plugins`
+    environment : of this process, which nodes are compared with
+    keep : stores a node's environment under its digest
+    warn : told in a line what the user should know
+
+    Raises
+    ------
+    InputError
+        When Dask is not installed; on opening, when there is no such scheduler; while
+        blocks are carried out, when a node is not fit to measure on.
+
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "--dask needs the package distributed, which is not installed; "
+            "pip install -c constraints.txt -e '.[cluster]'"
+        ) from None
+
+    @contextmanager
+    def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
+        from harness.running.dask_worker import Node
+
+        with ExitStack() as stack:
+            client = _connected(address, stack)
+            name = f"mortarbench-{client.id}"
+            _forget_lost_runs(client)
+            files = [file.resolve() for file in plugins]
+            node = Node(commands, files, operators, _sharing(client))
+            client.register_plugin(node, name=name)
+            stack.callback(_end, client, name)
+            nodes = Nodes(environment, keep, warn)
+            with _scheduler_there(client, address):
+                yield _Cluster(client, name, nodes, address, warn)
+
+    return opened
+
+
+class Nodes:
+    """What is known of the machines that have measured."""
+
+    def __init__(
+        self,
+        environment: Mapping[str, Any],
+        keep: Keep,
+        warn: Callable[[str], None],
+    ) -> None:
+        self._here = environment
+        self._keep = keep
+        self._warn = warn
+        self._seen: set[str] = set()
+
+    def meet(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
+        """Store an environment that is new, and tell how it differs from ours.
+
+        Raises
+        ------
+        InputError
+            When the node runs other code.
+
+        """
+        if digest in self._seen:
+            return
+        changed = list(differences(self._here, environment))
+        for key, here, there in changed:
+            if key.startswith(_CODE):
+                raise InputError(
+                    f"{node} runs other code than this machine: {key} is {there} "
+                    f"there, {here} here; install the same on every node"
+                )
+        self._seen.add(digest)
+        self._keep(digest, environment)
+        if changed:
+            keys = some(key for key, *_ in changed)
+            self._warn(f"{node} is another environment ({digest}): other {keys}")
+
+
+@dataclass(eq=False, kw_only=True)
+class _Task:
+    """A block, or what is left of one, with the Dask worker that it was given to."""
+
+    block: Block
+    part: int = 0  #: one more whenever a worker was lost after the first results
+    lost: int = 0  #: workers that it has cost
+    delivered: set[str] = field(default_factory=set)  #: run ids, of all parts
+    worker: str = ""  #: its address
+    future: Any = None
+    key: str = field(default_factory=lambda: f"mortarbench-{uuid4().hex}")  #: in Dask
+
+    def rest(self) -> _Task | None:
+        """Make the task of what was not delivered; None where nothing is left.
+
+        Of a sequence begun, all steps are left: what the solver carried is lost.
+        """
+        ids = [{record.run_id for record in turn} for turn in self.block.turns]
+        pairs = zip(self.block.turns, ids, strict=True)
+        turns = tuple(turn for turn, own in pairs if not own <= self.delivered)
+        if not turns:
+            return None
+        has_begun = any(own & self.delivered for own in ids)
+        return _Task(
+            block=replace(self.block, turns=turns),
+            part=self.part + has_begun,
+            lost=self.lost + 1,
+            delivered=self.delivered,
+        )
+
+
+class _Cluster:
+    """The engine: every Dask worker has one block, and gives back each measurement.
+
+    Blocks are bound to their workers, so that what is left of a block whose worker was
+    lost is known here to be another block, measured elsewhere or later.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        name: str,
+        nodes: Nodes,
+        address: str,
+        warn: Callable[[str], None],
+    ) -> None:
+        self._client = client
+        self._name = name
+        self._nodes = nodes
+        self._address = address
+        self._warn = warn
+        self._told: SimpleQueue[str] = SimpleQueue()  # keys that have something to give
+        self._under_way: dict[str, _Task] = {}
+        self._left: deque[_Task] = deque()
+        client.subscribe_topic(name, lambda event: self._told.put(event[1]))
+
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
+        """Carry out all of `blocks`."""
+        try:
+            while self._top_up(blocks):
+                for task in self._with_news():
+                    yield from self._collected(task)
+                    if task.key in self._under_way and task.future.done():
+                        yield from self._ended(task)
+                yield from self._recovered()
+        finally:
+            for task in self._under_way.values():
+                task.future.cancel()
+
+    def _top_up(self, blocks: Iterator[Block]) -> bool:
+        """Give every idle worker a block to do; False when all blocks are done."""
+        idle = self._workers() - {task.worker for task in self._under_way.values()}
+        while True:
+            if not self._left and (block := next(blocks, None)) is not None:
+                self._left.append(_Task(block=block))
+            if not self._left or (not idle and self._under_way):
+                return bool(self._left or self._under_way)
+            if not idle:
+                self._warn(f"waiting for Dask workers to join {self._address}")
+                self._client.wait_for_workers(1)
+                idle = self._workers()
+            elif idle:
+                self._submit(self._left.popleft(), idle.pop())
+
+    def _workers(self) -> set[str]:
+        """List the addresses of the workers that are there."""
+        try:
+            return set(self._client.nthreads())
+        except OSError as e:
+            raise _SchedulerGoneError from e
+
+    def _submit(self, task: _Task, worker: str) -> None:
+        from harness.running.dask_worker import carry_out
+
+        key = task.key
+        task.worker = worker
+        task.future = self._client.submit(
+            carry_out,
+            self._name,
+            key,
+            task.block,
+            key=key,
+            workers=[worker],
+            pure=False,
+        )
+        self._under_way[key] = task
+        task.future.add_done_callback(lambda _: self._told.put(key))
+
+    def _with_news(self) -> Iterator[_Task]:
+        """Wait a moment for something to come from a block; list those with news."""
+        with suppress(Empty):
+            keys = {self._told.get(timeout=LOOK_SECONDS): None}
+            while not self._told.empty():
+                keys[self._told.get()] = None
+            for key in keys:
+                if key in self._under_way:
+                    yield self._under_way[key]
+        if self._client.status != "running":
+            raise _SchedulerGoneError
+
+    def _collected(self, task: _Task) -> Iterator[Outcome]:
+        """Fetch what a worker has measured; nothing if it cannot be reached."""
+        from harness.running.dask_worker import collect
+
+        with suppress(OSError):  # it is lost, or about to be found so
+            found = self._client.run(
+                collect, self._name, task.key, workers=[task.worker], on_error="ignore"
+            )
+            yield from self._given(task, found.get(task.worker))
+
+    def _ended(self, task: _Task) -> Iterator[Outcome]:
+        """Take the last of a block; what it lacks is measured elsewhere."""
+        from distributed import KilledWorker
+
+        del self._under_way[task.key]
+        if task.future.status not in ("cancelled", "lost"):
+            with suppress(KilledWorker):
+                yield from self._given(task, task.future.result())
+        yield from self._again(task)
+
+    def _recovered(self) -> Iterator[Outcome]:
+        """Give the blocks of workers that were lost to others."""
+        there = self._workers()
+        for task in [t for t in self._under_way.values() if t.worker not in there]:
+            del self._under_way[task.key]
+            task.future.cancel()
+            yield from self._again(task)
+
+    def _again(self, task: _Task) -> Iterator[Outcome]:
+        """Have done what a block still lacks, unless it has cost too many workers."""
+        rest = task.rest()
+        if rest is None:
+            return
+        if rest.lost < MOST_LOST:
+            self._left.append(rest)
+            return
+        case = rest.block.turns[0][0].case
+        reason = f"{case} was given up: every Dask worker that took it was lost"
+        yield Unbuilt(block=rest.block, reason=reason)
+
+    def _given(self, task: _Task, delivery: Delivery | None) -> Iterator[Outcome]:
+        """Give back what is new of a delivery."""
+        if delivery is None:
+            return
+        self._nodes.meet(delivery.node, delivery.digest, delivery.environment)
+        for outcome in delivery.outcomes:
+            match outcome:
+                case Unbuilt():
+                    task.delivered |= {
+                        r.run_id for turn in task.block.turns for r in turn
+                    }
+                case Unmade(tried_again=True):
+                    pass
+                case Result() | Unmade():
+                    if outcome.record.run_id in task.delivered:
+                        continue
+                    task.delivered.add(outcome.record.run_id)
+            if isinstance(outcome, Result):
+                outcome = replace(outcome, part=task.part)
+            yield outcome
+
+
+class _SchedulerGoneError(Exception):
+    pass
+
+
+def _connected(address: str, stack: ExitStack) -> Any:
+    """Connect to a scheduler, started first if it is to be local.
+
+    Raises
+    ------
+    InputError
+        When there is none.
+
+    """
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we tell ourselves
+    if address == LOCAL:
+        cluster = LocalCluster(
+            n_workers=len(os.sched_getaffinity(0)),
+            threads_per_worker=1,
+            memory_limit=0,  # the supervisor's business
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        )
+        return stack.enter_context(Client(stack.enter_context(cluster)))
+    try:
+        return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
+    except TypeError as e:
+        if not address.startswith("tls:"):
+            raise
+        raise InputError(
+            f"--dask {address}: Dask's configuration has no certificate for it; "
+            "expected distributed.comm.tls: ca-file, client.cert and client.key, in a "
+            "file or as DASK_DISTRIBUTED__COMM__TLS__CA_FILE in the environment"
+        ) from e
+    except (OSError, ValueError) as e:
+        why = " ".join(str(e).split()) or type(e).__name__
+        raise InputError(
+            f"--dask {address}: no scheduler answers ({why}); expected 'local', or the "
+            "address that `dask scheduler` prints, such as tcp://HOST:8786"
+        ) from None
+
+
+@contextmanager
+def _scheduler_there(client: Any, address: str) -> Iterator[None]:
+    """Turn whatever a scheduler that has gone makes Dask raise into one line.
+
+    Raises
+    ------
+    InputError
+        When the connection is closed.
+
+    """
+    try:
+        yield
+    except Exception as e:
+        is_gone = isinstance(e, _SchedulerGoneError) or client.status != "running"
+        if isinstance(e, InputError) or not is_gone:
+            raise
+        raise InputError(
+            f"the Dask scheduler at {address} is gone; start one, and the same command "
+            "continues"
+        ) from e
+
+
+def _end(client: Any, name: str) -> None:
+    """Have workers end the processes of this run, unless the scheduler is gone.
+
+    It may go while it is asked, as a local one does at Ctrl-C (CommClosedError is an
+    OSError), or not know of us yet (KeyError); then nothing is lost.
+    """
+    with suppress(OSError, KeyError):
+        if client.status == "running":
+            client.unregister_worker_plugin(name)
+
+
+def _sharing(client: Any) -> int:
+    """Count the workers of the machine that has the most."""
+    workers = client.scheduler_info(n_workers=-1)["workers"].values()
+    return max(Counter(worker["host"] for worker in workers).values(), default=1)
+
+
+def _forget_lost_runs(client: Any) -> None:
+    """Have workers end the processes of runs whose parent has died."""
+
+    def lost(dask_scheduler: Any) -> list[str]:
+        alive = {f"mortarbench-{client}" for client in dask_scheduler.clients}
+        ours = (n for n in dask_scheduler.worker_plugins if n.startswith("mortarbench"))
+        return [name for name in ours if name not in alive]
+
+    for name in client.run_on_scheduler(lost):
+        client.unregister_worker_plugin(name)

@@ -1,0 +1,291 @@
+"""One machine of a cluster: what a Dask worker does for a run.
+
+A `Station` stays open in each Dask worker for as long as the run lasts, with its solver
+processes on a CPU that no other station of that machine has. It ends with the run.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import platform
+import stat
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from threading import Event, Lock
+from typing import Any, cast
+
+from distributed import Worker, get_worker
+from distributed.diagnostics.plugin import WorkerPlugin
+
+from harness.environment.environment import capture_in, digest
+from harness.errors import InputError
+from harness.processes.supervisor import ONE_THREAD
+from harness.recipe import Maker
+from harness.registry import load_plugin, merged
+from harness.results.work_unit import Block, Commands, Outcome
+from harness.running.executor import Station
+
+COLLECT_SECONDS = 10.0  #: that a worker waits for its parent to fetch a result
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Delivery:
+    """What came of a block since the last delivery, and where."""
+
+    outcomes: list[Outcome]
+    node: str  #: host name
+    digest: str  #: of the environment
+    environment: dict[str, Any]
+
+
+class Node(WorkerPlugin):
+    """Opens a station in every Dask worker, those that join later included.
+
+    commands : of the parent; its Python is replaced by that of the node
+    plugins : files, which must be there under the same paths
+    operators : what puts an operator P together, less what is in `plugins`
+    sharing : Dask workers on one machine; more than one disturb each other, which
+        makes another environment
+    """
+
+    def __init__(
+        self,
+        commands: Commands,
+        plugins: Sequence[Path],
+        operators: Mapping[str, Maker],
+        sharing: int,
+    ) -> None:
+        self._commands = commands
+        self._plugins = plugins
+        self._operators = dict(operators)
+        self._sharing = sharing
+        self._python = sys.executable
+        self._open: _Open | None = None
+        self._ended = False
+
+    def setup(self, worker: Worker) -> None:
+        """Open nothing yet: a block does, in the thread that it runs in.
+
+        The kernel kills solver processes with the thread that started them.
+        """
+        self._busy = Lock()
+        self._outcomes: list[Outcome] = []  # of the block `_key`, not yet fetched
+        self._key = ""
+        self._fetched = Event()
+
+    def teardown(self, worker: Worker | None = None) -> None:
+        """End the processes of the station, at the latest when a measurement is made.
+
+        Dask cannot stop a block that is being carried out; its thread comes here last.
+        """
+        self._ended = True
+        self._fetched.set()
+        if not self._busy.acquire(blocking=False):
+            return
+        if self._open is not None:
+            self._open.stack.close()
+            self._open = None
+        self._busy.release()
+
+    def carry_out(self, key: str, block: Block, tell: Callable[[], None]) -> Delivery:
+        """Measure a block, or what can be measured of it before the run ends.
+
+        Returns what was not fetched meanwhile. After each measurement it waits a while
+        for that, so that the next one is not disturbed by it.
+
+        key : of the block, for `collect`
+        tell : called when there is something to fetch
+
+        Raises
+        ------
+        InputError
+            When this machine is not fit to measure on.
+
+        """
+        try:
+            with self._busy:
+                return self._carried_out(key, block, tell)
+        finally:
+            if self._ended:
+                self.teardown()
+
+    def collect(self, key: str) -> Delivery | None:
+        """Give away what a block has come to since the last time; runs in Dask's loop.
+
+        None where that block is not the one under way.
+        """
+        if key != self._key or self._open is None:
+            return None
+        outcomes = []
+        while self._outcomes:  # `_carried_out` may add one meanwhile
+            outcomes.append(self._outcomes.pop(0))
+        self._fetched.set()
+        return Delivery(
+            outcomes=outcomes,
+            node=platform.node(),
+            digest=self._open.digest,
+            environment=self._open.environment,
+        )
+
+    def _carried_out(
+        self, key: str, block: Block, tell: Callable[[], None]
+    ) -> Delivery:
+        opened = self._open = self._open or self._opened()
+        os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
+        here = {"environment": opened.digest, "node": platform.node()}
+        turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
+        self._key, self._outcomes = key, []
+        is_fetched = True
+        try:
+            for outcome in opened.station.carry_out(replace(block, turns=turns)):
+                self._fetched.clear()
+                self._outcomes.append(outcome)
+                tell()
+                if is_fetched:  # else nobody is there any longer
+                    is_fetched = self._fetched.wait(COLLECT_SECONDS)
+                if self._ended:
+                    break
+        except InputError as e:  # its disk is full
+            raise InputError(f"{platform.node()}: {e}") from None
+        delivery = self.collect(key)
+        assert delivery is not None
+        return delivery
+
+    def _opened(self) -> _Open:
+        for path in self._plugins:
+            if not path.is_file():
+                raise InputError(
+                    f"{platform.node()}: no plug-in {path}; "
+                    "expected the same files under the same paths on every node"
+                )
+        environment = capture_in(ONE_THREAD, self._plugins)
+        if self._sharing > 1:
+            environment["machine"]["shared_by_workers"] = self._sharing
+        with ExitStack() as stack:
+            cpu = own_cpu(stack)
+            folder = TemporaryDirectory(prefix="mortarbench-")
+            scratch = Path(stack.enter_context(folder))
+            operators = self._operators
+            for path in self._plugins:
+                operators = merged("operator", operators, load_plugin(path).operators)
+            commands = self._here(self._commands)
+            station = Station(commands, scratch, scratch / "cases", operators)
+            stack.enter_context(station)
+            return _Open(
+                station=station,
+                cpu=cpu,
+                environment=environment,
+                digest=digest(environment),
+                stack=stack.pop_all(),
+            )
+
+    def _here(self, commands: Commands) -> Commands:
+        """Start processes with the Python that runs the Dask worker."""
+
+        def here(command: list[str]) -> list[str]:
+            return [sys.executable if w == self._python else w for w in command]
+
+        return Commands(
+            solvers={label: here(c) for label, c in commands.solvers.items()},
+            generator=here(commands.generator),
+        )
+
+
+def carry_out(name: str, key: str, block: Block) -> Delivery:
+    """Have the node plug-in of that name measure a block; runs in a Dask worker.
+
+    Whenever there is something to `collect`, it says so under the topic `name`.
+
+    Raises
+    ------
+    InputError
+        When this Dask worker is not fit to measure on.
+
+    """
+    worker = get_worker()
+    if worker.state.nthreads != 1:
+        raise InputError(
+            f"the Dask worker {worker.name} on {platform.node()} takes "
+            f"{worker.state.nthreads} blocks at a time, so that they would disturb "
+            "each other; start it with --nthreads 1"
+        )
+    node = cast(Node, worker.plugins[name])
+    return node.carry_out(key, block, lambda: worker.log_event(name, key))
+
+
+def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
+    """Fetch what that block has come to since the last time; runs in Dask's loop."""
+    node = cast(Node | None, dask_worker.plugins.get(name))
+    return None if node is None else node.collect(key)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Open:
+    station: Station
+    cpu: int
+    environment: dict[str, Any]
+    digest: str
+    stack: ExitStack
+
+
+def own_cpu(stack: ExitStack) -> int:
+    """Take a CPU that no other station on this machine has; the kernel gives it back.
+
+    Raises
+    ------
+    InputError
+        When there is none left, or somebody else has made the folder of the locks.
+
+    """
+    usable = sorted(os.sched_getaffinity(os.getpid()), reverse=True)
+    with _lock_folder() as folder:
+        for cpu in usable:
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+            fd = os.open(f"cpu{cpu}.lock", flags, 0o600, dir_fd=folder)
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(fd)
+                continue
+            stack.callback(os.close, fd)
+            return cpu
+    raise InputError(
+        f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
+        "measure there already; start fewer"
+    )
+
+
+@contextmanager
+def _lock_folder() -> Iterator[int]:
+    """Open the folder of this user's locks, in that of everybody's temporary files.
+
+    Raises
+    ------
+    InputError
+        When what is there is a link or a file, is another user's, or open to others:
+        they could plant links in it, or hold the locks.
+
+    """
+    path = Path(gettempdir()) / f"mortarbench-{os.getuid()}"
+    with suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    wrong = InputError(
+        f"{platform.node()}: {path} is not a folder of this user's alone; remove it, "
+        "or set TMPDIR to another folder, the same for all Dask workers there"
+    )
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        raise wrong from None
+    try:
+        found = os.fstat(fd)
+        if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
+            raise wrong
+        yield fd
+    finally:
+        os.close(fd)

@@ -1,0 +1,314 @@
+"""Where blocks are carried out: the processes of a run on one machine."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import partial
+from math import inf
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from harness.errors import FaultError
+from harness.files.durable import full_disk_told, refuse_full_disk
+from harness.files.qpfile import load_qp
+from harness.files.store import point_arrays, read_arrays, read_point
+from harness.names import CaseName
+from harness.processes.case_folder import Entry, entry
+from harness.processes.measurement import measured
+from harness.processes.supervisor import WorkerProcess
+from harness.qp import QP
+from harness.recipe import NO_MAKERS, Maker
+from harness.record import Record, Verdict
+from harness.results.work_unit import Block, Commands, Outcome, Result, Unbuilt, Unmade
+from harness.solution import Solution, Status
+from harness.verify.measure import SAMPLE_SECONDS
+from harness.verify.optimum import Optimum, proven_optimum
+from harness.verify.verdicts import has_point, noted
+
+_MOST_PROVEN = 1000  #: small QPs whose optima are kept
+
+
+class Station:
+    """Carries out blocks one after the other, with one worker process per solver.
+
+    scratch : for files that last as long as the station, of this station alone
+    cases : folder of built cases, see `harness.processes.case_folder`; several stations
+        may share it
+    operators : what puts an operator P together, see `harness.recipe`
+    """
+
+    def __init__(
+        self,
+        commands: Commands,
+        scratch: Path,
+        cases: Path,
+        operators: Mapping[str, Maker] = NO_MAKERS,
+    ) -> None:
+        self._commands = commands
+        self._scratch = scratch
+        self._cases = cases
+        self._operators = operators
+        self._generator = WorkerProcess(commands.generator, scratch / "generator.log")
+        self._workers: dict[str, WorkerProcess] = {}
+        self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
+        self._loaded: dict[str, QP] = {}  # theirs, by digest
+        self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for process in (*self._workers.values(), self._generator):
+            process.close()
+
+    def carry_out(self, block: Block) -> Iterator[Outcome]:
+        """Measure a block; each result comes as soon as it is there.
+
+        Raises
+        ------
+        InputError
+            When the disk is full.
+
+        """
+        with full_disk_told(self._scratch):
+            try:
+                self._entries = ()
+                for turn in block.turns:
+                    yield from self._turn(block, turn)
+            except _UnbuiltError as e:
+                yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
+
+    def _turn(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Outcome]:
+        """Measure one solver; after a fault that is not its own, once more.
+
+        Of a sequence all steps are driven again, since what the solver carried is lost;
+        none is given back twice.
+        """
+        made: set[str] = set()
+        for tried_again in (True, False):
+            try:
+                for result in self._results(block, turn):
+                    if result.record.run_id not in made:
+                        made.add(result.record.run_id)
+                        yield result
+                return
+            except (FaultError, OSError) as e:
+                reason = _in_a_line(e)
+                refuse_full_disk(self._scratch, reason)
+            self._start_anew(turn[0].solver)
+            missing = [record for record in turn if record.run_id not in made]
+            for record in missing[: 1 if tried_again else None]:
+                yield Unmade(record=record, reason=reason, tried_again=tried_again)
+
+    def _results(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Result]:
+        """Measure one solver once on each case.
+
+        Raises
+        ------
+        FaultError, OSError
+            When something else than the solver failed.
+
+        """
+        if not self._entries:
+            self._entries = tuple(self._entry(name, block) for name in block.cases)
+            self._loaded = {e.digest: self._qp(e) for e in self._entries}
+        worker = self._worker(turn[0].solver)
+        for step, (name, record, at) in enumerate(
+            zip(block.cases, turn, self._entries, strict=True)
+        ):
+            request = {
+                "qp": str(at.qp),
+                "digest": at.digest,
+                "out": str(self._point),
+                "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
+                **({"step": step} if block.is_sequence else {}),
+            }
+            record, solution = measured(
+                worker,
+                self._qp(at),
+                record.but(
+                    qp=at.meta.get("qp"),
+                    build_seconds=at.meta.get("build_seconds"),
+                    dualise_seconds=at.meta.get("dualise_seconds"),
+                ),
+                request,
+                time_limit=block.time_limit,
+                memory_limit=block.memory_limit,
+                prove=partial(self._optimum, at),
+            )
+            if record.status in (Verdict.CRASHED, Verdict.FAILED):
+                refuse_full_disk(self._scratch, "")  # whatever it died of
+            yield self._described(block, name, record, solution)
+            stopped = record.status is not Verdict.DECLINED and (
+                solution is None or not has_point(solution)
+            )
+            if block.is_sequence and stopped:  # what it carried is lost
+                yield from _broken(turn[step + 1 :], record)
+                return
+
+    def _described(
+        self, block: Block, name: CaseName, record: Record, solution: Solution | None
+    ) -> Result:
+        """Add what the point means, which the generator knows."""
+        if solution is None or not has_point(solution):
+            return Result(record=record)
+        first = record.status is Verdict.VERIFIED and record.repeat == 0
+        fields = self._scratch / "fields.npz"
+        fields.unlink(missing_ok=True)
+        request = {
+            "describe": _plain(name),
+            "point": str(self._point),
+            "fields": str(fields) if first else None,
+        }
+        notes: list[str]
+        try:
+            answer = self._ask_generator(request, block)
+            notes = answer["notes"]
+            record = record.but(
+                quantities=answer["quantities"],
+                recover_seconds=answer["seconds"],
+                **answer["bounds"],
+            )
+        except _UnbuiltError as e:
+            notes = [f"no quantities: {e.reason}"]
+        stored = read_arrays(fields, ()) if fields.exists() else None
+        return Result(
+            record=noted(record, *notes), point=point_arrays(solution), fields=stored
+        )
+
+    def _entry(self, name: CaseName, block: Block) -> Entry:
+        def make(path: Path) -> Mapping[str, Any]:
+            request = {"build": _plain(name), "qp": str(path)}
+            meta: Mapping[str, Any] = self._ask_generator(request, block)["meta"]
+            return meta
+
+        return entry(self._cases, name, block.turns[0][0].environment, make)
+
+    def _ask_generator(
+        self, request: Mapping[str, Any], block: Block
+    ) -> Mapping[str, Any]:
+        for _ in range(2):  # it may have died of something else
+            reply = self._generator.ask(
+                {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
+            )
+            if reply.answer is not None:
+                break
+        else:
+            refuse_full_disk(self._scratch, reply.message)
+            if reply.fault:
+                raise FaultError(reply.message)
+            case = block.turns[0][0].case
+            raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
+        if "unbuilt" in reply.answer:
+            refuse_full_disk(self._scratch, reply.answer["unbuilt"])
+            raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
+        return reply.answer
+
+    def _optimum(self, at: Entry, qp: QP) -> Optimum | None:
+        """Prove the optimum of the QP of an entry, once."""
+        if at.digest not in self._optima:
+            found = proven_optimum(qp, partial(self._reference, at))
+            while len(self._optima) >= _MOST_PROVEN:
+                del self._optima[next(iter(self._optima))]
+            self._optima[at.digest] = found
+        return self._optima[at.digest]
+
+    def _reference(self, at: Entry, qp: QP) -> Solution:
+        """Have the generator solve the QP of an entry by the reference.
+
+        Raises
+        ------
+        ArithmeticError
+            When it found no solution.
+        FaultError
+            When it died, or a file between us failed.
+
+        """
+        point = self._scratch / "reference.npz"
+        request = {"solve": str(at.qp), "point": str(point)}
+        reply = self._generator.ask(request, time_limit=inf, memory_limit=inf)
+        if reply.answer is None:
+            raise FaultError(f"the reference solve failed: {reply.message}")
+        if not reply.answer["found"]:
+            raise ArithmeticError("the reference solve found no solution")
+        return read_point(point, Status.SOLVED)
+
+    def _worker(self, label: str) -> WorkerProcess:
+        if label not in self._workers:
+            log = self._scratch / f"worker-{len(self._workers)}.log"
+            self._workers[label] = WorkerProcess(self._commands.solvers[label], log)
+        return self._workers[label]
+
+    def _start_anew(self, label: str) -> None:
+        """Have files that may be lost made again, and a worker started."""
+        self._entries = ()
+        with suppress(FileNotFoundError):  # the whole result folder has gone
+            self._scratch.mkdir(exist_ok=True)
+        self._worker(label).close()
+
+    def _qp(self, at: Entry) -> QP:
+        if at.digest not in self._loaded:
+            self._loaded[at.digest] = self._read(at)
+        return self._loaded[at.digest]
+
+    def _read(self, at: Entry) -> QP:
+        return load_qp(at.qp, operators=self._operators)[0]
+
+    @property
+    def _point(self) -> Path:
+        return self._scratch / "point.npz"
+
+
+@contextmanager
+def one_by_one(
+    commands: Commands,
+    scratch: Path,
+    cases: Path,
+    *,
+    operators: Mapping[str, Maker] = NO_MAKERS,
+) -> Iterator[OneByOne]:
+    """Open the engine that carries out one block at a time on this machine."""
+    with Station(commands, scratch, cases, operators) as station:
+        yield OneByOne(station)
+
+
+class OneByOne:
+    """The engine of a run on one machine: a block is made when the last one is done."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+
+    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
+        """Carry out all of `blocks`."""
+        for block in blocks:
+            yield from self._station.carry_out(block)
+
+
+def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
+    """Give the steps that a sequence did not come to, because of how one ended."""
+    for record in rest:
+        reason = f"the sequence ended at {end.case}: {end.message}"
+        yield Result(record=record.but(status=end.status, message=reason))
+
+
+def _in_a_line(e: Exception) -> str:
+    text = " ".join(str(e).split())
+    return text if isinstance(e, FaultError) else f"{type(e).__name__}: {text}"
+
+
+class _UnbuiltError(Exception):
+    def __init__(self, reason: str, trace: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.trace = trace
+
+
+def _plain(name: CaseName) -> dict[str, Any]:
+    return {"family": name.family, "params": dict(name.params), "form": name.form}

@@ -1,0 +1,241 @@
+"""A suite, measured: the schedule, resumption, and one journal line per measurement.
+
+This process decides what is measured, and alone writes the result folder; an engine
+carries out the blocks. So a run is the same on one machine and on many.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import current_thread, main_thread
+from typing import Any
+
+from harness.errors import InputError
+from harness.files.durable import Lines, full_disk_told
+from harness.files.store import save
+from harness.names import canonical
+from harness.plugin import Family, Solver
+from harness.record import Record
+from harness.registry import SolverSpec, options_of
+from harness.results.faults import FAULTS, Fault
+from harness.results.folder import (
+    Held,
+    claim,
+    describe,
+    locked,
+    refuse_foreign,
+    scratch_in,
+)
+from harness.results.journal import Journal, read_journal
+from harness.results.work_unit import Commands, Opens, Outcome, Result, Unbuilt, Unmade
+from harness.running.executor import one_by_one
+from harness.running.progress import Progress
+from harness.running.schedule import Schedule
+from harness.suite.suite import Suite
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Missing:
+    """What a run could not measure; the same command tries it again."""
+
+    unbuilt: list[str]  #: names of the cases that could not be built
+    faults: list[
+        Fault
+    ]  #: of measurements that something else than the solver prevented
+
+
+def run(
+    suite: Suite,
+    *,
+    families: Mapping[str, Family],
+    out: Path,
+    commands: Commands,
+    resolve: Callable[[SolverSpec], Solver],
+    environment: Mapping[str, Any],
+    digest: str,
+    progress: Progress,
+    fresh: bool = False,
+    engine: Opens = one_by_one,
+) -> Missing:
+    """Measure what the result folder `out` lacks of `suite`; return what it still does.
+
+    resolve : configures the solver, whose options go into the records
+    environment, digest : what to write into environment.json, and its digest
+    fresh : forget first what `out` holds
+    engine : where the blocks are carried out
+
+    Raises
+    ------
+    InputError
+        When `out` is no result folder, holds another suite, case or environment, is in
+        use, or was moved or deleted meanwhile, or its disk is full. Any other failure
+        costs the measurements it concerns.
+
+    """
+    refuse_foreign(out)
+    environment = {"digest": digest, **environment}
+    with _ended_by_sigterm(progress), full_disk_told(out), locked(out) as held:
+        claim(out, suite, environment, fresh=fresh)
+        with (
+            scratch_in(out) as scratch,
+            Journal(out, digest, progress.warn) as journal,
+        ):
+            past = read_journal(out)
+            _check_same(out, past, suite, families)
+            schedule = Schedule(
+                suite=suite,
+                families=families,
+                options={s.label: options_of(resolve(s)) for s in suite.solvers},
+                environment=digest,
+                progress=progress,
+            )
+            for record in past:
+                schedule.note(record)
+            progress.start(schedule.cells)
+            book = _Book(
+                out=out,
+                held=held,
+                journal=journal,
+                schedule=schedule,
+                progress=progress,
+            )
+            with engine(commands, scratch, out.resolve() / "cases") as carry_out:
+                for outcome in carry_out(schedule.blocks()):
+                    book.take(outcome)
+                    if book.was_deleted:
+                        describe(out, suite, environment)
+                        journal.restore()
+                        raise InputError(
+                            f"{out} was deleted while the run wrote to it; its journal "
+                            "is there again, solutions stored before are lost; the "
+                            "same command continues"
+                        )
+        unbuilt = [canonical(c, families[c.family]) for c in schedule.unbuilt]
+        return Missing(unbuilt=unbuilt, faults=book.left())
+
+
+@dataclass(eq=False, kw_only=True)
+class _Book:
+    """Writes down what an engine gives back, once, and tells who watches."""
+
+    out: Path
+    held: Held
+    journal: Journal
+    schedule: Schedule
+    progress: Progress
+    was_deleted: bool = False  #: the folder, since the last time
+    _counted: set[str] = field(default_factory=set)  # run ids that were told
+    _left: dict[str, Fault] = field(default_factory=dict)
+
+    def take(self, outcome: Outcome) -> None:
+        """Write down one result, or why there is none.
+
+        Raises
+        ------
+        InputError
+            When the folder was moved, or taken by another run, meanwhile.
+        OSError
+            When the disk is full, say; then nothing of the result is in the journal.
+
+        """
+        match outcome:
+            case Unbuilt():
+                _log.debug("%s\n%s", outcome.reason, outcome.trace)
+                if self.schedule.give_up(outcome.block):
+                    self.progress.warn(outcome.reason)
+                for turn in outcome.block.turns:
+                    for record in turn:
+                        self._count(record, None)
+            case Unmade():
+                self._take_fault(outcome)
+            case Result() if self.schedule.knows(outcome.record):
+                # of a block, or a sequence, that was done again
+                self._count(outcome.record, None)
+            case Result():
+                self._take_result(outcome)
+
+    def left(self) -> list[Fault]:
+        """List the last fault of each measurement that was not made."""
+        return [f for run_id, f in self._left.items() if not self.schedule.made(run_id)]
+
+    def _take_result(self, result: Result) -> None:
+        record = result.record
+        if result.part:
+            number = self.schedule.number_of_part(record.block, result.part)
+            record = record.but(block=number)
+        self.was_deleted = not self.held.is_there()
+        if result.point is not None:
+            record = record.but(vectors=save(self.out, result.point))
+        if result.fields is not None:
+            record = record.but(fields=save(self.out, result.fields))
+        self.journal.append(record)
+        self.schedule.note(record)
+        self._count(record, record)
+
+    def _take_fault(self, unmade: Unmade) -> None:
+        record, what = unmade.record, unmade.reason
+        fault = Fault(
+            time=datetime.now(UTC).isoformat(timespec="milliseconds"),
+            run_id=record.run_id,
+            case=record.case,
+            solver=record.solver,
+            what=what,
+            tried_again=unmade.tried_again,
+        )
+        self.was_deleted = not self.held.is_there()
+        with Lines(self.out / FAULTS, self.progress.warn) as faults:
+            faults.append(fault.to_json())
+        then = "it is tried again" if unmade.tried_again else "it was not measured"
+        self.progress.warn(f"{record.solver} on {record.case}: {what}; {then}")
+        if not unmade.tried_again:
+            self._left[record.run_id] = fault
+            self._count(record, None)
+
+    def _count(self, record: Record, measured: Record | None) -> None:
+        """Tell of each cell once, whatever came of it and however often."""
+        if record.run_id not in self._counted:
+            self._counted.add(record.run_id)
+            self.progress.advance(measured)
+
+
+@contextmanager
+def _ended_by_sigterm(progress: Progress) -> Iterator[None]:
+    """Have SIGTERM end a run as Ctrl-C does: its processes, then itself, by 143."""
+
+    def end(*_: object) -> None:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    if current_thread() is not main_thread():  # which alone can be told
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    except SystemExit:
+        progress.warn("terminated; the same command continues")
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+def _check_same(
+    out: Path, past: list[Record], suite: Suite, families: Mapping[str, Family]
+) -> None:
+    """Refuse to go on where a name now means another case: its file has changed."""
+    now = {canonical(c, families[c.family]): c.params for c in suite.names}
+    for record in past:
+        params = now.get(record.case, record.params)
+        for key in params.keys() & record.params.keys():
+            if record.params[key] != params[key]:
+                raise InputError(
+                    f"{out} holds {record.case} with {key} = {record.params[key]}, "
+                    f"now {params[key]}; choose another --out or use --fresh"
+                )

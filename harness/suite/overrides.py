@@ -1,0 +1,115 @@
+"""A suite narrowed, as the options of the command line say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from harness import checked
+from harness.errors import InputError, some
+from harness.files.reading import toml
+from harness.names import CaseName, canonical, match, parse
+from harness.plugin import Family, Solver
+from harness.registry import SolverSpec, resolve
+from harness.suite.suite import NULL, Suite
+
+
+def with_overrides(
+    suite: Suite,
+    families: Mapping[str, Family],
+    registry: Mapping[str, Solver],
+    *,
+    solvers: Sequence[str] = (),
+    cases: Sequence[str] = (),
+    repeats: int | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
+) -> Suite:
+    """Narrow a suite as the options of the command line say.
+
+    solvers : labels of the suite to keep, or names of the registry to add
+    cases : what to keep: shell globs over canonical names, or names
+
+    Raises
+    ------
+    InputError
+        For an unknown solver, a pattern that matches nothing, a value out of range.
+
+    """
+    changes: dict[str, Any] = {}
+    if solvers:
+        changes["solvers"] = _chosen_solvers(suite, solvers, registry)
+    if cases:
+        changes |= _chosen_cases(suite, cases, families)
+    if repeats is not None:
+        changes["repeats"] = checked.at_least_one("--repeats", repeats)
+    text = suite.text
+    for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
+        if limit is not None:
+            changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
+            text = _with_limit(text, key, limit)
+    return replace(suite, text=text, **changes)
+
+
+def _with_limit(text: str, key: str, limit: float) -> str:
+    """Set a limit in the TOML, where such keys come before those of any table.
+
+    Measurements under other limits are other measurements, unlike those of fewer
+    solvers, cases or repeats: they make another suite.
+    """
+    line = f"{key} = {limit!r}"
+    if key not in toml(text):
+        return f"{line}\n{text}"
+    return re.sub(rf"^[ \t]*{key}[ \t]*=.*$", line, text, count=1, flags=re.MULTILINE)
+
+
+def _chosen_solvers(
+    suite: Suite, names: Sequence[str], registry: Mapping[str, Solver]
+) -> tuple[SolverSpec, ...]:
+    chosen = {spec.label: spec for spec in suite.solvers}
+    known = {label: resolve(spec, registry) for label, spec in chosen.items()}
+    for name in names:
+        if name not in chosen:
+            chosen[name] = SolverSpec(name=name, label=name)
+            with checked.located("--solver"):
+                resolve(chosen[name], {**known, **registry})
+    kept = dict.fromkeys(names)
+    null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
+    return tuple(chosen[name] for name in (*kept, *null))
+
+
+def _chosen_cases(
+    suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
+) -> dict[str, Any]:
+    """Keep what matches; of a sequence all or nothing."""
+    named = {canonical(case, families[case.family]): case for case in suite.names}
+    kept: set[str] = set()
+    for pattern in patterns:
+        matched = match(_canonical_pattern(pattern, families), named)
+        if not matched:
+            raise InputError(
+                f"--case {pattern!r} matches none of the {len(named)} cases of suite "
+                f"{suite.name!r}; there are {some(named)}"
+            )
+        kept.update(matched)
+
+    def wanted(case: CaseName) -> bool:
+        return canonical(case, families[case.family]) in kept
+
+    return {
+        "cases": tuple(filter(wanted, suite.cases)),
+        "sequences": tuple(s for s in suite.sequences if any(map(wanted, s))),
+    }
+
+
+def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
+    """Write a pattern that is the name of a case canonically."""
+    if set("*?[") & set(pattern):
+        return pattern
+    try:
+        name = parse(pattern, families)
+    except InputError:
+        return pattern
+    return canonical(name, families[name.family])

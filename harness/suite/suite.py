@@ -1,0 +1,204 @@
+"""Suites: which cases, which solvers, how often and within which limits; from TOML."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from harness import checked
+from harness.errors import InputError, shown, unknown
+from harness.files.reading import MOST_TOML, read_text, toml
+from harness.names import CaseName
+from harness.plugin import Family, Solver
+from harness.registry import SolverSpec, resolve
+from harness.suite.parameter_grid import planned
+
+DEFAULTS: Mapping[str, Any] = {
+    "tolerances": [1e-6],
+    "repeats": 3,
+    "time_limit": 60,
+    "memory_limit": 4096,
+    "precision": None,
+    "max_repeats": 30,
+    "budget": 600,
+    "accuracy": None,
+    "null_arm": None,
+    "max_cases": 100_000,
+}
+_SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
+_SOLVER_KEYS = ("name", "label", "options")
+NULL = " (A/A)"  #: after the label of a solver that is measured once more
+
+
+@dataclass(frozen=True, kw_only=True)
+class Suite:
+    """What one run measures: every solver on every case at every tolerance."""
+
+    name: str
+    tolerances: tuple[float, ...]
+    repeats: int
+    time_limit: float  #: s per measurement
+    memory_limit: float  #: MiB per measurement
+    solvers: tuple[SolverSpec, ...]  #: of distinct labels
+    cases: tuple[CaseName, ...]  #: all distinct; those that are solved cold
+    text: str  #: the TOML as read, but with the limits that hold
+    sequences: tuple[tuple[CaseName, ...], ...] = ()  #: each: its steps in order
+    precision: float | None = None
+    """Go on beyond `repeats` until every ratio to the fastest is known so well."""
+    max_repeats: int = 30  #: where there is a precision to reach
+    budget: float = 600.0  #: s of measured time per case and tolerance, likewise
+    accuracy: float | None = None  #: judge answers at this, whatever was asked for
+
+    @property
+    def groups(self) -> tuple[tuple[CaseName, ...], ...]:
+        """What one block is made of: a single case, or the steps of a sequence."""
+        return (*((case,) for case in self.cases), *self.sequences)
+
+    @property
+    def names(self) -> tuple[CaseName, ...]:
+        """Every case, cold or in a sequence."""
+        return tuple(case for group in self.groups for case in group)
+
+
+def load_suite(
+    path: Path, families: Mapping[str, Family], solvers: Mapping[str, Solver]
+) -> Suite:
+    """Read a suite and check all of it: nothing is left to fail during the run.
+
+    Raises
+    ------
+    InputError
+        With the file and the place in it, and what would be right.
+
+    """
+    text = read_text(path, "a TOML file", MOST_TOML)
+    with checked.located(f"{path}"):
+        table = {**DEFAULTS, **toml(text)}
+        checked.only_keys(table, _SUITE_KEYS)
+        for key in ("name", "solvers", "problems"):
+            if key not in table:
+                raise InputError(f"{key} is missing")
+        if not re.fullmatch(r"[\w.-]*\w[\w.-]*", checked.text("name", table["name"])):
+            raise InputError(
+                f"name = {shown(table['name'])} is no name of a folder; "
+                "expected letters, digits, '.', '-' and '_'"
+            )
+        cases, sequences = planned(
+            table["problems"],
+            families,
+            path.parent,
+            checked.at_least_one("max_cases", table["max_cases"], most=10**9),
+        )
+        return Suite(
+            name=table["name"],
+            tolerances=_tolerances(table["tolerances"]),
+            repeats=checked.at_least_one("repeats", table["repeats"]),
+            time_limit=checked.positive("time_limit", table["time_limit"]),
+            memory_limit=checked.positive("memory_limit", table["memory_limit"]),
+            solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
+            cases=cases,
+            sequences=sequences,
+            precision=_between("precision", table["precision"]),
+            max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
+            budget=checked.positive("budget", table["budget"]),
+            accuracy=_between("accuracy", table["accuracy"]),
+            text=text,
+        )
+
+
+def asked_solvers(text: str) -> dict[str, SolverSpec]:
+    """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
+    table = toml(text)
+    specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
+    return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
+
+
+def steps_up_to(
+    text: str, name: CaseName, families: Mapping[str, Family]
+) -> tuple[CaseName, ...]:
+    """Read from a suite's TOML the steps of a sequence that lead to one of them.
+
+    Raises
+    ------
+    InputError
+        When no sequence has it.
+
+    """
+    table = {**DEFAULTS, **toml(text)}
+    most = checked.at_least_one("max_cases", table["max_cases"], most=10**9)
+    for steps in planned(table.get("problems"), families, Path(), most)[1]:
+        if name in steps:
+            return steps[: steps.index(name) + 1]
+    raise InputError("the suite has no sequence with that case")
+
+
+def limits(text: str) -> tuple[float, float]:
+    """Read the limits of a measurement from a suite's TOML, s and MiB."""
+    table = {**DEFAULTS, **toml(text)}
+    time_limit, memory_limit = (
+        checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
+    )
+    return time_limit, memory_limit
+
+
+def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
+    found: dict[str, SolverSpec] = {}
+    for i, entry in enumerate(checked.filled_list("solvers", entries)):
+        with checked.located(f"solvers[{i}]"):
+            spec = _spec(entry)
+            if spec.label in found:
+                raise InputError(
+                    f"label {shown(spec.label)} is used twice; expected a label of its "
+                    "own"
+                )
+            resolve(spec, registry)
+        found[spec.label] = spec
+    return tuple(found.values())
+
+
+def _spec(entry: object) -> SolverSpec:
+    if isinstance(entry, str):
+        return SolverSpec(name=entry, label=entry)
+    table = checked.table("entry", entry, instead="a name or a table")
+    checked.only_keys(table, _SOLVER_KEYS)
+    if "name" not in table:
+        raise InputError("name is missing")
+    name = checked.text("name", table["name"])
+    return SolverSpec(
+        name=name,
+        label=checked.text("label", table.get("label", name)),
+        options=checked.table("options", table.get("options", {})),
+    )
+
+
+def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
+    """Add the solver of that label once more, as a null arm."""
+    if label is None:
+        return specs
+    known = {spec.label: spec for spec in specs}
+    if (label := checked.text("null_arm", label)) not in known:
+        raise unknown("null_arm", label, known)
+    return (*specs, replace(known[label], label=f"{label}{NULL}", arm="null"))
+
+
+def _between(key: str, value: Any) -> float | None:
+    """Take nothing, or a number between 0 and 1."""
+    if value is None:
+        return None
+    if not checked.is_number(value) or not 0 < value < 1:
+        raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
+    return float(value)
+
+
+def _tolerances(value: object) -> tuple[float, ...]:
+    numbers = checked.filled_list("tolerances", value)
+    if not all(checked.is_number(n) and 0 < n < 1 for n in numbers) or len(
+        set(numbers)
+    ) < len(numbers):
+        raise InputError(
+            f"tolerances = {shown(value)}; expected distinct numbers between 0 and 1"
+        )
+    return tuple(map(float, numbers))

@@ -1,0 +1,287 @@
+"""The proven optimum of a small QP, which decides where residuals cannot.
+
+Residuals bound the error of the objective only through quantities that they do not
+know: how far the solution is, and how large the true multipliers are. A reference solve
+that is none of the solvers under test gives a point x̂ with multipliers λ̂ ≥ 0; it is
+believed no more than they are. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian
+L, convexity gives for the solution x*
+
+    f(x*) ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
+
+evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for the
+point x̃ that meets the active rows exactly, off x̂ by rounding; L(x̃, λ̂) − L(x̂, λ̂) is
+r̂ᵀ(x̃ − x̂) and a square of rounding. So L(x̂, λ̂) is f* up to the sum above. What is
+taken on trust: the bound of |x*ᵢ − x̂ᵢ| (`FAR`), and that x̃ is as near as that.
+
+Where the sum tells too little, since the objective cancels, the KKT equations of the
+rows that carry a multiplier are solved in rational arithmetic. If that point satisfies
+all KKT conditions, without any rounding, its value is f*, and nothing is on trust.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from harness.plugin import Reference
+from harness.qp import QP, Vector
+from harness.solution import Solution
+from harness.verify.kkt import (
+    EXCUSED,
+    ROUNDING,
+    Residuals,
+    allowed,
+    energy_at,
+    kkt_residuals,
+    scales_at,
+    violation,
+    widths,
+)
+
+LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
+CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optimum
+FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
+EPS = float(np.finfo(float).eps)
+SPARED = 10.0  #: the objective adds up what residuals say of single rows
+SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
+RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Optimum:
+    """The optimal value of a QP, and what errors against it are compared with."""
+
+    value: float  #: f*
+    doubt: float  #: by how much f* may be off, with the rounding of a right answer
+    energy: float  #: scale of errors of the objective
+    x: Vector  #: (n,) sizes of the variables
+
+
+Proves = Callable[[QP], Optimum | None]
+
+
+def decided(
+    qp: QP,
+    s: Solution,
+    residuals: Residuals,
+    tol: float,
+    prove: Proves,
+) -> float | None:
+    """Measure a point against the proven optimum; None where residuals decide.
+
+    They do where they exceed 10·tol even against the most generous scales, where the QP
+    is large or its P an operator, or where nothing could be proven.
+
+    prove : finds the optimum, see `proves`
+
+    Returns
+    -------
+    the larger of |f(x) − f*| and of the violation, relative to the scales of the
+    optimum; the first to 10 times the smaller of its terms and 500·|f*|
+
+    """
+    if not is_small(qp):
+        return None
+    most = allowed(tol)
+    if not (
+        residuals.worst <= most or kkt_residuals(qp, s, generous=True).worst <= most
+    ):
+        return None
+    found = prove(qp)
+    return None if found is None else error_at(qp, s, found)
+
+
+def is_small(qp: QP) -> bool:
+    """Whether a QP is cheap to solve once more."""
+    return qp.is_explicit and qp.q.size + qp.b.size + qp.h.size <= LARGEST
+
+
+@np.errstate(all="ignore")
+def error_at(qp: QP, s: Solution, optimum: Optimum) -> float:
+    """Compare a point with the optimum; see `decided`."""
+    x = s.x.astype(np.longdouble)
+    off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
+    return max(max(off, 0.0) / optimum.energy, violation(qp, s.x, optimum.x))
+
+
+@np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
+def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
+    """Solve a QP by the reference, and prove its optimal value; None if that fails."""
+    try:
+        found = solve(qp)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return None
+    s = replace(
+        found,
+        x=found.x.astype(np.longdouble), y=found.y.astype(np.longdouble),
+        z=np.maximum(found.z, 0).astype(np.longdouble),
+        z_box=np.where(found.z_box < 0, np.where(np.isfinite(qp.lb), found.z_box, 0),
+                       np.where(np.isfinite(qp.ub), found.z_box, 0)
+                       ).astype(np.longdouble),
+    )  # fmt: skip
+    if not kkt_residuals(qp, s, generous=True).worst <= CLOSE:
+        return None
+    f = _objective(qp, s.x)
+    bound = np.where(s.z_box < 0, qp.lb, qp.ub)
+    pulls = s.z_box[s.z_box != 0] * (s.x - bound)[s.z_box != 0]
+    value = f + s.y @ (qp.A @ s.x - qp.b) + s.z @ (qp.G @ s.x - qp.h) + pulls.sum()
+    r = np.abs(qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box)
+    terms = energy_at(qp, s, generous=True)
+    X = scales_at(qp, s.x.astype(float), terms).x
+    doubt = float(r @ np.minimum(widths(qp), FAR * X))
+    size = _size(qp, s)
+    if not EPS * size <= EXCUSED * abs(value):
+        size = min(size, _size(qp, _least_multipliers(qp, s)))
+    if not doubt <= EXCUSED * abs(value) and (exact := exact_value(qp, s)) is not None:
+        value, doubt = np.longdouble(exact), 0.0
+    # f* cannot be told more accurately than rounding x moves f
+    told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
+    if abs(value) > ROUNDING * terms + doubt:
+        known = min(terms, SMALLEST * told)
+    else:
+        known = told = terms
+    rounding = min(ROUNDING * size, EXCUSED * told)
+    if not (known > 0 and doubt <= EXCUSED * known):  # f* = 0 of nothing has no scale
+        return None
+    return Optimum(
+        value=float(value), doubt=doubt + rounding, energy=SPARED * known,
+        x=scales_at(qp, s.x.astype(float), known).x,
+    )  # fmt: skip
+
+
+def exact_value(qp: QP, s: Solution) -> Fraction | None:
+    """Find the optimal value in rational arithmetic; None where that is not proven.
+
+    The rows that carry a multiplier in `s` are taken as equations. What these leave
+    open is as in `s`. The point that solves them has to satisfy the KKT conditions of
+    all rows exactly.
+    """
+    below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    lower, upper = (s.z_box < 0) & below, (s.z_box > 0) & above
+    n, pressed = qp.q.size, s.z > 0
+    box = np.eye(n)[lower | upper]
+    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], box])
+    if n + len(B) > RATIONAL:
+        return None
+    c = np.concatenate([
+        qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[lower | upper]
+    ])  # fmt: skip
+    P = _dense(qp.P)
+    equations = np.block([[P, B.T], [B, np.zeros((len(B), len(B)))]])
+    guess = [s.x, s.y, s.z[pressed], s.z_box[lower | upper]]
+    found = _solved(
+        _rational(equations), _rational(np.concatenate([-qp.q, c])),
+        _rational(np.concatenate(guess).astype(float)),
+    )  # fmt: skip
+    if found is None:
+        return None
+    x, _, z, z_box = np.split(found, np.cumsum([n, qp.b.size, int(pressed.sum())]))
+    signs = np.where(upper, 1, -1)[lower | upper]
+    is_optimal = (
+        (_rational(_dense(qp.G)) @ x <= _rational(qp.h)).all()
+        and (x[below] >= _rational(qp.lb[below])).all()
+        and (x[above] <= _rational(qp.ub[above])).all()
+        and (z >= 0).all()
+        and (z_box * signs >= 0).all()
+    )
+    value: Fraction = x @ (_rational(P) @ x) / 2 + _rational(qp.q) @ x
+    return value if is_optimal else None
+
+
+def _solved(M: Any, b: Any, guess: Any) -> Any | None:
+    """Solve Mx = b by Gauss-Jordan elimination; None where there is no solution.
+
+    M, b, guess : arrays of fractions; unknowns without a pivot are as in `guess`
+    """
+    rows, pivots = np.column_stack([M, b]), list[int]()
+    for column in range(M.shape[1]):
+        at = len(pivots)
+        below = np.flatnonzero(rows[at:, column] != 0)
+        if not below.size:
+            continue
+        rows[[at, at + below[0]]] = rows[[at + below[0], at]]
+        rows[at] = rows[at] / rows[at, column]
+        for i in np.flatnonzero(rows[:, column] != 0):
+            if i != at:
+                rows[i] = rows[i] - rows[i, column] * rows[at]
+        pivots.append(column)
+    if (rows[len(pivots) :, -1] != 0).any():
+        return None
+    free = np.setdiff1d(np.arange(M.shape[1]), pivots)
+    x = guess.copy()
+    x[pivots] = rows[: len(pivots), -1] - rows[: len(pivots)][:, free] @ guess[free]
+    return x
+
+
+def _rational(v: Any) -> Any:
+    """Give an array of doubles as one of fractions."""
+    exact = np.empty(v.shape, dtype=object)
+    exact.ravel()[:] = [Fraction(float(value)) for value in v.ravel()]
+    return exact
+
+
+def _dense(M: Any) -> Any:
+    return M.toarray() if hasattr(M, "toarray") else M
+
+
+def proves(solve: Reference) -> Proves:
+    """Prove the optimum of every QP, told by identity, only once."""
+    known: dict[int, tuple[QP, Optimum | None]] = {}
+
+    def once(qp: QP) -> Optimum | None:
+        if id(qp) not in known:  # the QP is kept, or another could get its id
+            known[id(qp)] = qp, proven_optimum(qp, solve)
+        return known[id(qp)][1]
+
+    return once
+
+
+def _objective(qp: QP, x: Any) -> np.longdouble:
+    return np.longdouble(x @ (qp.P @ x) / 2 + qp.q @ x)
+
+
+def _least_multipliers(qp: QP, s: Solution) -> Solution:
+    """Give the multipliers that do the least work, where several balance the gradient.
+
+    Those of rows that carry one in `s`, with the least sum of squares of λᵢ times the
+    terms of row i; rows whose sign that would turn carry none. As they were, where
+    nothing is left that balances.
+    """
+    x, is_fixed = np.abs(s.x).astype(float), qp.lb == qp.ub
+    pressed, held = s.z > 0, (s.z_box != 0) | is_fixed
+    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(x.size)[held]])
+    c = np.concatenate([qp.b, qp.h[pressed], x[held]])
+    sign = np.where(is_fixed, 0, np.sign(s.z_box.astype(float)))[held]
+    sign = np.concatenate([np.zeros(qp.b.size), np.ones(int(pressed.sum())), sign])
+    weight = np.abs(B) @ x + np.abs(c)
+    weight = np.where(weight > 0, weight, 1.0)
+    gradient = (qp.P @ s.x + qp.q).astype(float)
+    found, on = np.zeros(sign.size), np.ones(sign.size, dtype=bool)
+    for _ in range(sign.size + 1):
+        scaled = (B[on] / weight[on, None]).T
+        found[:] = 0
+        found[on] = np.linalg.lstsq(scaled, -gradient, rcond=1e-12)[0] / weight[on]
+        turned = on & (found * sign < 0)
+        if not turned.any():
+            break
+        on &= ~turned
+    left = np.abs(gradient + B.T @ found)
+    if not (left <= 1e-6 * (np.abs(gradient) + np.abs(B).T @ np.abs(found))).all():
+        return s
+    y, z_pressed, z_held = np.split(found, np.cumsum([qp.b.size, int(pressed.sum())]))
+    z, z_box = np.zeros(s.z.size), np.zeros(s.z_box.size)
+    z[pressed], z_box[held] = z_pressed, z_held
+    return replace(s, y=y, z=z, z_box=z_box)
+
+
+def _size(qp: QP, s: Solution) -> float:
+    """Add up what rounding of x to double precision moves: f itself, and λᵀ(Bx − c)."""
+    x = np.abs(s.x)
+    rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
+    held = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)
+    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + held + 2 * np.abs(s.z_box) @ x
+    return float(total)

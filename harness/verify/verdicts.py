@@ -1,0 +1,180 @@
+"""From what a solver returned to a record: our verdict, residuals and quantities."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from hashlib import sha256
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from harness.names import CaseName
+from harness.plugin import Case
+from harness.qp import QP
+from harness.record import Record, Verdict
+from harness.registry import SolverSpec
+from harness.solution import Solution, Status
+from harness.verify.certificate import UncertifiableError, certify
+from harness.verify.kkt import kkt_residuals, verdict
+from harness.verify.measure import Measurement
+from harness.verify.optimum import Proves, decided
+
+#: first part of what a run_id digests; it names a measurement, whatever is stored of it
+IDENTITY = 1
+
+
+def blank(
+    name: CaseName,
+    case: str,
+    spec: SolverSpec,
+    *,
+    options: Mapping[str, Any],
+    tol: float,
+    repeat: int,
+    environment: str,
+    block: int = 0,
+    mode: str = "cold",
+    accuracy: float | None = None,
+) -> Record:
+    """Make the record of a measurement before it is made.
+
+    case : the canonical name
+    options : every option of the solver, defaults resolved
+    environment : digest
+    mode, accuracy : see `Record`
+    """
+    options = plain(options)
+    identity = [IDENTITY, case, spec.label, spec.name, options, tol, repeat]
+    if (mode, accuracy) != ("cold", None):
+        identity += [mode, accuracy]
+    text = json.dumps(identity, sort_keys=True)
+    return Record(
+        run_id=sha256(text.encode()).hexdigest()[:12],
+        case=case,
+        family=name.family,
+        params=name.params,
+        form=name.form,
+        sizes={},
+        solver=spec.label,
+        options=options,
+        tol=tol,
+        repeat=repeat,
+        block=block,
+        status=Verdict.FAILED,
+        environment=environment,
+        mode=mode,
+        accuracy=accuracy,
+        arm=spec.arm,
+        started=datetime.now(UTC).isoformat(timespec="milliseconds"),
+    )
+
+
+def judged(
+    record: Record, qp: QP, measurement: Measurement, prove: Proves | None = None
+) -> Record:
+    """Fill in what `measurement` is worth on `qp`, by our own evaluation.
+
+    prove : finds the optimum of `qp` where residuals cannot decide
+    """
+    s = measurement.solution
+    record = record.but(
+        sizes=qp.sizes,
+        claimed=s.status.value,
+        message=s.message,
+        iterations=s.iterations,
+        counts=s.counts,
+        reported=s.reported,
+        prepare_seconds=measurement.prepare_seconds,
+        solve_seconds=measurement.solve_seconds,
+        total_seconds=measurement.total_seconds,
+        peak_mib=measurement.peak_mib,
+        prepare_peak_mib=measurement.prepare_peak_mib,
+        solve_peak_mib=measurement.solve_peak_mib,
+        inner=measurement.inner,
+    )
+    if s.status is Status.DECLINED:
+        return record.but(status=Verdict.DECLINED)
+    with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
+        residuals = kkt_residuals(qp, s)
+        objective = qp.objective(s.x)
+    tol, error = record.accuracy or record.tol, None
+    if prove is not None:
+        error = decided(qp, s, residuals, tol, prove)
+    return record.but(
+        status=verdict(s.status, residuals, tol, error=error),
+        objective=objective,
+        decided_by="residuals" if error is None else "reference",
+        optimum_error=error,
+        **residuals._asdict(),
+    )
+
+
+def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
+    """Evaluate what a point means physically; with a note, if that is impossible."""
+    if not has_point(s):
+        return {}, ""
+    try:
+        return plain(case.quantities(s)), ""
+    except Exception as e:  # the family's code; its fault must not lose the record
+        return {}, note_of("quantities", e)
+
+
+def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
+    """Bound the error of a point: fields of its record; with a note, if impossible.
+
+    energy_bound covers the answer itself, û and u_λ of `harness.verify.certificate`.
+    certificate: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)),
+    `answer` (the bound of the answer alone) and `moved` = ‖u − û‖, all relative to a
+    lower bound of ‖u*‖, and `seminorm`, 1 where bodies can move rigidly, which nothing
+    bounds.
+    """
+    if case.mechanics is None or not has_point(s):
+        return {}, ""
+    import scipy.optimize  # noqa: F401  # `certify` may need it: that is not timed
+
+    start = perf_counter()
+    try:
+        found = certify(case.mechanics, case.mechanics.back(s))
+    except UncertifiableError as e:
+        seconds = perf_counter() - start
+        return {"certify_seconds": seconds}, f"no energy_bound: {e}"
+    except Exception as e:  # the family's code; its fault must not lose the record
+        return {}, note_of("energy_bound", e)
+    return {
+        "energy_bound": found.bound,
+        "certificate": found.parts,
+        "certify_seconds": perf_counter() - start,
+    }, ""
+
+
+def has_point(s: Solution) -> bool:
+    """Whether all four vectors are finite."""
+    return all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))
+
+
+def note_of(what: str, e: Exception) -> str:
+    """Say in one line what could not be computed of a record."""
+    return " ".join(f"no {what}: {type(e).__name__}: {e}".split())
+
+
+def noted(record: Record, *notes: str) -> Record:
+    """Add notes to the message of a record."""
+    return record.but(message="; ".join(filter(None, [record.message, *notes])))
+
+
+def plain(data: Any) -> Any:
+    """Convert to what JSON knows; anything else is shown by its repr."""
+    match data:
+        case np.ndarray() | np.generic():
+            return plain(data.tolist())
+        case Mapping():
+            return {str(key): plain(value) for key, value in data.items()}
+        case list() | tuple():
+            return [plain(value) for value in data]
+        case None | bool() | int() | float() | str():
+            return data
+        case _:
+            return repr(data)

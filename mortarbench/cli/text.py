@@ -1,0 +1,233 @@
+"""What commands print for people: aligned text from plain data."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness.history import History
+from harness.record import Record, Verdict
+from harness.solution import Status
+
+#: of quantities of elastic bodies, as the interface promises them; others are bare
+UNITS = {
+    "energy": "J/m",
+    "tip": "m",
+    "contact_force": "N/m",
+    "multiplier_sum": "N/m",
+    "max_von_mises": "Pa",
+    "stress_error": "(dimensionless)",
+}
+
+
+_HEADS = {
+    "free_gradient": "‖φ‖", "chopped_gradient": "‖β‖", "infeasibility": "‖Ax−b‖",
+    "active": "at bound", "cost": "own cost",
+}  # fmt: skip
+_LEGEND = {
+    "step": "steps: c cg, e expansion, f fallback, p proportioning",
+    "free_gradient": "‖φ‖: free gradient",
+    "chopped_gradient": "‖β‖: chopped gradient",
+    "active": "at bound: variables that meet one",
+    "cost": "own cost: what it minimises inside",
+}
+_UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
+_ROWS = 15  #: of a table of convergence
+
+
+def first_sentence(thing: object) -> str:
+    """Cut the docstring of an instance's class after its first sentence.
+
+    Empty where the class has none but that which `dataclass` makes of its fields.
+    """
+    kind = type(thing)
+    paragraph = (inspect.getdoc(kind) or "").partition("\n\n")[0]
+    if paragraph.startswith(f"{kind.__name__}("):
+        return ""
+    sentence, dot, _ = (" ".join(paragraph.split()) + " ").partition(". ")
+    return f"{sentence}." if dot else sentence.strip()
+
+
+def first_comment(path: Path) -> str:
+    """Read the comment that a suite starts with."""
+    line = path.read_text("utf-8").partition("\n")[0]
+    return line.removeprefix("#").strip() if line.startswith("#") else ""
+
+
+def listing(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Lay out one line per row: name, description, and what can be set."""
+    return aligned(
+        [
+            row["name"],
+            row["description"],
+            " ".join(
+                f"{key}={value}"
+                for key, value in (
+                    row.get("defaults") or row.get("options", {})
+                ).items()
+            ),
+            " | ".join(row.get("forms", ())),
+        ]
+        for row in rows
+    )
+
+
+def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
+    """Count what each of `solvers` claimed and what of it is so; others come last."""
+    latest = {r.run_id: r for r in records}.values()
+    header = [
+        "solver", "measured", "claimed solved", "verified", "refuted", "declined",
+        "other",
+    ]  # fmt: skip
+    rows = [header]
+    present = {r.solver for r in latest}
+    for solver in dict.fromkeys([*solvers, *sorted(present)]):
+        every = [r for r in latest if r.solver == solver]
+        declined = [r for r in every if r.status is Verdict.DECLINED]
+        own = [r for r in every if r.status is not Verdict.DECLINED]
+        claimed = [r for r in own if r.claimed == Status.SOLVED]
+        verified = [r for r in own if r.status is Verdict.VERIFIED]
+        refuted = [r for r in claimed if r.status is not Verdict.VERIFIED]
+        other = len(own) - len(verified) - len(refuted)
+        counts = map(len, (own, claimed, verified, refuted, declined))
+        rows.append([solver, *map(str, counts), str(other)])
+    return aligned(rows, right=range(1, len(header)))
+
+
+def outcome(r: Record) -> str:
+    """Lay out one measurement, in SI units."""
+    options = ", ".join(f"{key}={value}" for key, value in r.options.items())
+    units = UNITS if "dofs" in r.quantities else {}
+    rows = [
+        ("case", r.case),
+        ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
+        ("solver", f"{r.solver} ({options})" if options else r.solver),
+        ("tolerance", f"{r.tol:g}"),
+        ("status", f"{r.status} (claimed {r.claimed})"),
+        ("message", r.message),
+        ("iterations", _text(r.iterations)),
+        ("counts", _text(r.counts)),
+        ("it reports", _text(r.reported)),
+        ("prepare", _text(r.prepare_seconds, "s (one run)", digits=3)),
+        ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
+        ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
+        *(
+            (f"{name} residual", _text(_known(getattr(r, name)), digits=2))
+            for name in ("primal", "dual", "complementarity", "gap")
+        ),
+        ("off optimum", _text(_known(r.optimum_error), digits=2)),
+        ("energy error", _bound(r)),
+        ("objective", _text(_known(r.objective))),
+        *(
+            (name.replace("_", " "), _text(value, units.get(name, "")))
+            for name, value in r.quantities.items()
+        ),
+    ]
+    return aligned([name, value] for name, value in rows if value)
+
+
+def _bound(r: Record) -> str:
+    """Show the certified error: of the answer, of nothing that bodies can do freely."""
+    if r.energy_bound is None:
+        return ""
+    beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
+    return f"at most {r.energy_bound:.2g} (certified, relative{beside})"
+
+
+def convergence(history: History) -> str:
+    """Lay out how a solver got there, by its own account; empty without a history.
+
+    A row ends each outer iteration, or one in so many steps where there are none; what
+    happened since the row before is counted by kinds of steps: "c12 e3".
+    """
+    columns = {k: v for k, v in history.items() if v.size and k not in _UNTOLD}
+    if not columns:
+        return ""
+    ends = _milestones(history)
+    starts = [0, *(end + 1 for end in ends[:-1])]
+    cells = [["iteration", *(str(end + 1) for end in ends)]]
+    for name, values in columns.items():
+        texts = (
+            [_tally(values[a : b + 1]) for a, b in zip(starts, ends, strict=True)]
+            if values.dtype.kind == "U"
+            else [_entry(name, values[end].item()) for end in ends]
+        )
+        cells.append([_HEADS.get(name, name.replace("_", " ")), *texts])
+    return aligned(zip(*cells, strict=True), right=range(len(cells)))
+
+
+def legend(history: History) -> str:
+    """Explain in a line what `convergence` shows; empty where that needs no words."""
+    told = (text for k, text in _LEGEND.items() if k in history and history[k].size)
+    return "; ".join(told)
+
+
+def _milestones(history: History) -> list[int]:
+    """Choose the rows to show: the last of each outer iteration, or of equal parts."""
+    length = next(iter(history.values())).size
+    outer = history.get("outer", np.zeros(length))
+    ends = [*np.flatnonzero(outer[1:] != outer[:-1]).tolist(), length - 1]
+    if len(ends) == 1:
+        ends = list(range(length))
+    if len(ends) <= _ROWS:
+        return ends
+    return [ends[i] for i in np.linspace(0, len(ends) - 1, _ROWS).round().astype(int)]
+
+
+def _tally(letters: NDArray[np.str_]) -> str:
+    kinds, numbers = np.unique(letters, return_counts=True)
+    return " ".join(f"{k}{n}" for k, n in zip(kinds, numbers, strict=True))
+
+
+def _entry(name: str, value: float) -> str:
+    digits = ".8g" if name == "cost" or value == 0 else ".2e"
+    return str(value) if isinstance(value, int) else f"{value:{digits}}"
+
+
+def aligned(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
+    """Pad columns to their widest cell; those listed in `right` on the left side."""
+    table = list(rows)
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    right = set(right)
+    lines = (
+        "  ".join(
+            cell.rjust(width) if i in right else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in table
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _known(value: float | None) -> float | None:
+    """Take NaN for what it says: there is no such number."""
+    return None if value is None or math.isnan(value) else value
+
+
+def _text(value: Any, unit: str = "", digits: int = 9) -> str:
+    """Show a number, or nested numbers, with a unit; empty where there is nothing."""
+    match value:
+        case None:
+            return ""
+        case float():
+            text = f"{value:.{digits}g}"
+        case list() | tuple():
+            text = f"({', '.join(_text(v, digits=digits) for v in value)})"
+        case Mapping():
+            parts = (f"{key} {_text(v, unit, digits)}" for key, v in value.items())
+            return ", ".join(parts)
+        case _:
+            text = str(value)
+    return f"{text} {unit}".rstrip()
+
+
+def legible(text: str) -> str:
+    """Make foreign text fit for a terminal: one line, and nothing that steers it."""
+    line = " ".join(text.split())
+    return "".join(c if c.isprintable() else "\ufffd" for c in line)
