@@ -15,7 +15,7 @@ from harness.plugin import Fields
 from harness.processes.supervisor import ONE_THREAD
 from harness.verify.kkt import VERIFIED_FACTOR
 from mortarbench.cli import main as cli
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -31,8 +31,8 @@ def main() -> None:
     sys.exit(cli.main(_workbench(), sys.argv[1:]))
 
 
-def _workbench() -> Workbench:
-    return Workbench(
+def _workbench() -> Registries:
+    return Registries(
         families=PROBLEMS,
         solvers=SOLVERS,
         reference=reference_solution,

@@ -402,6 +402,6 @@ PROBLEMS = {"tiny": Tiny(), "sized": Sized()}
 if __name__ == "__main__":
     what, *pipes = sys.argv[1:]
     if what == "generator":
-        generator.serve(generator.Generator(PROBLEMS, unsolved), *map(int, pipes))
+        generator.serve(generator.CaseWorker(PROBLEMS, unsolved), *map(int, pipes))
     else:
         serve(SOLVERS[what], *map(int, pipes))

@@ -29,7 +29,7 @@ from harness.running.run import run
 from harness.suite.suite import Suite
 from harness.verify.measure import SAMPLE_SECONDS
 from harness.verify.optimum import proves
-from harness.verify.verdicts import blank
+from harness.verify.verdicts import new_record
 from solvers.reference.solve import reference_solution
 
 PLUGIN = Path(__file__).with_name("attackers.py")
@@ -166,7 +166,7 @@ class Bench:
         if solver not in self.workers:
             log = self.folder / f"{solver}.log"
             self.workers[solver] = WorkerProcess(command or [*START, solver], log)
-        record = blank(
+        record = new_record(
             CASE, "tiny/plain", SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
         ).but(qp=self.digest)  # fmt: skip

@@ -52,10 +52,10 @@ def journal(tmp_path):
 def refused(capsys, monkeypatch, tmp_path):
     """Run a command that must end with exit code 2; returns its one line."""
     monkeypatch.chdir(tmp_path)
-    workbench = _workbench()
+    registries = _workbench()
 
     def refused(*argv):
-        assert main(workbench, [str(word) for word in argv]) == 2
+        assert main(registries, [str(word) for word in argv]) == 2
         message = capsys.readouterr().err
         assert message.count("\n") == 1
         return message

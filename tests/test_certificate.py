@@ -269,7 +269,7 @@ def test_the_same_point_is_certified_once_and_another_one_anew(tmp_path, monkeyp
     name = parse("beam-ring/Nr=4/Nh=3/step=1/dual", PROBLEMS)
     of = {"family": name.family, "params": dict(name.params), "form": name.form}
     at = {"describe": of, "point": str(tmp_path / "s.npz"), "fields": None, "keep": 1}
-    made = generator.Generator(PROBLEMS, reference_solution)
+    made = generator.CaseWorker(PROBLEMS, reference_solution)
     qp = build(name, PROBLEMS[name.family], reference_solution).qp
     s = SOLVERS["clarabel"].prepare(qp, 1e-8)()
 

@@ -18,7 +18,7 @@ from harness.registry import load_plugin
 from harness.results.journal import Journal, read_journal
 from harness.running.progress import shown_on
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 WELLS = Path(__file__).with_name("wells.py")
 SOLVERS = load_plugin(WELLS).solvers
@@ -36,14 +36,14 @@ def paper(out, quick, say):
 
 
 @pytest.fixture
-def workbench(tmp_path):
+def registries(tmp_path):
     suites = tmp_path / "suites"
     suites.mkdir()
     (suites / "tiny.toml").write_text(
         "# For tests.\nname = 'tiny'\nsolvers = ['exact']\n"
         "[[problems]]\nfamily = 'well'\n"
     )
-    return Workbench(
+    return Registries(
         families=FAMILIES,
         solvers=SOLVERS,
         reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
@@ -58,13 +58,13 @@ def workbench(tmp_path):
 
 
 @pytest.fixture
-def cli(workbench, capsys, monkeypatch, tmp_path):
+def cli(registries, capsys, monkeypatch, tmp_path):
     """Run a command line in an empty folder; returns its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
 
     def cli(*argv):
-        code = main(workbench, [str(word) for word in argv])
+        code = main(registries, [str(word) for word in argv])
         streams = capsys.readouterr()
         return code, streams.out, streams.err
 
@@ -212,8 +212,8 @@ def compare(before, after, formats, *, factor):
     return said, [after / f"{form}.{form}" for form in formats]
 
 
-def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(workbench, capsys):
-    bench = replace(workbench, compare=compare)
+def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(registries, capsys):
+    bench = replace(registries, compare=compare)
     argv = ["report", "one", "two", "--factor", "3"]
 
     assert main(bench, [*argv, "--format", "csv,html,md"]) == 0
@@ -349,11 +349,11 @@ def test_a_terminal_of_few_characters_is_enough(tmp_path):
     assert "? ? 0." in done.stdout
 
 
-def test_a_file_that_cannot_be_written_is_named(workbench, capsys):
+def test_a_file_that_cannot_be_written_is_named(registries, capsys):
     def report(folder, formats, **_):
         raise PermissionError(13, "Permission denied", str(folder / "index.html"))
 
-    assert main(replace(workbench, report=report), ["report", "here"]) == 2
+    assert main(replace(registries, report=report), ["report", "here"]) == 2
     assert capsys.readouterr().err == (
         "mortarbench: here/index.html: Permission denied\n"
     )
@@ -724,12 +724,12 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     ]  # fmt: skip
 
 
-def test_the_workbench_is_not_changed_by_plugins(workbench, tmp_path):
+def test_the_workbench_is_not_changed_by_plugins(registries, tmp_path):
     (tmp_path / "plug.py").write_text(PLUGIN)
-    before = replace(workbench)
+    before = replace(registries)
 
-    extended = workbench.with_files([tmp_path / "plug.py"])
+    extended = registries.with_files([tmp_path / "plug.py"])
 
     assert set(extended.solvers) == {*SOLVERS, "times"}
     assert set(extended.families) == {"well", "pit"}
-    assert workbench == before
+    assert registries == before

@@ -19,7 +19,7 @@ from harness.registry import load_plugin
 from harness.results.folder import environment_of
 from harness.results.journal import read_journal
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 pytest.importorskip("distributed")
 
@@ -100,7 +100,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     (tmp_path / "wells.toml").write_text(SUITE.format(repeats=1))
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
-    workbench = Workbench(
+    registries = Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
         report=lambda folder, formats: [],
@@ -109,7 +109,7 @@ def cli(capsys, monkeypatch, tmp_path):
     )
 
     def cli(*argv):
-        code = main(workbench, argv)
+        code = main(registries, argv)
         return code, *capsys.readouterr()
 
     return cli
@@ -304,9 +304,9 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import wells; "
         "from mortarbench.cli.main import main; "
-        "from mortarbench.cli.registries import Workbench; "
+        "from mortarbench.cli.registries import Registries; "
         "nothing = dict.fromkeys(('reference', 'plot', 'vtu', 'series', 'paper')); "
-        "main(Workbench(families=wells.PROBLEMS, solvers=wells.SOLVERS, "
+        "main(Registries(families=wells.PROBLEMS, solvers=wells.SOLVERS, "
         "report=lambda *_: [], start=(sys.executable, '-P', wells.__file__), "
         "**nothing), sys.argv[2:])"
     )

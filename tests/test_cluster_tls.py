@@ -10,7 +10,7 @@ from harness import InputError, Verdict
 from harness.registry import load_plugin
 from harness.running.cluster import on_cluster
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from tests.test_cluster import Cluster, measured
 
 WELLS = Path(__file__).with_name("wells.py")
@@ -77,7 +77,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     (tmp_path / "wells.toml").write_text(SUITE)
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
     plugin = load_plugin(WELLS)
-    workbench = Workbench(
+    registries = Registries(
         families=plugin.problems,
         solvers=plugin.solvers,
         report=lambda folder, formats: [],
@@ -90,7 +90,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
         # this process read its environment when it imported Dask
         told = {f"distributed.comm.tls.{k}": v for k, v in credentials.items()}
         with dask.config.set(told):
-            code = main(workbench, [
+            code = main(registries, [
                 "run", str(tmp_path / "wells.toml"), "--out", str(tmp_path / "out"),
                 "--dask", cluster.address,
             ])  # fmt: skip

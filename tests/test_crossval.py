@@ -23,9 +23,9 @@ from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
 from harness.verify.measure import Measurement
 from harness.verify.references import reference_point
-from harness.verify.verdicts import blank, judged
+from harness.verify.verdicts import judged, new_record
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from reports.validation.report import write_validation
 from solvers.reference.solve import reference_solution
@@ -47,7 +47,7 @@ def record_of(text, label, tol=1e-8, **more):
     name = parse(text, FAMILIES)
     spec = SolverSpec(name=label, label=label)
     case = canonical(name, FAMILIES[name.family])
-    return blank(
+    return new_record(
         name, case, spec, options={}, tol=tol, repeat=0, environment="here", **more
     )
 
@@ -75,11 +75,11 @@ def cli(capsys):
     """Validate a folder; returns the exit code, stdout and stderr."""
 
     def cli(*argv, **more):
-        workbench = Workbench(
+        registries = Registries(
             families=PROBLEMS, solvers={}, reference=reference_solution, **NOWHERE,
             **more,
         )  # fmt: skip
-        code = main(workbench, ["validate", *map(str, argv)])
+        code = main(registries, ["validate", *map(str, argv)])
         return code, *capsys.readouterr()
 
     return cli

@@ -244,7 +244,7 @@ def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
         ["solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "2"],
         ["export", "beam-ring/dual", "a.txt"], ["run", "nowhere", "--case", "*"],
     ]  # fmt: skip
-    chance, workbench = random.Random(count), _workbench()
+    chance, registries = random.Random(count), _workbench()
     for _ in range(count // 3):
         argv = [*chance.choice(commands)]
         at = chance.randrange(1, len(argv))
@@ -252,7 +252,7 @@ def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
         if argv in commands or "\n" in argv[at] or "-h" in argv[at]:
             continue
         with damage.no_hang():
-            assert main(workbench, argv) == 2, argv
+            assert main(registries, argv) == 2, argv
         message = capsys.readouterr().err
         assert message.count("\n") == 1, argv
         assert len(message) < 1500

@@ -176,7 +176,7 @@ def test_a_block_that_shows_a_command_is_one_that_is_run():
 
 
 @pytest.fixture
-def carry_out(tmp_path, monkeypatch, capsys):
+def execute(tmp_path, monkeypatch, capsys):
     """Run one command as a reader would, in a folder that has the suites."""
     (tmp_path / "suites").symlink_to(ROOT / "suites")
     monkeypatch.chdir(tmp_path)
@@ -198,14 +198,14 @@ def carry_out(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_command_of_a_page_works(page, carry_out, tmp_path):
+def test_every_command_of_a_page_works(page, execute, tmp_path):
     """In its order; what one command writes, the next may read."""
     instead, elsewhere = normal(SHORTER), normal(ELSEWHERE)
     for kind, what, more in shown(page):
         if kind == "file":
             (tmp_path / what).write_text(more, "utf-8")
         elif what not in elsewhere:
-            assert carry_out(instead.get(what, what)) == more, what
+            assert execute(instead.get(what, what)) == more, what
     for file, pattern in PROMISED.get(page.stem, {}).items():
         written = (tmp_path / file).read_bytes().decode("utf-8", "replace")
         assert re.search(pattern, written), file

@@ -28,7 +28,7 @@ from harness.registry import load_plugin
 from harness.results.faults import FAULTS, Fault, in_words, left, read_faults
 from harness.results.folder import Held, refuse_foreign
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from reports.data.evidence import read_evidence
 from reports.sections.summary import summary
 
@@ -284,7 +284,7 @@ def cli(capsys, monkeypatch, tmp_path):
     (tmp_path / "wells.toml").write_text(SUITE)
     plugin = load_plugin(WELLS)
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
-    workbench = Workbench(
+    registries = Registries(
         families=plugin.problems,
         solvers=plugin.solvers,
         report=first_page,
@@ -293,7 +293,7 @@ def cli(capsys, monkeypatch, tmp_path):
     )
 
     def cli(*argv):
-        code = main(workbench, argv)
+        code = main(registries, argv)
         return code, *capsys.readouterr()
 
     return cli

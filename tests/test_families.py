@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -20,7 +20,7 @@ CASES = [
 
 @pytest.mark.parametrize(("name", "form"), CASES)
 def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsys):
-    workbench = Workbench(
+    registries = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=None, plot=None, vtu=None, series=None, paper=None,
     )  # fmt: skip
@@ -28,7 +28,7 @@ def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsy
         PROBLEMS[name].build(form, _defaults(name), reference_solution).qp
     )
     solver = "clarabel" if declined else "smalbe"
-    code = main(workbench, ["solve", f"{name}/{form}", "--solver", solver, "--json"])
+    code = main(registries, ["solve", f"{name}/{form}", "--solver", solver, "--json"])
     record = json.loads(capsys.readouterr().out)
 
     assert (code, record["status"]) == (0, "verified")

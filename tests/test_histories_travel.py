@@ -18,7 +18,7 @@ from harness.registry import load_plugin
 from harness.results.journal import read_journal
 from harness.verify.measure import measure
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from mortarbench.cli.text import convergence
 
 DESCENTS = Path(__file__).with_name("descents.py")
@@ -43,7 +43,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     wells = load_plugin(WELLS)
     nothing = dict.fromkeys(("plot", "vtu", "series", "paper"))
-    workbench = Workbench(
+    registries = Registries(
         families=wells.problems, solvers=wells.solvers,
         report=lambda folder, formats: [], start=(sys.executable, "-P", str(WELLS)),
         reference=unsolved, **nothing,
@@ -51,7 +51,7 @@ def cli(capsys, monkeypatch, tmp_path):
 
     def cli(command, *argv):
         words = [command, *argv, "--plugin", str(DESCENTS)]
-        code = main(workbench, words)
+        code = main(registries, words)
         streams = capsys.readouterr()
         return code, streams.out, streams.err
 

@@ -10,7 +10,7 @@ from harness.files.store import load_fields, load_history, load_solution, save
 from harness.results.folder import environment_of
 from harness.results.journal import Journal
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from reports import write_report
 from solvers import SOLVERS
@@ -57,7 +57,7 @@ def command(capsys, monkeypatch, tmp_path):
     """Run the command line; return exit code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
-    bench = Workbench(
+    bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=write_report, plot=None, vtu=None, series=None, paper=None,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from harness import InputError, Record, Verdict
 from harness.names import CaseName
 from harness.registry import SolverSpec
 from harness.results.journal import Journal, read_journal
-from harness.verify.verdicts import blank
+from harness.verify.verdicts import new_record
 
 
 def record(run_id, **changes):
@@ -155,7 +155,7 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
 
 def test_a_measurement_has_the_name_that_older_folders_give_it():
     """Or a folder that goes on would measure everything once more."""
-    made = blank(
+    made = new_record(
         CaseName(family="box", params={"n": 3}, form="dual"), "box/n=3/dual",
         SolverSpec(name="osqp", label="osqp"), options={"max_iter": 100}, tol=1e-6,
         repeat=2, environment="e",

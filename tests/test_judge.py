@@ -13,7 +13,7 @@ from harness.names import CaseName
 from harness.registry import SolverSpec
 from harness.verify.certificate import UncertifiableError
 from harness.verify.measure import Measurement
-from harness.verify.verdicts import blank, certified, judged, quantities_of
+from harness.verify.verdicts import certified, judged, new_record, quantities_of
 
 #: min ½(x₁² + x₂²) − x₁ − x₂, x₁ + x₂ = 1, x₁ ≤ ¼, x ≥ 0: (¼, ¾), y = ¼, z = ½
 QP_ = QP(
@@ -30,7 +30,7 @@ POINT = Solution(
 def record(tol=1e-8, options=None, **changes):
     name = CaseName(family="f", params={"n": 1}, form="p")
     spec = SolverSpec(name="s", label="s")
-    return blank(
+    return new_record(
         name, "f/p", spec, options=options or {}, tol=tol,
         **dict(repeat=0, environment="e") | changes,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from harness import Record, Status, Verdict
 from harness.results.journal import Journal, read_journal
 from harness.verify.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
@@ -148,7 +148,7 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
     """Of a real run, verified and refuted answers: no status is taken from the line."""
     monkeypatch.chdir(tmp_path)
-    bench = Workbench(
+    bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda out, formats: [], plot=None, vtu=None, series=None, paper=None,
     )  # fmt: skip

@@ -15,7 +15,7 @@ from harness.files.qpfile import load_qp, save_qp
 from harness.registry import load_plugin
 from harness.results.journal import read_journal
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 #: one process has the run that all replay
 pytestmark = pytest.mark.xdist_group("replay")
@@ -42,9 +42,9 @@ def no_report(folder, formats):
 
 
 @pytest.fixture(scope="module")
-def workbench():
+def registries():
     nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
-    return Workbench(
+    return Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
         report=no_report,
@@ -54,22 +54,22 @@ def workbench():
 
 
 @pytest.fixture(scope="module")
-def finished(workbench, tmp_path_factory):
+def finished(registries, tmp_path_factory):
     """The folder of a run, which no test may write to."""
     folder = tmp_path_factory.mktemp("finished")
     suite = folder / "wells.toml"
     suite.write_text(SUITE)
-    assert main(workbench, ["run", str(suite), "--out", str(folder / "done")]) == 0
+    assert main(registries, ["run", str(suite), "--out", str(folder / "done")]) == 0
     return folder / "done"
 
 
 @pytest.fixture
-def cli(workbench, capsys, monkeypatch, tmp_path):
+def cli(registries, capsys, monkeypatch, tmp_path):
     """Run a command line in an empty folder; returns its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
 
-    def cli(*argv, workbench=workbench):
-        code = main(workbench, argv)
+    def cli(*argv, registries=registries):
+        code = main(registries, argv)
         return code, *capsys.readouterr()
 
     return cli
@@ -256,13 +256,13 @@ def test_a_capsule_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
 
 
 @pytest.mark.parametrize("lost", [{"solvers": {}}, {"families": {}}])
-def test_a_plug_in_that_is_needed_is_asked_for(cli, workbench, tmp_path, lost):
+def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
     (tmp_path / "wells.toml").write_text(SUITE)
     (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
     little = ("--solver", "exact", "--repeats", "1")
     cli("run", "wells.toml", "--out", "done", "--plugin", "empty.py", *little)
     run_id = read_journal(tmp_path / "done")[0].run_id
-    code, _, err = cli("replay", "done", run_id, workbench=replace(workbench, **lost))
+    code, _, err = cli("replay", "done", run_id, registries=replace(registries, **lost))
 
     assert (code, err.count("\n")) == (2, 1)
     assert "unknown" in err

@@ -144,7 +144,7 @@ def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
     assert kkt_residuals(WEAK, SHORT).worst <= 10 * TOL
 
     measured = judged(
-        blank(), WEAK, Measurement(solution=SHORT), proves(reference_solution)
+        new_record(), WEAK, Measurement(solution=SHORT), proves(reference_solution)
     )
 
     assert measured.status is Verdict.WRONG
@@ -155,7 +155,7 @@ def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
     assert rejudged(again, 1e9) is Verdict.VERIFIED  # at 0.1
 
 
-def blank(**changes):
+def new_record(**changes):
     return Record(
         run_id="r", case="c/f", family="c", params={}, form="f", sizes={}, solver="s",
         options={}, tol=TOL, repeat=0, block=0, status=Verdict.FAILED, **changes,
@@ -169,7 +169,7 @@ def test_an_answer_is_judged_at_the_accuracy_that_is_not_its_tolerance(
     """min ½x² − x at x = 1.001: a residual of 1e-3."""
     s = at([1.001])
     measured = judged(
-        blank(accuracy=accuracy), qp_of([1], [-1]), Measurement(solution=s)
+        new_record(accuracy=accuracy), qp_of([1], [-1]), Measurement(solution=s)
     )
 
     assert (measured.status is Verdict.VERIFIED) is expected
@@ -184,7 +184,7 @@ def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
     assert judge(qp, s) is Verdict.VERIFIED
 
     measured = judged(
-        blank(), qp, Measurement(solution=broken), proves(reference_solution)
+        new_record(), qp, Measurement(solution=broken), proves(reference_solution)
     )
 
     assert measured.status is Verdict.WRONG
@@ -244,7 +244,7 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
 
 
 def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
-    stored = blank(decided_by="reference", optimum_error=5e-8).but(
+    stored = new_record(decided_by="reference", optimum_error=5e-8).but(
         claimed="solved", primal=1e-6, dual=0.0, complementarity=0.0, gap=0.0,
         status=verdict(Status.SOLVED, Residuals(1e-6, 0, 0, 0), TOL, error=5e-8),
     )  # fmt: skip

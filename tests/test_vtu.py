@@ -9,7 +9,7 @@ import pytest
 from harness import Fields, InputError
 from harness.files.qpfile import save_qp
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from problems import PROBLEMS
 from reports.export.vtu import write_series, write_vtu
 from solvers import SOLVERS
@@ -91,7 +91,7 @@ def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path)
 @pytest.fixture
 def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""
-    bench = Workbench(
+    bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
         series=write_series,

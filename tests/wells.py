@@ -1,6 +1,6 @@
 """A plug-in: parabolas over half lines, and solvers for them, some of which misbehave.
 
-Run as a program it is the worker of a workbench that holds nothing else.
+Run as a program it is the worker of a registries that holds nothing else.
 """
 
 import os
@@ -14,7 +14,7 @@ import numpy as np
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 FAULTS = {
     13: KeyboardInterrupt(),
@@ -171,7 +171,7 @@ def unsolved(qp):
 
 if __name__ == "__main__":
     nothing = dict.fromkeys(("report", "plot", "vtu", "series", "paper"))
-    workbench = Workbench(
+    registries = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=unsolved, **nothing
     )
-    sys.exit(main(workbench, sys.argv[1:]))
+    sys.exit(main(registries, sys.argv[1:]))

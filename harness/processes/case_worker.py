@@ -49,7 +49,7 @@ from harness.verify.verdicts import certified, note_of, plain, quantities_of
 MOST_CERTIFIED = 10_000  #: points whose bounds are kept
 
 
-class Generator:
+class CaseWorker:
     """Builds cases of `families`, with the injected `reference` solve."""
 
     def __init__(
@@ -160,7 +160,7 @@ class Generator:
         return {"meta": {**meta, **seconds, "qp": digest}}
 
 
-def serve(generator: Generator, request_fd: int, reply_fd: int) -> None:
+def serve(generator: CaseWorker, request_fd: int, reply_fd: int) -> None:
     """Answer requests until there are no more."""
 
     def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:

@@ -15,13 +15,13 @@ from harness.record import Record
 from harness.registry import SolverSpec, options_of, resolve
 from harness.results.folder import environment_of, suite_text
 from harness.results.journal import read_journal
-from harness.results.work_unit import Block
+from harness.results.work_unit import WorkUnit
 from harness.suite.suite import asked_solvers, limits, steps_up_to
-from harness.verify.verdicts import blank, plain
+from harness.verify.verdicts import new_record, plain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Capsule:
+class StoredRun:
     """One stored measurement, and what it takes to repeat it."""
 
     record: Record
@@ -38,7 +38,7 @@ def open_capsule(
     run_id: str,
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
-) -> Capsule:
+) -> StoredRun:
     """Find one measurement and resolve its case and solver in today's registries.
 
     run_id : or the beginning of one, if it is the only one to begin so
@@ -64,7 +64,7 @@ def open_capsule(
     except InputError as e:
         raise InputError(f"{record.run_id}: {e}{plugins_needed(environment)}") from None
     time_limit, memory_limit = limits(text)
-    return Capsule(
+    return StoredRun(
         record=record,
         repeats=[r for r in records if _cell(r) == _cell(record)],
         cases=cases,
@@ -76,18 +76,18 @@ def open_capsule(
 
 
 def block_of(
-    capsule: Capsule,
+    capsule: StoredRun,
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
     environment: str,
-) -> Block:
+) -> WorkUnit:
     """Make the block that measures a capsule again; its last result is that.
 
     environment : digest
     """
     record = capsule.record
     turn = tuple(
-        blank(
+        new_record(
             name,
             canonical(name, families[name.family]),
             capsule.spec,
@@ -100,7 +100,7 @@ def block_of(
         )
         for name in capsule.cases
     )
-    return Block(
+    return WorkUnit(
         number=0,
         cases=capsule.cases,
         turns=(turn,),

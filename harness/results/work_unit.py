@@ -27,7 +27,7 @@ class Commands:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Block:
+class WorkUnit:
     """What to measure, in which order."""
 
     number: int
@@ -57,7 +57,7 @@ class Result:
 class Unbuilt:
     """Instead of results: a case of the block could not be built."""
 
-    block: Block
+    block: WorkUnit
     reason: str  #: one line
     trace: str = ""  #: of the family's code
 
@@ -82,7 +82,7 @@ class Engine(Protocol):
     made as they are taken: the less is taken ahead, the sooner a run can stop.
     """
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
+    def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
 
 

@@ -23,7 +23,6 @@ from harness.errors import InputError, some
 from harness.recipe import Maker
 from harness.results.folder import differences
 from harness.results.work_unit import (
-    Block,
     Commands,
     Engine,
     Opens,
@@ -31,6 +30,7 @@ from harness.results.work_unit import (
     Result,
     Unbuilt,
     Unmade,
+    WorkUnit,
 )
 
 if TYPE_CHECKING:  # it needs the package distributed
@@ -143,7 +143,7 @@ class Nodes:
 class _Task:
     """A block, or what is left of one, with the Dask worker that it was given to."""
 
-    block: Block
+    block: WorkUnit
     part: int = 0  #: one more whenever a worker was lost after the first results
     lost: int = 0  #: workers that it has cost
     delivered: set[str] = field(default_factory=set)  #: run ids, of all parts
@@ -195,7 +195,7 @@ class _Cluster:
         self._left: deque[_Task] = deque()
         client.subscribe_topic(name, lambda event: self._told.put(event[1]))
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
+    def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
         try:
             while self._top_up(blocks):
@@ -208,7 +208,7 @@ class _Cluster:
             for task in self._under_way.values():
                 task.future.cancel()
 
-    def _top_up(self, blocks: Iterator[Block]) -> bool:
+    def _top_up(self, blocks: Iterator[WorkUnit]) -> bool:
         """Give every idle worker a block to do; False when all blocks are done."""
         idle = self._workers() - {task.worker for task in self._under_way.values()}
         while True:
@@ -231,12 +231,12 @@ class _Cluster:
             raise _SchedulerGoneError from e
 
     def _submit(self, task: _Task, worker: str) -> None:
-        from harness.running.dask_worker import carry_out
+        from harness.running.dask_worker import execute
 
         key = task.key
         task.worker = worker
         task.future = self._client.submit(
-            carry_out,
+            execute,
             self._name,
             key,
             task.block,

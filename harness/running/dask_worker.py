@@ -1,7 +1,7 @@
 """One machine of a cluster: what a Dask worker does for a run.
 
-A `Station` stays open in each Dask worker for as long as the run lasts, with its solver
-processes on a CPU that no other station of that machine has. It ends with the run.
+An `Executor` stays open in each Dask worker for as long as the run lasts; its solver
+processes are on a CPU that no other of that machine has. It ends with the run.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from harness.errors import InputError
 from harness.processes.supervisor import ONE_THREAD
 from harness.recipe import Maker
 from harness.registry import load_plugin, merged
-from harness.results.work_unit import Block, Commands, Outcome
-from harness.running.executor import Station
+from harness.results.work_unit import Commands, Outcome, WorkUnit
+from harness.running.executor import Executor
 
 COLLECT_SECONDS = 10.0  #: that a worker waits for its parent to fetch a result
 
@@ -44,7 +44,7 @@ class Delivery:
 
 
 class Node(WorkerPlugin):
-    """Opens a station in every Dask worker, those that join later included.
+    """Opens an executor in every Dask worker, those that join later included.
 
     commands : of the parent; its Python is replaced by that of the node
     plugins : files, which must be there under the same paths
@@ -79,7 +79,7 @@ class Node(WorkerPlugin):
         self._fetched = Event()
 
     def teardown(self, worker: Worker | None = None) -> None:
-        """End the processes of the station, at the latest when a measurement is made.
+        """End the processes of the executor, at the latest when a measurement is made.
 
         Dask cannot stop a block that is being carried out; its thread comes here last.
         """
@@ -92,7 +92,7 @@ class Node(WorkerPlugin):
             self._open = None
         self._busy.release()
 
-    def carry_out(self, key: str, block: Block, tell: Callable[[], None]) -> Delivery:
+    def execute(self, key: str, block: WorkUnit, tell: Callable[[], None]) -> Delivery:
         """Measure a block, or what can be measured of it before the run ends.
 
         Returns what was not fetched meanwhile. After each measurement it waits a while
@@ -133,7 +133,7 @@ class Node(WorkerPlugin):
         )
 
     def _carried_out(
-        self, key: str, block: Block, tell: Callable[[], None]
+        self, key: str, block: WorkUnit, tell: Callable[[], None]
     ) -> Delivery:
         opened = self._open = self._open or self._opened()
         os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
@@ -142,7 +142,7 @@ class Node(WorkerPlugin):
         self._key, self._outcomes = key, []
         is_fetched = True
         try:
-            for outcome in opened.station.carry_out(replace(block, turns=turns)):
+            for outcome in opened.executor.execute(replace(block, turns=turns)):
                 self._fetched.clear()
                 self._outcomes.append(outcome)
                 tell()
@@ -174,10 +174,10 @@ class Node(WorkerPlugin):
             for path in self._plugins:
                 operators = merged("operator", operators, load_plugin(path).operators)
             commands = self._here(self._commands)
-            station = Station(commands, scratch, scratch / "cases", operators)
-            stack.enter_context(station)
+            executor = Executor(commands, scratch, scratch / "cases", operators)
+            stack.enter_context(executor)
             return _Open(
-                station=station,
+                executor=executor,
                 cpu=cpu,
                 environment=environment,
                 digest=digest(environment),
@@ -196,7 +196,7 @@ class Node(WorkerPlugin):
         )
 
 
-def carry_out(name: str, key: str, block: Block) -> Delivery:
+def execute(name: str, key: str, block: WorkUnit) -> Delivery:
     """Have the node plug-in of that name measure a block; runs in a Dask worker.
 
     Whenever there is something to `collect`, it says so under the topic `name`.
@@ -215,7 +215,7 @@ def carry_out(name: str, key: str, block: Block) -> Delivery:
             "each other; start it with --nthreads 1"
         )
     node = cast(Node, worker.plugins[name])
-    return node.carry_out(key, block, lambda: worker.log_event(name, key))
+    return node.execute(key, block, lambda: worker.log_event(name, key))
 
 
 def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
@@ -226,7 +226,7 @@ def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Open:
-    station: Station
+    executor: Executor
     cpu: int
     environment: dict[str, Any]
     digest: str
@@ -234,7 +234,7 @@ class _Open:
 
 
 def own_cpu(stack: ExitStack) -> int:
-    """Take a CPU that no other station on this machine has; the kernel gives it back.
+    """Take a CPU that no other executor on this machine has; the kernel gives it back.
 
     Raises
     ------

@@ -21,7 +21,14 @@ from harness.processes.supervisor import WorkerProcess
 from harness.qp import QP
 from harness.recipe import NO_MAKERS, Maker
 from harness.record import Record, Verdict
-from harness.results.work_unit import Block, Commands, Outcome, Result, Unbuilt, Unmade
+from harness.results.work_unit import (
+    Commands,
+    Outcome,
+    Result,
+    Unbuilt,
+    Unmade,
+    WorkUnit,
+)
 from harness.solution import Solution, Status
 from harness.verify.measure import SAMPLE_SECONDS
 from harness.verify.optimum import Optimum, proven_optimum
@@ -30,11 +37,11 @@ from harness.verify.verdicts import has_point, noted
 _MOST_PROVEN = 1000  #: small QPs whose optima are kept
 
 
-class Station:
+class Executor:
     """Carries out blocks one after the other, with one worker process per solver.
 
-    scratch : for files that last as long as the station, of this station alone
-    cases : folder of built cases, see `harness.processes.case_folder`; several stations
+    scratch : for files that last as long as the executor, of this executor alone
+    cases : folder of built cases, see `harness.processes.case_folder`; several executors
         may share it
     operators : what puts an operator P together, see `harness.recipe`
     """
@@ -68,7 +75,7 @@ class Station:
         for process in (*self._workers.values(), self._generator):
             process.close()
 
-    def carry_out(self, block: Block) -> Iterator[Outcome]:
+    def execute(self, block: WorkUnit) -> Iterator[Outcome]:
         """Measure a block; each result comes as soon as it is there.
 
         Raises
@@ -85,7 +92,7 @@ class Station:
             except _UnbuiltError as e:
                 yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
 
-    def _turn(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Outcome]:
+    def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
         """Measure one solver; after a fault that is not its own, once more.
 
         Of a sequence all steps are driven again, since what the solver carried is lost;
@@ -107,7 +114,7 @@ class Station:
             for record in missing[: 1 if tried_again else None]:
                 yield Unmade(record=record, reason=reason, tried_again=tried_again)
 
-    def _results(self, block: Block, turn: tuple[Record, ...]) -> Iterator[Result]:
+    def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
         Raises
@@ -154,7 +161,7 @@ class Station:
                 return
 
     def _described(
-        self, block: Block, name: CaseName, record: Record, solution: Solution | None
+        self, block: WorkUnit, name: CaseName, record: Record, solution: Solution | None
     ) -> Result:
         """Add what the point means, which the generator knows."""
         if solution is None or not has_point(solution):
@@ -183,7 +190,7 @@ class Station:
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, name: CaseName, block: Block) -> Entry:
+    def _entry(self, name: CaseName, block: WorkUnit) -> Entry:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _plain(name), "qp": str(path)}
             meta: Mapping[str, Any] = self._ask_generator(request, block)["meta"]
@@ -192,7 +199,7 @@ class Station:
         return entry(self._cases, name, block.turns[0][0].environment, make)
 
     def _ask_generator(
-        self, request: Mapping[str, Any], block: Block
+        self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
         for _ in range(2):  # it may have died of something else
             reply = self._generator.ask(
@@ -275,20 +282,20 @@ def one_by_one(
     operators: Mapping[str, Maker] = NO_MAKERS,
 ) -> Iterator[OneByOne]:
     """Open the engine that carries out one block at a time on this machine."""
-    with Station(commands, scratch, cases, operators) as station:
-        yield OneByOne(station)
+    with Executor(commands, scratch, cases, operators) as executor:
+        yield OneByOne(executor)
 
 
 class OneByOne:
     """The engine of a run on one machine: a block is made when the last one is done."""
 
-    def __init__(self, station: Station) -> None:
-        self._station = station
+    def __init__(self, executor: Executor) -> None:
+        self._executor = executor
 
-    def __call__(self, blocks: Iterator[Block]) -> Iterable[Outcome]:
+    def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
         for block in blocks:
-            yield from self._station.carry_out(block)
+            yield from self._executor.execute(block)
 
 
 def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:

@@ -107,8 +107,8 @@ def run(
                 schedule=schedule,
                 progress=progress,
             )
-            with engine(commands, scratch, out.resolve() / "cases") as carry_out:
-                for outcome in carry_out(schedule.blocks()):
+            with engine(commands, scratch, out.resolve() / "cases") as execute:
+                for outcome in execute(schedule.blocks()):
                     book.take(outcome)
                     if book.was_deleted:
                         describe(out, suite, environment)

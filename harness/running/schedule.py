@@ -19,11 +19,11 @@ from typing import Any
 from harness.names import CaseName, canonical
 from harness.plugin import Family
 from harness.record import Record, Verdict
-from harness.results.work_unit import Block
+from harness.results.work_unit import WorkUnit
 from harness.running.pairs import widest
 from harness.running.progress import Progress
 from harness.suite.suite import Suite
-from harness.verify.verdicts import blank
+from harness.verify.verdicts import new_record
 
 Group = tuple[CaseName, ...]
 Cell = tuple[str, str, float]  #: mode, case and tolerance
@@ -76,13 +76,13 @@ class Schedule:
             self._next += 1
         return self._parts[block, part]
 
-    def give_up(self, block: Block) -> bool:
+    def give_up(self, block: WorkUnit) -> bool:
         """Leave out the cases of a block that cannot be built; False if known."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[WorkUnit]:
         """Make the blocks, each when it is asked for."""
         for group in self.suite.groups:
             for tol in self.suite.tolerances:
@@ -120,12 +120,12 @@ class Schedule:
         width = widest(times)
         return width is None or width <= self.suite.precision
 
-    def _block(self, group: Group, tol: float, repeat: int) -> Block | None:
+    def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
         """Shuffle what is left of a block; of a sequence, a solver's whole turn is."""
         left = []
         for spec in self.suite.solvers:
             turn = tuple(
-                blank(
+                new_record(
                     name,
                     self._canonical(name),
                     spec,
@@ -150,7 +150,7 @@ class Schedule:
         if repeat % 2:  # who was first is last: no place in a block favours anybody
             left.reverse()
         self._next += 1
-        return Block(
+        return WorkUnit(
             number=left[0][0].block,
             cases=group,
             turns=tuple(left),

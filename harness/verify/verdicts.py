@@ -26,7 +26,7 @@ from harness.verify.optimum import Proves, decided
 IDENTITY = 1
 
 
-def blank(
+def new_record(
     name: CaseName,
     case: str,
     spec: SolverSpec,

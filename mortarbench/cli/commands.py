@@ -37,18 +37,18 @@ from harness.suite.suite import load_suite
 from harness.verify.verdicts import plain
 from mortarbench.cli import text as show
 from mortarbench.cli.list_ import in_a_line, solvers_page
-from mortarbench.cli.registries import FORMATS, Workbench
+from mortarbench.cli.registries import FORMATS, Registries
 from mortarbench.cli.replay import compared
 from mortarbench.cli.replay import render as show_comparison
 
 
-def list_(workbench: Workbench, options: Namespace) -> int:
+def list_(registries: Registries, options: Namespace) -> int:
     """List what there is, one line each or as one JSON array."""
-    workbench = workbench.with_files(options.plugin)
+    registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
             raise InputError("--markdown is for list solvers only")
-        print(solvers_page(workbench.solvers), end="")
+        print(solvers_page(registries.solvers), end="")
         return 0
     rows: list[dict[str, Any]]
     match options.what:
@@ -60,7 +60,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
                     "defaults": completed(family, {}),
                     "forms": family.forms,
                 }
-                for name, family in workbench.families.items()
+                for name, family in registries.families.items()
             ]
         case "solvers":
             rows = [
@@ -69,7 +69,7 @@ def list_(workbench: Workbench, options: Namespace) -> int:
                     "description": in_a_line(solver),
                     "options": options_of(solver),
                 }
-                for name, solver in workbench.solvers.items()
+                for name, solver in registries.solvers.items()
             ]
         case _:
             rows = [
@@ -79,22 +79,22 @@ def list_(workbench: Workbench, options: Namespace) -> int:
                     "path": str(path),
                 }
                 for path in sorted(
-                    workbench.suites.glob("*.toml"), key=attrgetter("stem")
+                    registries.suites.glob("*.toml"), key=attrgetter("stem")
                 )
             ]
     print(json.dumps(plain(rows)) if options.json else show.listing(rows))
     return 0
 
 
-def run(workbench: Workbench, options: Namespace) -> int:
+def run(registries: Registries, options: Namespace) -> int:
     """Measure what the result folder lacks of a suite, and report; 1 if not all."""
-    ours = workbench.operators
-    workbench = workbench.with_files(options.plugin)
-    path = workbench.suite_path(options.suite)
+    ours = registries.operators
+    registries = registries.with_files(options.plugin)
+    path = registries.suite_path(options.suite)
     suite = with_overrides(
-        load_suite(path, workbench.families, workbench.solvers),
-        workbench.families,
-        workbench.solvers,
+        load_suite(path, registries.families, registries.solvers),
+        registries.families,
+        registries.solvers,
         solvers=options.solver,
         cases=options.case,
         repeats=options.repeats,
@@ -108,17 +108,17 @@ def run(workbench: Workbench, options: Namespace) -> int:
     with shown_on(sys.stderr) as progress:
         missing = run_suite(
             suite,
-            families=workbench.families,
+            families=registries.families,
             out=out,
-            commands=workbench.commands(suite.solvers, options.plugin),
-            resolve=lambda spec: resolve(spec, workbench.solvers),
+            commands=registries.commands(suite.solvers, options.plugin),
+            resolve=lambda spec: resolve(spec, registries.solvers),
             environment=environment,
             digest=digest(environment),
             progress=progress,
             fresh=options.fresh,
             engine=_cluster(options, ours, out, environment, progress)
             if options.dask is not None
-            else partial(one_by_one, operators=workbench.operators),
+            else partial(one_by_one, operators=registries.operators),
         )
     records = read_journal(out, say)
     print(show.summary(records, [s.label for s in suite.solvers]))
@@ -128,7 +128,7 @@ def run(workbench: Workbench, options: Namespace) -> int:
     if missing.faults:
         print(f"{in_words(missing.faults)}; the same command tries again")
     with full_disk_told(out):
-        written = workbench.report(out, FORMATS) if records else []
+        written = registries.report(out, FORMATS) if records else []
     for page in (file for file in written if file.suffix == ".html"):
         print(page)
     return 1 if missing.unbuilt or missing.faults else 0
@@ -151,7 +151,7 @@ def _cluster(
     )
 
 
-def report(workbench: Workbench, options: Namespace) -> int:
+def report(registries: Registries, options: Namespace) -> int:
     """Write the report on a result folder, or what changed between two."""
     formats = options.format.split(",")
     for form in formats:
@@ -160,11 +160,11 @@ def report(workbench: Workbench, options: Namespace) -> int:
     factor = positive("--factor", options.factor)
     if options.other is None:
         with full_disk_told(options.folder):
-            written = workbench.report(options.folder, formats, factor=factor)
+            written = registries.report(options.folder, formats, factor=factor)
         print(*written, sep="\n")
         return 0
     with full_disk_told(options.other):
-        said, written = workbench.compare(
+        said, written = registries.compare(
             options.folder, options.other, formats, factor=factor
         )
     pages = [file for file in written if file.suffix == ".html"]
@@ -172,7 +172,7 @@ def report(workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
-def paper(workbench: Workbench, options: Namespace) -> int:
+def paper(registries: Registries, options: Namespace) -> int:
     """Measure what the paper's figures and tables show, and write them."""
     try:
         options.out.mkdir(parents=True, exist_ok=True)
@@ -181,14 +181,14 @@ def paper(workbench: Workbench, options: Namespace) -> int:
             f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
         ) from None
     with full_disk_told(options.out):
-        written = workbench.paper(options.out, options.quick, say)
+        written = registries.paper(options.out, options.quick, say)
     for file in written:
         if file.suffix == ".html":
             print(file)
     return 0
 
 
-def doctor(_workbench: Workbench, options: Namespace) -> int:
+def doctor(_workbench: Registries, options: Namespace) -> int:
     """Describe this machine and say what to change before measuring."""
     environment, noise = capture(), noise_floor()
     checks = examine(environment, noise)
@@ -200,24 +200,24 @@ def doctor(_workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
-def replay(workbench: Workbench, options: Namespace) -> int:
+def replay(registries: Registries, options: Namespace) -> int:
     """Make one stored measurement again and compare; 0 if it is reproduced."""
-    workbench = workbench.with_files(options.plugin)
+    registries = registries.with_files(options.plugin)
     capsule = open_capsule(
-        options.folder, options.run_id, workbench.families, workbench.solvers
+        options.folder, options.run_id, registries.families, registries.solvers
     )
     environment = capture(options.plugin)
     block = block_of(
-        capsule, workbench.families, workbench.solvers, digest(environment)
+        capsule, registries.families, registries.solvers, digest(environment)
     )
-    commands = workbench.commands([capsule.spec], options.plugin)
+    commands = registries.commands([capsule.spec], options.plugin)
     with TemporaryDirectory(prefix="mortarbench-") as scratch:
         folder = Path(scratch)
-        operators = workbench.operators
+        operators = registries.operators
         with one_by_one(
             commands, folder, folder / "cases", operators=operators
-        ) as carry_out:
-            *_, result = carry_out(iter([block]))
+        ) as execute:
+            *_, result = execute(iter([block]))
     if isinstance(result, Unbuilt):
         raise InputError(f"{capsule.record.run_id}: {result.reason}")
     if isinstance(result, Unmade):

@@ -20,9 +20,9 @@ from harness.files.durable import FULL
 from harness.registry import entry_point_plugins
 from harness.verify.kkt import VERIFIED_FACTOR
 from mortarbench.cli import processes
-from mortarbench.cli.registries import FORMATS, Workbench
+from mortarbench.cli.registries import FORMATS, Registries
 
-_Run = Callable[[Workbench, argparse.Namespace], int]  #: returns the exit code
+_Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 
 
 class _Parser(argparse.ArgumentParser):
@@ -38,11 +38,11 @@ class _Parser(argparse.ArgumentParser):
         super().exit(status, message)
 
 
-def main(workbench: Workbench, argv: Sequence[str]) -> int:
+def main(registries: Registries, argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     _show_what_can_be_shown()
     try:
-        return _run(workbench, argv)
+        return _run(registries, argv)
     except InputError as e:
         return _complain(str(e))
     except KeyboardInterrupt:
@@ -61,16 +61,16 @@ def main(workbench: Workbench, argv: Sequence[str]) -> int:
         return 3
 
 
-def _run(workbench: Workbench, argv: Sequence[str]) -> int:
-    workbench = workbench.extended(entry_point_plugins())
+def _run(registries: Registries, argv: Sequence[str]) -> int:
+    registries = registries.extended(entry_point_plugins())
     if argv[:1] == ["worker"]:  # how runs start their processes; not for users
-        return processes.worker(workbench, argv[1:])
+        return processes.worker(registries, argv[1:])
     if argv[:1] == ["generator"]:
-        return processes.generator(workbench, argv[1:])
+        return processes.generator(registries, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
-    code: int = options.run(workbench, options)
+    code: int = options.run(registries, options)
     print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
 

@@ -12,11 +12,11 @@ from harness.running.progress import shown_on
 from harness.running.run import run
 from harness.suite.overrides import with_overrides
 from harness.suite.suite import load_suite
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 
 def measured(
-    workbench: Workbench,
+    registries: Registries,
     name: str,
     out: Path,
     *,
@@ -33,9 +33,11 @@ def measured(
 
     """
     suite = with_overrides(
-        load_suite(workbench.suite_path(name), workbench.families, workbench.solvers),
-        workbench.families,
-        workbench.solvers,
+        load_suite(
+            registries.suite_path(name), registries.families, registries.solvers
+        ),
+        registries.families,
+        registries.solvers,
         solvers=solvers,
         cases=cases,
         repeats=repeats,
@@ -44,10 +46,10 @@ def measured(
     with shown_on(sys.stderr) as progress:
         run(
             suite,
-            families=workbench.families,
+            families=registries.families,
             out=out,
-            commands=workbench.commands(suite.solvers, ()),
-            resolve=lambda spec: resolve(spec, workbench.solvers),
+            commands=registries.commands(suite.solvers, ()),
+            resolve=lambda spec: resolve(spec, registries.solvers),
             environment=environment,
             digest=digest(environment),
             progress=progress,

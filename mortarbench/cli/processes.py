@@ -6,33 +6,33 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from harness.processes.case_worker import Generator
+from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
 from harness.processes.worker import serve
 from harness.registry import SolverSpec, resolve
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 
-def worker(workbench: Workbench, arguments: Sequence[str]) -> int:
-    """Be the worker that `Workbench.worker_command` starts."""
+def worker(registries: Registries, arguments: Sequence[str]) -> int:
+    """Be the worker that `Registries.worker_command` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
-    workbench = workbench.with_files([Path(file) for file in request["plugins"]])
+    registries = registries.with_files([Path(file) for file in request["plugins"]])
     spec = SolverSpec(
         name=request["name"], label=request["name"], options=request["options"]
     )
-    solver = resolve(spec, workbench.solvers)
-    serve(solver, int(request_fd), int(reply_fd), workbench.operators)
+    solver = resolve(spec, registries.solvers)
+    serve(solver, int(request_fd), int(reply_fd), registries.operators)
     return 0
 
 
-def generator(workbench: Workbench, arguments: Sequence[str]) -> int:
-    """Be the generator that `Workbench.commands` starts."""
+def generator(registries: Registries, arguments: Sequence[str]) -> int:
+    """Be the generator that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
     files = [Path(file) for file in json.loads(text)["plugins"]]
-    workbench = workbench.with_files(files)
+    registries = registries.with_files(files)
     serve_cases(
-        Generator(workbench.families, workbench.reference, workbench.operators),
+        CaseWorker(registries.families, registries.reference, registries.operators),
         int(request_fd),
         int(reply_fd),
     )

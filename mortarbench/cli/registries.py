@@ -41,7 +41,7 @@ class Comparer(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Workbench:
+class Registries:
     """What can be measured, and what to measure and show it with."""
 
     families: Mapping[str, Family]
@@ -67,7 +67,7 @@ class Workbench:
     #: in the working directory must not pass for a library
     start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
 
-    def extended(self, plugin: Plugin) -> Workbench:
+    def extended(self, plugin: Plugin) -> Registries:
         """Add the solvers, problems and operators of a plug-in.
 
         Raises
@@ -84,7 +84,7 @@ class Workbench:
             origins={**self.origins, **dict.fromkeys(plugin.problems, plugin.origin)},
         )
 
-    def with_files(self, files: Sequence[Path]) -> Workbench:
+    def with_files(self, files: Sequence[Path]) -> Registries:
         """Add the plug-ins in `files`.
 
         Raises

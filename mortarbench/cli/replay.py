@@ -14,7 +14,7 @@ from harness.errors import InputError
 from harness.files.store import Arrays, digest_of, load_solution, point_arrays
 from harness.record import Record, finite
 from harness.results.folder import differences
-from harness.results.stored_run import Capsule
+from harness.results.stored_run import StoredRun
 from harness.results.work_unit import Result
 from harness.solution import Status
 from mortarbench.cli.text import aligned
@@ -57,7 +57,7 @@ class Comparison:
 
 def compared(
     folder: Path,
-    capsule: Capsule,
+    capsule: StoredRun,
     result: Result,
     environment: Mapping[str, Any],
 ) -> Comparison:

@@ -21,12 +21,12 @@ from harness.plugin import Case, Fields
 from harness.processes.measurement import measured_once
 from harness.record import Record, Verdict, finite
 from harness.registry import SolverSpec, options_of, resolve
-from harness.verify.verdicts import blank, has_point, plain
+from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.cli import text as show
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 
-def solve(workbench: Workbench, options: Namespace) -> int:
+def solve(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
     if not 0 < options.tol < 1:
         raise InputError(f"--tol = {options.tol}; expected a number between 0 and 1")
@@ -34,17 +34,17 @@ def solve(workbench: Workbench, options: Namespace) -> int:
         _check_writable(options.plot, (".png",))
     if options.vtu is not None:
         _check_writable(options.vtu, (".vtu", ".pvd"))
-    workbench = workbench.with_files(options.plugin)
-    name = parse(options.case, workbench.families)
+    registries = registries.with_files(options.plugin)
+    name = parse(options.case, registries.families)
     spec = SolverSpec(name=options.solver, label=options.solver)
-    solver = resolve(spec, workbench.solvers)
+    solver = resolve(spec, registries.solvers)
     if options_of(solver).get("history") is False:  # what it costs is not at stake here
         spec = replace(spec, options={"history": True})
-        solver = resolve(spec, workbench.solvers)
-    case = _built(workbench, name)
-    record = blank(
+        solver = resolve(spec, registries.solvers)
+    case = _built(registries, name)
+    record = new_record(
         name,
-        canonical(name, workbench.families[name.family]),
+        canonical(name, registries.families[name.family]),
         spec,
         options=options_of(solver),
         tol=options.tol,
@@ -56,53 +56,53 @@ def solve(workbench: Workbench, options: Namespace) -> int:
         wanted = ", ".join(f"--{o}" for o in drawn)
         raise InputError(f"{record.case} has no bodies to draw; leave out {wanted}")
 
-    command = workbench.worker_command(spec, options.plugin)
+    command = registries.worker_command(spec, options.plugin)
     with redirect_stdout(sys.stderr):  # whatever the family prints
-        record, solution = measured_once(command, case, record, workbench.reference)
+        record, solution = measured_once(command, case, record, registries.reference)
     _show(record, solution.history if solution else {}, options.json)
     if drawn and case.fields is not None:
         if solution is not None and has_point(solution):
-            _draw(workbench, options, name, case.fields(solution))
+            _draw(registries, options, name, case.fields(solution))
         else:
             say(f"no picture: {record.solver} returned no point")
     return 0 if record.status is Verdict.VERIFIED else 1
 
 
 def _draw(
-    workbench: Workbench, options: Namespace, name: CaseName, fields: Fields
+    registries: Registries, options: Namespace, name: CaseName, fields: Fields
 ) -> None:
     """Write the pictures that were asked for; for .pvd solve the steps before too."""
     if options.plot is not None:
-        workbench.plot(fields, options.plot)
+        registries.plot(fields, options.plot)
     if options.vtu is None:
         return
     if options.vtu.suffix == ".vtu":
-        workbench.vtu(fields, options.vtu)
+        registries.vtu(fields, options.vtu)
         return
     states, last = [], int(name.params.get("step", 1))
     spec = SolverSpec(name=options.solver, label=options.solver)
-    command = workbench.worker_command(spec, options.plugin)
+    command = registries.worker_command(spec, options.plugin)
     for step in range(1, last):
         earlier = replace(name, params={**name.params, "step": step})
-        case = _built(workbench, earlier)
-        record = blank(
+        case = _built(registries, earlier)
+        record = new_record(
             earlier, "", spec, options={}, tol=options.tol, repeat=0, environment=""
         )
-        _, solution = measured_once(command, case, record, workbench.reference)
+        _, solution = measured_once(command, case, record, registries.reference)
         if solution is None or not has_point(solution) or case.fields is None:
             raise InputError(f"{options.vtu}: no point at step {step}; write a .vtu")
         states.append((float(step), case.fields(solution)))
-    workbench.series([*states, (float(last), fields)], options.vtu)
+    registries.series([*states, (float(last), fields)], options.vtu)
 
 
-def export(workbench: Workbench, options: Namespace) -> int:
+def export(registries: Registries, options: Namespace) -> int:
     """Write the QP of one case for other people's solvers."""
     _check_writable(options.file, (".npz", ".mat", ".parquet"))
-    workbench = workbench.with_files(options.plugin)
-    name = parse(options.case, workbench.families)
-    case = _built(workbench, name)
+    registries = registries.with_files(options.plugin)
+    name = parse(options.case, registries.families)
+    case = _built(registries, name)
     meta = {
-        "name": canonical(name, workbench.families[name.family]),
+        "name": canonical(name, registries.families[name.family]),
         "family": name.family,
         "params": name.params,
         "form": name.form,
@@ -121,7 +121,7 @@ def export(workbench: Workbench, options: Namespace) -> int:
     return 0
 
 
-def _built(workbench: Workbench, name: CaseName) -> Case:
+def _built(registries: Registries, name: CaseName) -> Case:
     """Build a case; what a plug-in or too little memory prevents is no fault of ours.
 
     Raises
@@ -130,10 +130,10 @@ def _built(workbench: Workbench, name: CaseName) -> Case:
         For both, and what the family itself refuses.
 
     """
-    family = workbench.families[name.family]
-    origin = workbench.origins.get(name.family)
+    family = registries.families[name.family]
+    origin = registries.origins.get(name.family)
     try:
-        return build(name, family, workbench.reference)
+        return build(name, family, registries.reference)
     except InputError:
         raise
     except (Exception, SystemExit) as e:

@@ -15,26 +15,26 @@ from harness.processes.measurement import scratch_folder
 from harness.processes.supervisor import WorkerProcess
 from harness.registry import SolverSpec, resolve
 from mortarbench.cli import text as show
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 
 TIME_LIMIT = 60.0  #: s per check
 MEMORY_LIMIT = 4096.0  #: MiB per check
 
 
-def test_solver(workbench: Workbench, options: Namespace) -> int:
+def test_solver(registries: Registries, options: Namespace) -> int:
     """Run every check; 1 if one fails, or if a solver solved nothing at all."""
-    workbench = workbench.with_files(options.plugin)
+    registries = registries.with_files(options.plugin)
     specs = [
         SolverSpec(name=name, label=name)
         for pattern in options.solver
-        for name in _named(pattern, workbench.solvers)
+        for name in _named(pattern, registries.solvers)
     ]
     for spec in specs:
-        resolve(spec, workbench.solvers)
+        resolve(spec, registries.solvers)
     checks = [c for c in CHECKS if c.startswith(KEEPS) or not options.markdown]
     results = {}
     for spec in specs:
-        command = workbench.worker_command(spec, options.plugin)
+        command = registries.worker_command(spec, options.plugin)
         results[spec.name] = dict(examined(command, checks))
         if not options.json and not options.markdown:
             _show(spec.name, results[spec.name])

@@ -18,20 +18,20 @@ from harness.errors import InputError, say
 from harness.files.durable import full_disk_told, replace_file
 from harness.names import assemble
 from harness.results.journal import read_journal
-from mortarbench.cli.registries import Workbench
+from mortarbench.cli.registries import Registries
 from mortarbench.cli.text import aligned, legible
 
 _MOST = 12  #: entries of a list on the terminal; the page has them all
 
 
-def validate(workbench: Workbench, options: Namespace) -> int:
+def validate(registries: Registries, options: Namespace) -> int:
     """Cross-validate a result folder; 1 if a claim is refuted or answers disagree."""
     if not options.budget >= 0:  # a NaN, too
         raise InputError(
             f"--budget {options.budget:g}; expected a number of seconds ≥ 0"
         )
-    workbench = workbench.with_files(options.plugin)
-    found = validated(options.folder, workbench.families, workbench.reference, say)
+    registries = registries.with_files(options.plugin)
+    found = validated(options.folder, registries.families, registries.reference, say)
     data = as_data(found, options.folder.resolve().name)
     if not (data["counts"]["answers"] or found.false_claims):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
@@ -40,10 +40,10 @@ def validate(workbench: Workbench, options: Namespace) -> int:
     text = json.dumps(data, allow_nan=False) + "\n"
     with full_disk_told(options.folder):
         replace_file(target, text.encode())
-    pages = workbench.validation(options.folder, data, ())
-    if meshes := _meshes(workbench, options.folder, options.budget):
+    pages = registries.validation(options.folder, data, ())
+    if meshes := _meshes(registries, options.folder, options.budget):
         # the page was there while meshes were solved; now it tells of them, too
-        pages = workbench.validation(options.folder, data, meshes)
+        pages = registries.validation(options.folder, data, meshes)
     if options.json:
         verdict = {k: v for k, v in data.items() if k != "problems"}
         verdict["discretisation"] = [asdict(d) for d in meshes]
@@ -62,16 +62,18 @@ def validate(workbench: Workbench, options: Namespace) -> int:
     return 0 if found.agreed else 1
 
 
-def _meshes(workbench: Workbench, folder: Path, budget: float) -> list[Discretisation]:
+def _meshes(
+    registries: Registries, folder: Path, budget: float
+) -> list[Discretisation]:
     """Solve the folder's cases on finer meshes, where families say what these are."""
-    refinable = {k: f for k, f in workbench.families.items() if hasattr(f, "refined")}
+    refinable = {k: f for k, f in registries.families.items() if hasattr(f, "refined")}
     records = {r.case: r for r in read_journal(folder, say) if r.family in refinable}
     names = []
     for r in records.values():
         with suppress(InputError):  # of another version: listed as not validated
             names.append(assemble(refinable[r.family], r.params, r.form))
     return discretisation_errors(
-        names, refinable, workbench.reference, folder, budget, say
+        names, refinable, registries.reference, folder, budget, say
     )
 
 
