@@ -513,10 +513,10 @@ def test_damaged_data_are_named(tmp_path, file, text):
 
 
 @pytest.mark.slow
-def test_the_command_writes_it_all_within_a_minute_or_so(tmp_path):
+def test_the_command_writes_it_all(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "harness", "paper", "--quick", "--out", tmp_path],
-        capture_output=True, text=True, timeout=300, check=True,
+        capture_output=True, text=True, timeout=1200, check=True,
     )  # fmt: skip
 
     assert done.stdout == f"{tmp_path / 'index.html'}\n"
