@@ -41,7 +41,7 @@ class Executor:
     """Carries out blocks one after the other, with one worker process per solver.
 
     scratch : for files that last as long as the executor, of this executor alone
-    cases : folder of built cases, see `harness.processes.case_folder`; several executors
+    cases : folder of built cases, see `harness.processes.case_folder`; executors
         may share it
     operators : what puts an operator P together, see `harness.recipe`
     """
