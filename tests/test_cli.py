@@ -291,11 +291,16 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
          "--plugin", WELLS],
         env=os.environ | {"STARTED": str(started)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # what a shell starts in the background ignores interrupts otherwise
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as command:  # fmt: skip
         while command.poll() is None and not (started.exists() and started.read_text()):
             time.sleep(0.05)
         command.send_signal(signal.SIGINT)
-        out, err = command.communicate(timeout=60)
+        try:
+            out, err = command.communicate(timeout=60)
+        finally:
+            command.kill()  # leaving the block waits for it
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
