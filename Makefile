@@ -9,7 +9,7 @@ BIN := .venv/bin
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
-.PHONY: help setup browser demo test mutants bench docs weaknesses size crowd check clean
+.PHONY: help setup browser demo test mutants bench docs weaknesses size synthetic check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -49,8 +49,8 @@ weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
 size: setup  ## time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py
 
-crowd: setup  ## time and memory of journals and reports up to 100 000 records
-	$(BIN)/python benchmarks/crowd.py
+synthetic: setup  ## time and memory of journals and reports up to 100 000 records
+	$(BIN)/python benchmarks/synthetic_results.py
 
 check: setup  ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

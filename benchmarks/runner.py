@@ -26,7 +26,7 @@ from harness.running.run import run
 from harness.suite.suite import NULL, Suite
 from harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
-PLUGIN = Path(__file__).parents[1] / "tests" / "adversaries.py"
+PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
 ATTACKERS = PLUGIN.with_name("attackers.py")
 
 

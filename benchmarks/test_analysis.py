@@ -17,7 +17,7 @@ from problems.families.beam_ring import model
 from solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
-TIP = [0.04101815, -0.29791196]  #: m, see tests/test_beam_ring.py
+TIP = [0.04101815, -0.29791196]  #: m, see tests/problems/families/test_beam_ring.py
 
 
 def analysis(form, Nr=30, Nh=15, steps=10):

@@ -1,0 +1,99 @@
+"""Time and peak memory of reading a journal and of its report, by their sizes.
+
+    make synthetic   or   .venv/bin/python benchmarks/synthetic_results.py [CASES ...]
+
+20 solvers, 5 repeats, all formats. Each size runs in a process of its own, so that
+peaks are its own. With chromium and playwright (make browser) also the page's first
+paint and the time until it is loaded and all of its plots are drawn.
+"""
+
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+SOLVERS, REPEATS = 20, 5
+CASES = (10, 100, 1000)
+FORMATS = ("html", "md", "tex", "csv", "parquet")
+TIMES = """() => new Promise((done) =>
+  requestAnimationFrame(() => setTimeout(() => done([
+    performance.getEntriesByName("first-contentful-paint")[0]?.startTime,
+    performance.getEntriesByType("navigation")[0].loadEventEnd]))))"""
+
+
+def read(folder):
+    """Read the journal of a folder in this process."""
+    from harness.results.journal import read_journal
+
+    start = process_time()
+    records = read_journal(Path(folder))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"{len(records):9} {process_time() - start:9.1f} {peak:9.0f}", end="")
+
+
+def measure(folder):
+    """Write the report of a folder in this process."""
+    from reports import write_report
+
+    start = process_time()
+    write_report(Path(folder), FORMATS)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    size = (Path(folder) / "report" / "index.html").stat().st_size / 1e6
+    print(f"{process_time() - start:9.1f} {peak:9.0f} {size:9.1f}", end="")
+
+
+def paint(folder):
+    """Return ms to first paint and to the end of loading, or None."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        return None
+    browser = shutil.which("chromium") or shutil.which("chromium-browser")
+    if browser is None:
+        return None
+    root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=browser, args=root)
+        page = chromium.new_page()
+        page.goto((folder / "report" / "index.html").as_uri())
+        times = page.evaluate(TIMES)
+        chromium.close()
+    return times
+
+
+def main(cases):
+    maker = Path(__file__).parents[1] / "tests/support/synthetic_results.py"
+    print("             journal:            report:")
+    print(
+        "  records     CPU s  peak MiB     CPU s  peak MiB   page MB"
+        "  first paint s  loaded s"
+    )
+    for count in cases:
+        with TemporaryDirectory() as folder:
+            make = [
+                maker,
+                folder,
+                SOLVERS,
+                count,
+                REPEATS,
+            ]
+            subprocess.run([sys.executable, *map(str, make)], check=True)
+            for part in ("--read", "--measure"):
+                again = [sys.executable, __file__, part, folder]
+                done = subprocess.run(again, check=True, capture_output=True, text=True)
+                print(done.stdout, end="", flush=True)
+            times = paint(Path(folder))
+            print("" if times is None else "".join(f"{t / 1e3:12.2f}" for t in times))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--read"]:
+        read(sys.argv[2])
+    elif sys.argv[1:2] == ["--measure"]:
+        measure(sys.argv[2])
+    else:
+        main([int(a) for a in sys.argv[1:]] or CASES)

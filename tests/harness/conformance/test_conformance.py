@@ -1,0 +1,470 @@
+"""Conformance: every solver passes every check; every check catches its fault."""
+
+import gc
+import json
+import os
+import re
+import signal
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from harness import Solution, Status, kkt_residuals
+from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from harness.conformance.equivalence import (
+    CHANGES,
+    DeclinedError,
+    WeakError,
+    answer,
+    changes_of,
+    same_answer,
+)
+from harness.conformance.manufactured import FORMS, SHAPES, planted, strings
+from harness.conformance.weaknesses import line_of
+from mortarbench.cli import test_solver as examine
+from solvers import SOLVERS
+from tests.support import ROOT
+
+#: backends that stand for the wildcard entries of the registry; the others are slow
+BACKENDS = {
+    "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
+    "cvxpy:*": ("CLARABEL", "HIGHS"),
+}
+OTHERS = {
+    "qpsolvers:*": ("cvxopt", "daqp", "osqp", "piqp", "proxqp", "qpalm", "qtqp", "scs"),
+    "cvxpy:*": ("DAQP", "OSQP", "PIQP", "PROXQP", "QOCO", "QPALM", "SCS"),
+}
+
+
+#: variants of a solver that stands for them
+VARIANTS = ("proxqp-dense", "proxqp-sparse", "piqp-dense", "piqp-sparse", "scs-qdldl")
+
+
+def configured(backends):
+    return {
+        wildcard.replace("*", backend): replace(SOLVERS[wildcard], backend=backend)
+        for wildcard, names in backends.items()
+        for backend in names
+    }
+
+
+NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
+SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
+CONCRETE = NATIVE | configured(BACKENDS)
+#: no condition of conformance are equivalent formulations, which have their own test
+STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
+WEAKNESSES = ROOT / "docs/weaknesses.md"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def loaded_once():
+    """Keep what libraries load out of the collection before every measurement."""
+    import cvxpy  # noqa: F401
+    import qpsolvers  # noqa: F401
+
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_planted_point_is_a_solution(shape, dense):
+    qp, expected = planted(shape, seed=314159, dense=dense)
+    assert kkt_residuals(qp, expected).worst < 1e-13
+
+
+#: threads of the test runner's own count, too, where tests run in parallel
+ONE_THREAD = "computes in one thread"
+#: goes on to the last of its iterations, for many seconds
+LONG = ("proxqp", "claims no success: unbounded")
+
+
+def marks(name, check):
+    if (name, check) == LONG:
+        return pytest.mark.slow
+    return pytest.mark.alone if check == ONE_THREAD else ()
+
+
+@pytest.mark.parametrize(
+    ("name", "check"),
+    [pytest.param(n, c, marks=marks(n, c)) for n in CONCRETE for c in STRICT],
+)
+def test_a_solver_conforms(name, check):
+    grade, message, _ = run_check(check, CONCRETE[name])
+    if grade is Grade.DECLINE:
+        pytest.skip(message)
+    assert grade is Grade.PASS, message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("check", STRICT)
+@pytest.mark.parametrize("name", SLOW)
+def test_variants_and_other_backends_conform(name, check):
+    grade, message, _ = run_check(check, SLOW[name])
+    assert grade is not Grade.FAIL, message
+
+
+def weaknesses(solver):
+    """Every (form, change) that changes verdict or answer, and how many were solved."""
+    weak, solved = [], 0
+    for form in FORMS:
+        old = None
+        for change in changes_of(form):
+            try:
+                old = old or answer(solver, strings(form))
+                same_answer(form, change, solver, old)
+            except WeakError:
+                weak.append((form, change))
+            except DeclinedError:
+                continue
+            solved += 1
+    return weak, solved
+
+
+@pytest.mark.parametrize("name", CONCRETE)
+def test_what_an_equivalent_formulation_changes_is_in_the_documents(name):
+    """`make weaknesses` writes the page; one that is gone again may stay there."""
+    page = WEAKNESSES.read_text()
+    weak, solved = weaknesses(CONCRETE[name])
+
+    assert solved
+    assert f"| `{name}` |" in page
+    assert [w for w in weak if line_of(name, *w) not in page] == []
+
+
+def test_our_own_solvers_have_no_weakness():
+    page = WEAKNESSES.read_text()
+    for name in NATIVE:
+        if name.startswith(("smalbe", "pdas", "projected-gradient")):
+            assert f"| `{name}` |" in page
+            assert f"- `{name}`" not in page
+
+
+@dataclass(frozen=True)
+class Sound:
+    """PIQP in disguise, for others to spoil."""
+
+    spoilt: str = ""
+
+    def declines(self, qp):
+        return SOLVERS["piqp"].declines(qp)
+
+    def prepare(self, qp, tol):
+        return lambda: self.act(qp, tol)
+
+    def act(self, qp, tol):
+        return self.honest(qp, tol)
+
+    def honest(self, qp, tol):
+        return SOLVERS["piqp"].prepare(qp, tol)()
+
+
+class StopsEarly(Sound):
+    def act(self, qp, tol):
+        return self.honest(qp, 0.1)
+
+
+class FlipsSigns(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, y=-s.y)
+
+
+class LeavesRoundOff(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, z_box=s.z_box - 1e-16)
+
+
+class Remembers(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        first = not MEMORY
+        MEMORY.append(s)
+        return s if first else replace(s, iterations=1)
+
+
+MEMORY = []
+
+
+class Wanders(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, x=s.x + 1e-9 * np.random.default_rng().standard_normal())
+
+
+class Scales(Sound):
+    """Answers rightly, after scaling the data in place by force."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        qp.q.flags.writeable = True
+        qp.q[:] *= 2
+        return s
+
+
+class TakesAnything(Sound):
+    def __init__(self, **options):
+        pass
+
+
+class AlwaysSolved(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, status=Status.SOLVED, x=np.nan_to_num(s.x))
+
+
+class Silent(Sound):
+    def act(self, qp, tol):
+        return replace(self.honest(qp, tol), message="")
+
+
+class TakesOperatorsForZero(Sound):
+    def declines(self, qp):
+        return None
+
+    def act(self, qp, tol):
+        if qp.is_explicit:
+            return self.honest(qp, tol)
+        zero = np.zeros(qp.q.size)
+        return Solution(
+            status=Status.SOLVED, x=np.clip(zero, qp.lb, qp.ub), y=qp.b, z=qp.h,
+            z_box=zero,
+        )  # fmt: skip
+
+
+class StopsAtTheStart(Sound):
+    """As HiGHS 1.15.1 did on QPs with bounds only."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, x=qp.lb) if qp.q.size == 400 else s
+
+
+class Slow(Sound):
+    def act(self, qp, tol):
+        time.sleep(0.1)
+        return self.honest(qp, tol)
+
+
+class MindsUnits(Sound):
+    """Gives up where numbers are large, as an absolute tolerance would."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return s if abs(qp.q).max() < 1e6 else replace(s, x=1.01 * s.x)
+
+
+class SlowInNewtons(Sound):
+    """Takes 49 times the iterations where unknowns are large, as OSQP does."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        factor = 49 if abs(s.x).max() > 1e5 else 1
+        return replace(s, iterations=7 * factor)
+
+
+class MindsTheOrder(Sound):
+    """Fails where the first unknown may be no less than zero."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, status=Status.FAILED) if qp.lb[0] == 0 else s
+
+
+class RepeatsTheFirst(Sound):
+    def chain(self, tol):
+        prepare = SOLVERS["piqp"].chain(tol)
+        first = []
+
+        def next_one(qp):
+            first.append(prepare(qp))
+            return first[0]
+
+        return next_one
+
+
+class DeclinesAll(Sound):
+    def declines(self, qp):
+        return "never on a Monday"
+
+
+class Dies(Sound):
+    def act(self, qp, tol):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+PLUGIN_SOLVERS = {
+    "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
+    "slow": SlowInNewtons(),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_a_sound_solver_fails_no_check(check):
+    grade, message, _ = run_check(check, Sound())
+    assert grade is not Grade.FAIL, message
+
+
+@pytest.mark.parametrize(
+    ("kind", "check"),
+    [
+        (StopsEarly, "finds the planted solution: everything, sparse"),
+        (StopsEarly, "reaches the tolerance 1e-06: box"),
+        (FlipsSigns, "gives multipliers our signs"),
+        (LeavesRoundOff, "puts none on absent bounds"),
+        (Remembers, "starts every repeat cold, same answer"),
+        (Wanders, "starts every repeat cold, same answer"),
+        (Scales, "leaves the problem alone: sparse"),
+        (Scales, "leaves the problem alone: dense"),
+        (TakesAnything, "refuses a misspelt option"),
+        (AlwaysSolved, "claims no success: infeasible"),
+        (AlwaysSolved, "claims no success: unbounded"),
+        (Silent, "claims no success: unbounded"),
+        (TakesOperatorsForZero, "takes or declines an operator"),
+        (StopsAtTheStart, "finds where a membrane of 400 nodes touches"),
+        (RepeatsTheFirst, "solves a sequence"),
+    ],
+)
+def test_a_check_catches_its_fault(kind, check):
+    MEMORY.clear()
+    assert run_check(check, kind()).grade is Grade.FAIL
+
+
+@pytest.mark.parametrize(
+    ("kind", "check"),
+    [
+        (MindsUnits, "keeps its answer: primal, units N, m"),
+        (MindsTheOrder, "keeps its answer: dual, unknowns permuted"),
+    ],
+)
+def test_what_an_equivalent_formulation_changes_is_a_weakness(kind, check):
+    assert run_check(check, Sound()).grade is Grade.PASS
+    assert run_check(check, kind()).grade is Grade.WEAK
+
+
+def test_what_was_not_solved_cannot_change():
+    weak = run_check("keeps its answer: dual-bounds, as it is", MindsTheOrder())
+    other = run_check("keeps its answer: dual-bounds, mirrored", MindsTheOrder())
+    assert weak.grade is Grade.WEAK
+    assert other.grade is Grade.DECLINE
+    assert other.message.startswith("not solved as it is: ended as failed")
+
+
+def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
+    # a fake clock: real threads need idle cores to show
+    monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
+    slow = Slow()
+    assert run_check("computes in one thread", slow).grade is Grade.FAIL
+    monkeypatch.undo()
+    assert run_check("computes in one thread", slow).grade is Grade.PASS
+
+
+def test_a_decline_of_all_is_no_pass():
+    grades = {run_check(check, DeclinesAll()).grade for check in CHECKS}
+    assert Grade.PASS in grades  # its options
+    result = run_check("gives multipliers our signs", DeclinesAll())
+    assert result == (Grade.DECLINE, "never on a Monday", None)
+
+
+@pytest.fixture
+def plugin(tmp_path):
+    """This file's solvers, offered as a plug-in."""
+    path = tmp_path / "spoilt.py"
+    here = os.path.abspath(__file__)
+    path.write_text(
+        "import importlib.util, sys\n"
+        f"spec = importlib.util.spec_from_file_location('conformance', {here!r})\n"
+        "module = importlib.util.module_from_spec(spec)\n"
+        "sys.modules['conformance'] = module\n"
+        "spec.loader.exec_module(module)\n"
+        "SOLVERS = module.PLUGIN_SOLVERS\n"
+    )
+    return path
+
+
+def command(*arguments):
+    from mortarbench.__main__ import main
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["mortarbench", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    return ended.value.code
+
+
+def test_the_command_says_how_every_check_ended(plugin, capsys):
+    assert command("test-solver", "sound", "--plugin", plugin, "--json") == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["check"] for row in rows] == list(CHECKS)
+    assert {row["grade"] for row in rows} == {"pass", "decline"}
+
+
+def test_weaknesses_are_told_and_solvers_that_have_some_conform(
+    plugin, capsys, monkeypatch
+):
+    few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
+    monkeypatch.setattr(examine, "CHECKS", few)
+    assert command("test-solver", "minds", "--plugin", plugin) == 0
+    out = capsys.readouterr().out
+    (line,) = (x for x in out.splitlines() if "primal, units N, m " in x)
+    assert line.startswith("weak")
+    assert "wrong: " in line
+    assert out.endswith("0 decline, 1 weak, 0 fail\n")
+
+
+def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
+    plugin, capsys
+):
+    names = ("sound", "minds", "slow")
+    assert command("test-solver", *names, "--plugin", plugin, "--markdown") == 0
+    page = capsys.readouterr().out
+    (sound,) = (x for x in page.splitlines() if x.startswith("| `sound` |"))
+    (minds,) = (x for x in page.splitlines() if x.startswith("| `minds` |"))
+    assert sound.count(" | ") == len(CHANGES)  # name, forms, all changes but none
+    assert "**" not in sound
+    assert minds.split(" | ")[2].startswith("**primal**")
+    assert page.count("×49") == 1  # forces of 1e8 N, not a displacement, not 1e5 N/mm
+    assert line_of("minds", "primal", "units N, m") in page
+    assert line_of("sound", "primal", "units N, m") not in page
+
+
+def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
+    few = ("refuses a misspelt option", "keeps its answer: dual, mirrored")
+    monkeypatch.setattr(examine, "CHECKS", few)
+    command("test-solver", "piqp-*", "sound", "--plugin", plugin, "--json")
+    rows = json.loads(capsys.readouterr().out)
+    named = ["piqp-dense", "piqp-sparse", "sound"]
+    assert [row["solver"] for row in rows] == np.repeat(named, 2).tolist()
+    for row in rows[1::2]:
+        assert re.fullmatch(r"\d+ iterations, \d+ as it is", row["message"])
+
+    assert command("test-solver", "nobody*") == 2
+    assert "nobody*" in capsys.readouterr().err
+    assert command("test-solver", "piqp", "--json", "--markdown") == 2
+
+
+def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):
+    few = ("gives multipliers our signs", "refuses a misspelt option")
+    monkeypatch.setattr(examine, "CHECKS", few)
+    assert command("test-solver", "dies", "--plugin", plugin) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (options,) = (line for line in lines if "misspelt option" in line)
+    assert options.startswith("pass")
+    (signs,) = (line for line in lines if "our signs" in line)
+    assert signs.startswith("fail")
+    assert "SIGSEGV" in signs
+
+
+def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
+    assert command("test-solver", "declines", "--plugin", plugin) == 1
+    assert "never on a Monday" in capsys.readouterr().out
+
+
+def test_an_unknown_solver_is_wrong_input(capsys):
+    assert command("test-solver", "nobody") == 2
+    assert "nobody" in capsys.readouterr().err

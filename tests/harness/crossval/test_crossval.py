@@ -1,0 +1,716 @@
+"""Cross-validation: planted errors are measured, their solver named, nobody else."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_array
+
+from harness import QP, Case, Mechanics, Solution, Status, no_rows
+from harness.build import build
+from harness.crossval.assessment import assess, distances, energy_allowed
+from harness.crossval.comparison import brief, compared
+from harness.crossval.discretisation import read_discretisation
+from harness.crossval.ground_truth import Given, truth_of
+from harness.files.qpfile import qp_digest, save_qp
+from harness.files.store import save_solution, write_point
+from harness.names import canonical, parse
+from harness.record import Verdict
+from harness.registry import SolverSpec, load_plugin
+from harness.results.journal import Journal, read_journal
+from harness.verify.measure import Measurement
+from harness.verify.references import reference_point
+from harness.verify.verdicts import judged, new_record
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from problems import PROBLEMS
+from reports.validation.report import write_validation
+from solvers.reference.solve import reference_solution
+from tests.support import FALSE_CLAIMS
+
+PLUGIN = load_plugin(FALSE_CLAIMS)
+FAMILIES = {**PROBLEMS, **PLUGIN.problems}
+BEAM = "beam-ring/Nr=2/Nh=1/steps=2"
+HONEST = ("a", "b", "c", "d")
+NOWHERE = dict.fromkeys(("report", "plot", "vtu", "series", "paper"))
+
+
+def built(text, families=FAMILIES):
+    name = parse(text, families)
+    return build(name, families[name.family], reference_solution)
+
+
+def record_of(text, label, tol=1e-8, **more):
+    name = parse(text, FAMILIES)
+    spec = SolverSpec(name=label, label=label)
+    case = canonical(name, FAMILIES[name.family])
+    return new_record(
+        name, case, spec, options={}, tol=tol, repeat=0, environment="here", **more
+    )
+
+
+def write(folder, answers, tol=1e-8):
+    """Make a result folder of (solver, case, solution or verdict)."""
+    cases = {}
+    with Journal(folder, "here") as journal:
+        for label, text, answer in answers:
+            record = record_of(text, label, tol)
+            if isinstance(answer, Verdict):
+                journal.append(record.but(status=answer, message="as it ended"))
+                continue
+            case = cases.setdefault(text, built(text))
+            record = record.but(qp=qp_digest(case.qp, recipe=True))
+            record = judged(record, case.qp, Measurement(solution=answer))
+            if np.isfinite(answer.x).all():
+                record = record.but(vectors=save_solution(folder, answer))
+            journal.append(record)
+    return folder
+
+
+@pytest.fixture
+def cli(capsys):
+    """Validate a folder; returns the exit code, stdout and stderr."""
+
+    def cli(*argv, **more):
+        registries = Registries(
+            families=PROBLEMS, solvers={}, reference=reference_solution, **NOWHERE,
+            **more,
+        )  # fmt: skip
+        code = main(registries, ["validate", *map(str, argv)])
+        return code, *capsys.readouterr()
+
+    return cli
+
+
+def verdict_on(cli, folder, *more):
+    code, out, _ = cli(folder, "--json", *more)
+    return code, json.loads(out)
+
+
+def culprits(verdict):
+    return {d["solver"] for d in verdict["disagreements"]}
+
+
+@pytest.fixture(scope="module")
+def truths():
+    """The exact answer to each form of two load steps, with its case."""
+    found = {}
+    for step in (1, 2):
+        for form in ("primal", "dual", "dual-bounds"):
+            case = built(f"{BEAM}/step={step}/{form}")
+            found[step, form] = (case, reference_solution(case.qp))
+    return found
+
+
+def disturbed(case, s, size):
+    """Move an answer by `size`·‖u*‖ in the energy norm, whatever its form."""
+    rng = np.random.default_rng(141421)
+    point = reference_point(case.mechanics, reference_solution)
+    if case.qp.h.size:
+        v = rng.standard_normal(s.x.size)
+        v[case.mechanics.exact.held] = 0
+    else:
+        v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
+        if case.qp.b.size:  # what the rigid motions do not feel
+            A = np.asarray(case.qp.A)
+            v = v - np.linalg.pinv(A) @ (A @ v)
+    return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)
+
+
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+def test_a_planted_error_is_measured_and_its_solver_named_alone(
+    form, truths, tmp_path, cli
+):
+    case, s = truths[2, form]
+    forms = ("primal", "dual", "dual-bounds")
+    answers = [
+        (label, f"{BEAM}/{f}", truths[2, f][1]) for label in HONEST for f in forms
+    ]
+    answers.append(("planted", f"{BEAM}/{form}", disturbed(case, s, 1e-4)))
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert code == 1
+    assert culprits(verdict) == {"planted"}
+    assert verdict["unresolved"] == verdict["remarks"] == []
+    (wrong,) = verdict["disagreements"]
+    assert wrong["case"] == f"{BEAM}/{form}"
+    assert wrong["reasons"]
+    (problem,) = json.loads((tmp_path / "validation.json").read_text())["problems"]
+    (found,) = [a for a in problem["answers"] if a["solver"] == "planted"]
+    assert found["assessment"]["error"] == pytest.approx(1e-4, rel=1e-4)
+    assert found["error"] >= found["assessment"]["error"]
+
+
+def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli):
+    answers = [
+        (label, f"{BEAM}/step={step}/{form}", s)
+        for (step, form), (_, s) in truths.items()
+        for label in ("a", "smalbe")
+    ]
+
+    code, out, err = cli(write(tmp_path, answers), validation=write_validation)
+
+    assert code == 0
+    assert out.startswith("No disagreement: 12 answers of 2 solvers to 6 cases")
+    assert "(2 of 2)" in err
+    data = json.loads((tmp_path / "validation.json").read_text())
+    assert [len(p["pairs"]) for p in data["problems"]] == [15, 15]
+    assert all(p["truth"] == "reference" for p in data["problems"])
+    assert all(r["error_worst"] < 1e-7 for r in data["solvers"])
+    assert all(r["primal_dual"] < 1e-7 for r in data["solvers"])
+    assert all(r["from_ours"] < 1e-7 for r in data["solvers"])
+    pages = [tmp_path / "report" / f"validation.{kind}" for kind in ("html", "md")]
+    assert out.split()[-2:] == list(map(str, pages))
+    assert all("No disagreement" in page.read_text() for page in pages)
+
+
+def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_path, cli):
+    stale = PLUGIN.solvers["stale"]
+    answers = []
+    for step in (1, 2):
+        text = f"{BEAM}/step={step}/dual-bounds"
+        case, s = truths[step, "dual-bounds"]
+        answers += [(label, text, s) for label in HONEST]
+        answers.append(("stale", text, stale.prepare(case.qp, 1e-8)()))
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert code == 1
+    (wrong,) = verdict["disagreements"]
+    assert (wrong["solver"], wrong["case"]) == ("stale", f"{BEAM}/dual-bounds")
+    assert wrong["error"] > 0.1
+    assert any("the very point that it gave for" in r for r in wrong["reasons"])
+    assert f"its contact forces are those of {BEAM}/step=1" in wrong["reasons"]
+
+
+def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
+    """Two steps of one problem could share them; it is u that is wrong here."""
+    case, s = truths[2, "primal"]
+    answers = [("a", f"{BEAM}/primal", s), ("a", f"{BEAM}/step=1/primal",
+                                            truths[1, "primal"][1])]  # fmt: skip
+    answers.append(("off", f"{BEAM}/primal", disturbed(case, s, 1e-2)))
+
+    _, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    (wrong,) = verdict["disagreements"]
+    assert not any("contact forces are those" in r for r in wrong["reasons"])
+
+
+def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
+    case, s = truths[2, "dual-bounds"]
+    back, nothing = case.mechanics.back, replace(s, x=np.zeros_like(s.x))
+    point = reference_point(case.mechanics, reference_solution)
+
+    exact, _ = assess(case.mechanics, point, back(s), 1e-8)
+    free, _ = assess(case.mechanics, point, replace(back(nothing), x=0 * point.u), 1e-8)
+
+    gap = np.asarray(case.mechanics.primal.h)
+    assert exact.rows == ()
+    assert exact.active == point.active.sum()
+    assert free.rows == tuple(np.flatnonzero(point.active & (gap > 0)))
+
+
+@pytest.mark.parametrize("form", ["primal", "dual-bounds"])
+def test_a_multiplier_that_pulls_is_found_with_its_row(form, truths, tmp_path, cli):
+    case, s = truths[2, form]
+    wrong = PLUGIN.solvers["pulls"].prepare(case.qp, 1e-8)()
+    if form == "dual-bounds":
+        wrong = replace(s, x=np.where(s.x > 0, s.x, -s.x.max()))
+    answers = [(label, f"{BEAM}/{form}", s) for label in HONEST]
+    answers.append(("pulls", f"{BEAM}/{form}", wrong))
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert (code, culprits(verdict)) == (1, {"pulls"})
+    pulling = case.mechanics.back(wrong).z < 0
+    assert verdict["disagreements"][0]["pulls"] == np.flatnonzero(pulling).tolist()
+
+
+def test_penetration_is_measured_in_mesh_sizes_and_balance_per_body(truths):
+    case, s = truths[2, "primal"]
+    mechanics = case.mechanics
+    point = reference_point(mechanics, reference_solution)
+    B, c, h = case.qp.G, case.qp.h, mechanics.mesh_size
+    normal = B.T @ (np.arange(c.size) == point.active.argmax())
+    deep = replace(s, x=s.x + 0.5 * h * normal / (normal @ normal))
+    loose = replace(s, y=0 * s.y, z=0 * s.z)
+
+    found, _ = assess(mechanics, point, deep, 1e-8)
+    unheld, _ = assess(mechanics, point, loose, 1e-8)
+    exact, _ = assess(mechanics, point, s, 1e-8)
+
+    assert found.penetration == pytest.approx(np.max(B @ deep.x - c) / h)
+    assert found.penetration >= 0.5 * (1 - 1e-9)
+    assert unheld.balance == 1  # nothing holds the load
+    assert exact.balance < 1e-9
+    assert exact.penetration < 1e-12
+
+
+class Dense:
+    """K⁻¹ of a K that is regular."""
+
+    def __init__(self, K):
+        self.inverse, self.kernel = np.linalg.inv(K), np.zeros((len(K), 0))
+
+    def __call__(self, b):
+        return self.inverse @ b
+
+    def congruence(self, B):
+        return np.asarray(B @ (B @ self.inverse).T)
+
+
+def given(case, label, s, tol=1e-8):
+    record = record_of(f"{BEAM}/primal", label, tol).but(claimed=s.status.value)
+    return Given(record=record, label=label, repeats=1, case=case, solution=s)
+
+
+@pytest.fixture
+def duplicate():
+    """Two springs whose end is pushed by 2 against a wall at 1, which has two rows."""
+    K = np.array([[2.0, -1.0], [-1.0, 1.0]])
+    primal = QP(
+        P=csc_array(K), q=np.array([0.0, -2.0]), A=no_rows(2), b=np.zeros(0),
+        G=csc_array([[0.0, 1.0], [0.0, 1.0]]), h=np.ones(2),
+        lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
+    )  # fmt: skip
+    mechanics = Mechanics(
+        primal=primal, back=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
+        rigid=np.zeros((2, 0)),
+    )  # fmt: skip
+    return Case(qp=primal, recover=lambda s: s.x, quantities=lambda s: {},
+                mechanics=mechanics)  # fmt: skip
+
+
+def pushed(z, x=(0.5, 1.0)):
+    return Solution(
+        status=Status.SOLVED, x=np.array(x), y=np.zeros(0), z=np.array(z),
+        z_box=np.zeros(2),
+    )  # fmt: skip
+
+
+def test_a_certificate_that_the_reference_contradicts_is_our_fault(
+    truths, tmp_path, cli
+):
+    """The error is 2e-5, which the claim allows, but certified as 1e-7."""
+    _, s = truths[2, "dual-bounds"]
+    answers = [("a", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5)))]
+    write(tmp_path, answers, tol=1e-5)
+    for bound, code in ((1e-4, 0), (1e-7, 1)):
+        (record,) = {r.run_id: r for r in read_journal(tmp_path)}.values()
+        for path in (tmp_path / "journal").iterdir():
+            path.unlink()
+        with Journal(tmp_path, "here") as journal:
+            journal.append(record.but(energy_bound=bound))
+
+        found, verdict = verdict_on(cli, tmp_path)
+
+        assert found == code
+        assert culprits(verdict) == set()
+        assert [d["solver"] for d in verdict["contradictions"]] == ["a"] * code
+
+
+def test_different_multipliers_of_one_contact_force_agree(duplicate):
+    shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
+    answers = [given(duplicate, k, pushed(z)) for k, z in shares.items()]
+
+    found = compared("wall", answers, reference_solution, None)
+
+    assert found.truth == "reference"
+    assert len(found.pairs) == 3
+    assert all(p.equilibrium < 1e-15 for p in found.pairs)
+    assert not any(a.refuted or a.assessment.rows for a in found.answers)
+
+
+def finds_nothing(qp):
+    raise ArithmeticError("it found nothing")
+
+
+def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
+    """As an interior point has them: all forces and all gaps are positive."""
+    point = reference_point(duplicate.mechanics, reference_solution)
+    inside = pushed((1.5, 1e-9), (0.5 - 5e-8, 1 - 1e-7))
+
+    found, _ = assess(duplicate.mechanics, point, inside, 1e-8)
+
+    assert found.active == 1
+    assert found.rows == ()
+
+
+def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
+    duplicate, monkeypatch
+):
+    def back(s):  # which leads astray, while nothing is known for sure
+        return replace(s, x=s.x + 1) if s.iterations else s
+
+    def doubtful(*args):
+        return truth_of(*args)._replace(doubt=np.inf)
+
+    monkeypatch.setattr("harness.crossval.comparison.truth_of", doubtful)
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    s = pushed((1.5, 0.0))
+    answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
+    silent = replace(s, iterations=3, status=Status.FAILED)
+
+    found = compared("wall", [*answers, given(case, "c", silent)], finds_nothing, None)
+
+    assert not any(a.refuted for a in found.answers)
+    assert [(p.a, p.b) for p in found.unresolved] == [(0, 1)]
+    assert found.unresolved[0].distance > found.unresolved[0].allowed
+
+
+def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
+    good, bad = pushed((1.5, 0.0)), pushed((1.5, 0.0), (0.45, 0.9))
+    answers = [given(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))]
+    answers.append(given(duplicate, "good", good))
+
+    found = compared("wall", answers, finds_nothing, None)
+
+    assert found.truth == "good on primal"
+    assert "it found nothing" in found.note
+    assert [bool(a.refuted) for a in found.answers] == [True, True, False]
+
+
+def test_distances_are_those_of_the_energy_norm():
+    rng = np.random.default_rng(173205)
+    M, V = rng.standard_normal((6, 6)), rng.standard_normal((3, 6))
+    K = M @ M.T
+    V[2] = np.inf
+
+    found = distances(K, np.zeros((6, 0)), list(V))
+
+    d = V[0] - V[1]
+    assert found[0, 1] == pytest.approx(np.sqrt(d @ K @ d))
+    assert found[2, 0] == found[1, 2] == np.inf
+
+
+@pytest.mark.parametrize("recipe", [True, False])
+def test_a_qp_has_the_digest_that_a_run_writes_down(recipe, truths, tmp_path):
+    for case, _ in truths.values():
+        written = save_qp(tmp_path / "qp.npz", case.qp, {}, recipe=recipe)
+        assert qp_digest(case.qp, recipe=recipe) == written
+
+
+def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():
+    assert energy_allowed(1e-8) == pytest.approx(np.sqrt(20e-8))
+    assert energy_allowed(0.5) == pytest.approx(np.sqrt(0.2))
+
+
+def test_an_answer_within_its_claim_that_stands_out_is_a_remark(truths, tmp_path, cli):
+    _, s = truths[2, "dual-bounds"]
+    answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]
+    answers.append(("lazy", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5))))
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers, tol=1e-5))
+
+    assert code == 0
+    assert {d["solver"] for d in verdict["remarks"]} == {"lazy"}
+
+
+def test_what_all_solvers_are_is_no_remark(truths, tmp_path, cli):
+    _, s = truths[2, "dual-bounds"]
+    lazy = replace(s, x=s.x * (1 + 2e-5))
+    answers = [(label, f"{BEAM}/dual-bounds", lazy) for label in HONEST]
+
+    _, verdict = verdict_on(cli, write(tmp_path, answers, tol=1e-5))
+
+    assert verdict["remarks"] == []
+
+
+def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
+    truths, tmp_path, cli
+):
+    off = disturbed(*truths[2, "dual-bounds"], 1e-3)
+    asked = {"smalbe": "dual", "b": "primal", "c": "dual"}
+    exact = [(k, f"{BEAM}/{form}", truths[2, form][1]) for k, form in asked.items()]
+    write(
+        tmp_path, [*exact, *((k, f"{BEAM}/dual-bounds", off) for k in "bc")], tol=1e-4
+    )
+    write(tmp_path, exact, tol=1e-6)
+
+    _, verdict = verdict_on(cli, tmp_path)
+
+    rows = {(r["solver"], r["tol"]): r for r in verdict["solvers"]}
+    assert next(iter(rows)) == ("smalbe", 1e-4)
+    assert rows["b", 1e-4]["primal_dual"] == pytest.approx(1e-3, rel=1e-3)
+    assert rows["c", 1e-4]["primal_dual"] is None  # dual forms only
+    assert rows["b", 1e-4]["from_ours"] == pytest.approx(1e-3, rel=1e-3)
+    assert rows["b", 1e-6]["from_ours"] < 1e-8
+    assert rows["smalbe", 1e-4]["from_ours"] is None  # alone
+    assert verdict["counts"]["pairs"] == 10 + 3  # of answers at one tolerance
+
+
+@pytest.mark.slow  # the solve; those of HiGHS and of a candidate by hand are quick
+def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
+    text = "obstacle/n=16/primal"
+    case = built(text)
+    s = PLUGIN.solvers["proxqp-unchecked"].prepare(case.qp, 1e-6)()
+    exact = reference_solution(case.qp)
+    answers = [(label, text, exact) for label in HONEST]
+
+    code, verdict = verdict_on(
+        cli, write(tmp_path, [*answers, ("proxqp-unchecked", text, s)], tol=1e-6)
+    )
+
+    assert s.status is Status.SOLVED
+    assert (code, culprits(verdict)) == (1, {"proxqp-unchecked"})
+    assert verdict["disagreements"][0]["error"] > 0.05
+    assert any("displacement off" in r for r in verdict["disagreements"][0]["reasons"])
+
+
+def test_highs_on_a_problem_with_bounds_only_is_refuted(tmp_path, cli):
+    qp = built("membrane/qp").qp
+    s = PLUGIN.solvers["highs-bare"].prepare(qp, 1e-6)()
+    answers = [
+        ("a", "membrane/qp", reference_solution(qp)),
+        ("highs", "membrane/qp", s),
+    ]
+
+    code, verdict = verdict_on(
+        cli, write(tmp_path, answers, tol=1e-6), "--plugin", FALSE_CLAIMS
+    )
+
+    assert s.status is Status.SOLVED
+    assert (code, culprits(verdict)) == (1, {"highs"})
+    assert verdict["disagreements"][0]["error"] > 0.1
+
+
+def test_the_candidate_that_three_usual_residuals_accept_is_refuted(tmp_path, cli):
+    qp = built("half/qp").qp
+    s = PLUGIN.solvers["at-the-row"].prepare(qp, 1e-8)()
+    answers = [("a", "half/qp", reference_solution(qp)), ("at-the-row", "half/qp", s)]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers), "--plugin", FALSE_CLAIMS)
+
+    assert (code, culprits(verdict)) == (1, {"at-the-row"})
+    assert verdict["disagreements"][0]["reasons"][0].startswith("dual residual")
+
+
+def test_claims_without_a_point_are_refuted_and_what_died_is_listed(
+    truths, tmp_path, cli
+):
+    case, s = truths[2, "primal"]
+    text = f"{BEAM}/primal"
+    answers = [
+        ("a", text, s),
+        ("denies", text, PLUGIN.solvers["denies"].prepare(case.qp, 1e-8)()),
+        ("empty", text, Solution.without_point(case.qp, Status.SOLVED)),
+        ("dies", text, Verdict.CRASHED),
+        ("picky", text, Verdict.DECLINED),
+    ]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert (code, culprits(verdict)) == (1, {"denies", "empty"})
+    assert [d["solver"] for d in verdict["unanswered"]] == ["dies"]
+    assert verdict["unanswered"][0]["text"] == "crashed: as it ended"
+    assert verdict["counts"]["declined"] == 1
+
+
+def test_a_claim_that_nothing_refutes_is_listed_all_the_same(tmp_path, cli):
+    qp = built("membrane/qp").qp
+    denied = PLUGIN.solvers["denies"].prepare(qp, 1e-8)()
+    answers = [("a", "half/qp", pulled()), ("denies", "membrane/qp", denied)]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers), "--plugin", FALSE_CLAIMS)
+
+    assert code == 0
+    assert [d["text"] for d in verdict["unanswered"]] == ["infeasible claim"]
+
+
+def test_a_form_that_all_deny_is_refuted_by_the_other_forms(truths, tmp_path, cli):
+    _, s = truths[2, "dual"]
+    denied = PLUGIN.solvers["denies"].prepare(truths[2, "primal"][0].qp, 1e-8)()
+    answers = [("a", f"{BEAM}/dual", s), ("denies", f"{BEAM}/primal", denied)]
+
+    code, verdict = verdict_on(cli, write(tmp_path, answers))
+
+    assert (code, culprits(verdict)) == (1, {"denies"})
+
+
+def test_mechanics_that_fail_leave_the_residuals(duplicate):
+    def factorise():
+        raise ZeroDivisionError("no factor")
+
+    mechanics = replace(duplicate.mechanics, factorise=factorise)
+    answers = [given(replace(duplicate, mechanics=mechanics), k, pushed(z))
+               for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
+
+    found = compared("wall", answers, reference_solution, None)
+
+    assert found.truth == ""
+    assert "no factor" in found.note
+    assert [bool(a.refuted) for a in found.answers] == [False, True]
+
+
+def test_a_stored_point_that_was_changed_afterwards_is_noticed(truths, tmp_path, cli):
+    _, s = truths[2, "dual-bounds"]
+    answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]
+    other = replace(s, x=s.x * (1 + 1e-12))
+    write(tmp_path, [*answers, ("planted", f"{BEAM}/dual-bounds", other)])
+    stored = {r.solver: r.vectors for r in read_journal(tmp_path)}
+    moved = replace(s, x=s.x * (1 + 1e-4))
+    write_point(tmp_path / "vectors" / f"{stored['planted']}.npz", moved)
+
+    code, verdict = verdict_on(cli, tmp_path)
+
+    assert (code, culprits(verdict)) == (1, {"planted"})
+    assert any("was changed" in r for r in verdict["disagreements"][0]["reasons"])
+
+
+def test_cases_that_cannot_be_built_as_they_were_are_listed(truths, tmp_path, cli):
+    _, s = truths[2, "dual-bounds"]
+    answers = [("a", f"{BEAM}/dual-bounds", s), ("a", "half/qp", pulled())]
+    write(tmp_path, answers)
+    with Journal(tmp_path, "here") as journal:
+        for r in read_journal(tmp_path):
+            if r.family == "beam-ring":
+                other = r.but(solver="other", run_id="other", qp="0" * 16)
+                journal.append(other.but(case=f"{BEAM}/step=1/dual-bounds",
+                                         params={**r.params, "step": 1}))  # fmt: skip
+
+    code, verdict = verdict_on(cli, tmp_path)
+
+    assert code == 0
+    why = {d["case"]: d["text"] for d in verdict["not_validated"]}
+    assert why.keys() == {"half/qp", f"{BEAM}/step=1/dual-bounds"}
+    assert "unknown family 'half'" in why["half/qp"]
+    assert "digest" in why[f"{BEAM}/step=1/dual-bounds"]
+
+
+def pulled():
+    return reference_solution(built("half/qp").qp)
+
+
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, cli):
+    (tmp_path / "empty").mkdir()
+    bare = write(tmp_path / "bare", [("dies", f"{BEAM}/primal", Verdict.CRASHED)])
+    foreign = write(tmp_path / "foreign", [("a", "half/qp", pulled())])
+    gone = write(tmp_path / "gone", [("a", "half/qp", pulled())])
+    shutil.rmtree(gone / "vectors")
+    (foreign / "suite.toml").touch()
+
+    for folder, text in (
+        (tmp_path / "nowhere", "no such folder"),
+        (tmp_path / "empty", "no journal"),
+        (bare, "no solver returned a point (1 crashed)"),
+        (foreign / "suite.toml", "suite.toml: a file; expected a result folder"),
+        (gone, "its stored points are gone"),
+        (foreign, "no stored answer can be judged: unknown family 'half'"),
+    ):
+        code, out, err = cli(folder)
+        assert (code, out) == (2, "")
+        assert text in err.splitlines()[-1]
+        assert "Traceback" not in err
+
+
+def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path, cli):
+    folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
+    (folder / "report").touch()
+    code, _, err = cli(folder, validation=write_validation)
+
+    assert code == 2
+    assert err.splitlines()[-1] == (
+        f"mortarbench: {folder / 'report'}: a file is where a folder is needed; "
+        "move the file away"
+    )
+
+
+def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
+    truths, tmp_path, cli
+):
+    _, s = truths[2, "primal"]
+    name = "<b>evil</b>\x1b[31m\n|x"
+    huge = replace(s, x=np.full_like(s.x, 1e300))
+    answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
+
+    code, out, _ = cli(write(tmp_path, answers), validation=write_validation)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    assert code == 1
+    assert "\x1b" not in out
+    json.loads((tmp_path / "validation.json").read_text(), parse_constant=refuse)
+    page = (tmp_path / "report" / "validation.html").read_text()
+    assert "<b>evil" not in page
+    assert "&lt;b&gt;evil" in page
+
+
+def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
+    def back(s):
+        if s.z[0] == 0:
+            raise ZeroDivisionError("no way back")
+        return s
+
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    answers = [given(case, k, pushed(z)) for k, z in
+               {"a": (1.5, 0.0), "lost": (0.0, 1.5)}.items()]  # fmt: skip
+
+    found = compared("wall", answers, reference_solution, None)
+
+    assert [a.assessment is None for a in found.answers] == [False, True]
+    assert "no way back" in found.answers[1].remarks[0]
+
+
+def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path):
+    """u″ = 2 over a length of 1 makes ‖u − u_h‖² = h²/3, but for the norm of û."""
+    text = "obstacle/dim=1/n=12/primal"
+    case = built(text)
+    folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])
+    _, verdict = verdict_on(cli, folder)
+    (found,) = read_discretisation(folder).values()
+    (level, *_) = found.levels
+
+    assert verdict["discretisation"][0]["error"] == found.error
+    assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
+    assert "obstacle/dim=1/n=12: " in cli(folder)[1]
+    cli(folder, validation=write_validation)
+    page = (folder / "report" / "validation.md").read_text()
+    assert "Errors of the meshes" in page
+    assert "obstacle/dim=1/n=12" in page.partition("Errors of the meshes")[2]
+    again = verdict_on(cli, folder, "--budget", "0")[1]["discretisation"]
+    assert again[0]["error"] == found.error
+
+
+@pytest.mark.parametrize("budget", ["-1", "nan"])
+def test_no_time_for_finer_meshes_is_less_than_none(cli, tmp_path, budget):
+    code, _, complaint = cli(tmp_path, "--budget", budget)
+
+    assert code == 2
+    assert "--budget" in complaint
+    assert "expected a number of seconds" in complaint
+    assert budget in complaint
+
+
+def test_errors_say_their_norm_and_nothing_is_said_of_a_smalbe_that_took_no_part(
+    truths, tmp_path, cli
+):
+    for label, told in (("a", False), ("smalbe", True)):
+        answers = [(k, f"{BEAM}/primal", truths[2, "primal"][1]) for k in (label, "b")]
+        folder = write(tmp_path / label, answers)
+        _, out, _ = cli(folder, "--budget", "0", validation=write_validation)
+        page = (folder / "report" / "validation.md").read_text()
+
+        assert "Certified errors: relative, in the energy norm." in out
+        assert "√(20t)‖u\\*‖" in page or "√(20t)‖u*‖" in page
+        assert [("smalbe" in text) for text in (out, page)] == [told, told]
+
+
+def test_small_numbers_have_two_digits_each():
+    assert [brief(x) for x in (1.0, 4e-4, 3.17e-9)] == ["1.0e0", "4.0e-4", "3.2e-9"]
+
+
+def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
+    text = "obstacle/dim=1/n=12/primal"
+    exact = reference_solution(built(text).qp)
+    folder = write(tmp_path / "out", [("exact", text, exact)])
+    with Journal(folder, "there") as journal:
+        old = record_of(text, "old").but(params={"size": 3}, case="obstacle/size=3/x")
+        journal.append(old.but(status=Verdict.FAILED))
+
+    assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
+        "obstacle/dim=1/n=12"
+    ]

@@ -1,0 +1,373 @@
+"""The environment says what times depend on, and nothing about who measured."""
+
+import copy
+import json
+import os
+import platform
+import re
+import socket
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from hashlib import sha256
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.environment.doctor import Level, as_json, examine, render
+from harness.environment.environment import (
+    capture,
+    capture_in,
+    digest,
+    source,
+    system_blas,
+)
+from harness.environment.noise import NoiseFloor, noise_floor
+from tests.support import ROOT
+
+DEBIAN = "/usr/lib/x86_64-linux-gnu"
+WHEEL = "/opt/venv/lib/python3.11/site-packages/numpy.libs/libopenblas64_p-r0-1f.so"
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def pool(library="libopenblas", owner="system", threads=1):
+    return {
+        "library": library, "owner": owner, "version": "0.3.21",
+        "architecture": "Haswell", "layer": "pthreads", "threads": threads,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def quiet():
+    """An environment with nothing to complain about."""
+    return {
+        "machine": {
+            "cpu": "Some CPU", "physical_cores": 4, "logical_cores": 8,
+            "usable_cores": 8, "cpu_limit": None, "memory_mib": 16000,
+            "architecture": "x86_64", "system": "Linux", "kernel": "6.1",
+            "libc": "glibc 2.36", "governor": "performance", "turbo": False,
+            "virtual": False, "smt": False,
+        },
+        "versions": {"python": "3.11.2", "scikit-sparse": "0.4.16"},
+        "source": {"commit": "0123456789abcdef", "dirty": False},
+        "threads": {"variables": {"OMP_NUM_THREADS": "1"}, "pools": [pool()]},
+        "cholmod": {"version": "3.0.14", "blas": "OpenBLAS 0.3.21 (pthreads)"},
+        "now": {"time": "2026-01-01", "load": 0.1, "available_memory_mib": 9000},
+    }  # fmt: skip
+
+
+def changed(environment, path, value):
+    """Copy with the entry at the dotted path replaced."""
+    result = copy.deepcopy(environment)
+    *parents, last = path.split(".")
+    entry = result
+    for key in parents:
+        entry = entry[key]
+    entry[last] = value
+    return result
+
+
+@pytest.mark.parametrize("path", ["now.load", "now.available_memory_mib", "now.time"])
+def test_the_digest_ignores_what_changes_from_minute_to_minute(quiet, path):
+    assert digest(changed(quiet, path, 7)) == digest(quiet)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("versions.scikit-sparse", "0.4.15"),
+        ("cholmod.blas", "reference BLAS"),
+        ("threads.variables", {"OMP_NUM_THREADS": "2"}),
+        ("threads.pools", [pool(threads=2)]),
+        ("machine.cpu", "Another CPU"),
+        ("source.dirty", True),
+    ],
+)
+def test_the_digest_changes_with_what_times_depend_on(quiet, path, value):
+    assert digest(changed(quiet, path, value)) != digest(quiet)
+
+
+def test_the_digest_is_12_hex_digits_whatever_the_order_of_keys(quiet):
+    reordered = dict(reversed(quiet.items()))
+    assert digest(reordered) == digest(quiet)
+    assert re.fullmatch(r"[0-9a-f]{12}", digest(quiet))
+
+
+def test_two_captures_in_a_row_have_one_digest_through_json():
+    first, second = capture(), json.loads(json.dumps(capture()))
+    assert digest(first) == digest(second)
+
+
+def test_a_capture_tells_no_host_name_and_no_absolute_path(monkeypatch):
+    host = "a-planted-host-name"
+    planted = os.uname_result(("Linux", host, "6.1.0", "#1 SMP", "x86_64"))
+    monkeypatch.setattr(os, "uname", lambda: planted)
+    monkeypatch.setattr(platform, "_uname_cache", None, raising=False)
+    monkeypatch.setattr(socket, "gethostname", lambda: host)
+    text = json.dumps(capture())
+    assert host not in text
+    assert not re.search(r'"/|\s/\w|\w/\w+/', text)
+    assert str(Path.home()) not in text
+
+
+def test_plugins_are_named_by_their_content(tmp_path):
+    (tmp_path / "other").mkdir()
+    file, namesake = tmp_path / "a.py", tmp_path / "other" / "a.py"
+    file.write_text("x = 1")
+    namesake.write_text("")
+
+    plain = capture([file])
+    both = capture([file, namesake])
+    file.write_text("x = 2")
+    changed_one = capture([file])
+    namesake.write_text("y = 3")
+
+    assert plain["plugins"] == {"a.py": sha256(b"x = 1").hexdigest()[:12]}
+    assert both["plugins"] == plain["plugins"]  # nothing in it
+    assert changed_one["plugins"] != plain["plugins"]
+    assert capture([file, namesake])["plugins"] != changed_one["plugins"]
+    assert digest(changed_one) != digest(plain)
+    assert capture()["plugins"] == {}
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A repository with one commit."""
+    for who in ("AUTHOR", "COMMITTER"):
+        monkeypatch.setenv(f"GIT_{who}_NAME", "A")
+        monkeypatch.setenv(f"GIT_{who}_EMAIL", "a@example.org")
+    (tmp_path / "harness").mkdir()
+    (tmp_path / "harness" / "a.py").write_text("x = 1\n")
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "First"]):
+        subprocess.run(["git", "-C", str(tmp_path), *arguments], check=True)
+    return tmp_path
+
+
+def test_a_checkout_as_committed_is_clean(checkout):
+    (checkout / "notes.py").write_text("elsewhere")
+
+    assert source(checkout).keys() == {"commit", "dirty", "changes"}
+    assert (source(checkout)["dirty"], source(checkout)["changes"]) == (False, None)
+
+
+@pytest.mark.parametrize("name", ["a.py", "new file.py"])
+def test_two_states_of_a_dirty_checkout_are_told_apart(checkout, name):
+    states = []
+    for text in ("x = 2\n", "x = 3\n", "x = 2\n"):
+        (checkout / "harness" / name).write_text(text)
+        states.append(source(checkout))
+
+    assert all(state["dirty"] for state in states)
+    assert states[0] == states[2] != states[1]
+    assert re.fullmatch("[0-9a-f]{12}", states[0]["changes"])
+
+
+def test_a_capture_holds_the_versions_that_the_modules_themselves_tell():
+    versions = capture()["versions"]
+    assert versions["numpy"] == np.__version__
+    assert versions["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert None not in versions.values()
+
+
+def test_thread_variables_take_effect_in_the_captured_process():
+    captured = capture_in(ONE_THREAD)
+    pools = captured["threads"]["pools"]
+    assert captured["threads"]["variables"].items() >= ONE_THREAD.items()
+    assert {"numpy", "scipy"} <= {p["owner"] for p in pools}
+    assert {p["threads"] for p in pools} == {1}
+
+
+@pytest.mark.parametrize(
+    ("mapped", "name"),
+    [
+        ([f"{DEBIAN}/blas/libblas.so.3.11.0", WHEEL], "reference BLAS"),
+        (
+            [
+                f"{DEBIAN}/openblas-pthread/libblas.so.3",
+                f"{DEBIAN}/openblas-pthread/libopenblasp-r0.3.21.so",
+                WHEEL,
+            ],
+            "OpenBLAS 0.3.21 (pthreads)",
+        ),
+        (["/opt/intel/lib/libmkl_rt.so.2"], "MKL"),
+        ([WHEEL], None),
+    ],
+)
+def test_cholmods_blas_is_the_one_outside_the_wheels_of_others(mapped, name):
+    pools = [pool("libopenblas64_", "numpy") | {"version": "0.3.30"}]
+    pools += [pool()] if name and name.startswith("OpenBLAS") else []
+    assert system_blas(mapped, pools) == name
+
+
+QUIET_NOISE = NoiseFloor(
+    clock_seconds=1e-7, kernel_seconds=1e-3, pairs=1000,
+    ratio=1.002, low=0.99, high=1.01, one_pair=0.05,
+)  # fmt: skip
+
+
+def warnings(environment, noise=QUIET_NOISE):
+    return [c for c in examine(environment, noise) if c.level is Level.WARN]
+
+
+def test_a_quiet_machine_gets_no_advice(quiet):
+    checks = examine(quiet, QUIET_NOISE)
+
+    assert {c.level for c in checks} == {Level.OK}
+    assert not any(c.advice for c in checks)
+    assert as_json(quiet, QUIET_NOISE, checks)["fit"] is True
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "remedy"),
+    [
+        ("cholmod.blas", "reference BLAS", "sudo apt-get install libopenblas0-pthread"),
+        ("threads.pools", [pool(threads=2)], "export OMP_NUM_THREADS=1 OPENBLAS_NUM_"),
+        ("machine.governor", "powersave", "cpupower frequency-set -g performance"),
+        ("machine.governor", "performance, powersave", "cpupower frequency-set"),
+        ("machine.turbo", True, "echo 0 | sudo tee"),
+        ("machine.smt", True, "echo off | sudo tee"),
+        ("machine.cpu_limit", 0.5, "docker run --cpus=2"),
+        ("machine.usable_cores", 1, "2 cores"),
+        ("now.load", 0.6, "Stop other programs"),
+        ("now.available_memory_mib", 500, "memory_limit"),
+        ("source.dirty", True, "Commit"),
+        ("versions.scikit-sparse", None, "make setup"),
+    ],
+)
+def test_each_trouble_says_what_to_change(quiet, path, value, remedy):
+    found = warnings(changed(quiet, path, value))
+
+    assert any(remedy in check.advice for check in found)
+    assert all(check.advice and "\n" not in check.advice for check in found)
+    assert {c.section for c in found} <= {"Machine", "BLAS", "Threads", "Versions"}
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        ({"clock_seconds": 1e-3}, "smallest step"),
+        ({"ratio": 1.05, "low": 1.04, "high": 1.06}, "A/A ratio"),
+        ({"one_pair": 0.3}, "noise floor"),
+    ],
+)
+def test_a_clock_that_cannot_be_trusted_is_warned_of(quiet, change, name):
+    (check,) = warnings(quiet, replace(QUIET_NOISE, **change))
+
+    assert check.name == name
+
+
+def test_a_ratio_whose_interval_holds_one_is_no_difference(quiet):
+    wide = replace(QUIET_NOISE, ratio=1.05, low=0.95, high=1.15)
+    assert warnings(quiet, wide) == []
+
+
+def test_what_cannot_be_read_is_unknown_and_no_reason_to_complain(quiet):
+    paths = ("governor", "turbo", "smt")
+    for path in paths:
+        quiet = changed(quiet, f"machine.{path}", None)
+    quiet = changed(quiet, "now.available_memory_mib", None)
+    checks = examine(quiet, QUIET_NOISE)
+    unknown = [c.name for c in checks if c.level is Level.UNKNOWN]
+
+    assert unknown == ["governor", "turbo", "hyper-threads", "memory"]
+    assert warnings(quiet) == []
+
+
+def test_the_blas_of_each_package_is_named_apart(quiet):
+    pools = [
+        pool("libscipy_openblas", "numpy") | {"version": "0.3.31"},
+        pool("libmkl_rt", "scipy") | {"version": "2024.1"},
+        pool("libgomp"),
+        pool(),
+    ]
+    checks = examine(changed(quiet, "threads.pools", pools), QUIET_NOISE)
+    blas = {c.name: c.value for c in checks if c.section == "BLAS"}
+
+    assert blas["of numpy"] == "libscipy_openblas 0.3.31"
+    assert blas["of scipy"] == "libmkl_rt 2024.1"
+    assert blas["of CHOLMOD"].startswith("OpenBLAS 0.3.21 (pthreads), linked by")
+
+
+def test_a_package_without_a_blas_of_its_own_uses_the_systems(quiet):
+    pools = [pool("libgomp"), pool()]
+    checks = examine(changed(quiet, "threads.pools", pools), QUIET_NOISE)
+
+    assert [c.value for c in checks if c.section == "BLAS"][:2] == [
+        "libopenblas 0.3.21"
+    ] * 2
+
+
+def test_the_values_stand_in_one_column_with_the_advice_below(quiet):
+    environment = changed(quiet, "machine.governor", "powersave")
+    lines = str(render(examine(environment, QUIET_NOISE), "0123456789ab")).splitlines()
+    rows = [re.match(r"  (ok|warn) +\S+(?: \S+)* {2,}", line) for line in lines]
+    governor = next(i for i, line in enumerate(lines) if "powersave" in line)
+
+    assert len({row.end() for row in rows if row}) == 1
+    assert lines[governor].split()[0] == "warn"
+    assert "cpupower" in lines[governor + 1]
+    assert lines[-1].startswith("1 thing to change")
+    assert "0123456789ab" in lines[-1]
+
+
+def test_a_perfect_clock_shows_no_noise_between_equal_arms():
+    ticks = count()
+    noise = noise_floor(500.0, clock=lambda: float(next(ticks)))
+    assert (noise.ratio, noise.low, noise.high, noise.one_pair) == (1, 1, 1, 0)
+    assert (noise.kernel_seconds, noise.clock_seconds) == (1.0, 1.0)
+
+
+def test_a_steady_drift_hits_both_arms_alike():
+    readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
+    noise = noise_floor(30_000.0, clock=lambda: next(readings))
+    assert noise.one_pair > 0.003  # what pairs in one order would be off by
+    assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of that
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 0.5])
+def test_the_interval_of_an_unsteady_clock_holds_the_true_ratio(amplitude):
+    rng = np.random.default_rng(271828)
+    readings = (k + amplitude * rng.random() for k in count())
+    noise = noise_floor(2000.0, clock=lambda: next(readings))
+    assert noise.low < 1 < noise.high
+    assert 0.01 * amplitude < noise.high - noise.low < amplitude
+    assert noise.high - noise.low < noise.one_pair
+
+
+def test_the_comparison_leaves_the_process_where_it_ran():
+    usable = os.sched_getaffinity(0)
+    noise = noise_floor(0.05)
+    assert os.sched_getaffinity(0) == usable
+    assert noise.low <= noise.ratio <= noise.high
+
+
+def read_pins():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return [line for line in lines if not line.startswith("#")]
+
+
+def normal(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_every_dependency_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    named = [
+        *project["project"]["dependencies"],
+        *project["project"]["optional-dependencies"]["dev"],
+        *project["project"]["optional-dependencies"]["browser"],
+        *project["build-system"]["requires"],
+    ]
+    wanted = {normal(re.match(r"[\w.-]+", requirement)[0]) for requirement in named}
+    assert wanted <= {normal(pin.partition("==")[0]) for pin in read_pins()}
+
+
+def test_constraints_are_exact_pins_in_order_and_hold_no_address():
+    pins = read_pins()
+    for pin in pins:
+        assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+]+", pin), pin
+    assert pins == sorted(pins, key=str.lower)
+    assert "mortarbench" not in {pin.partition("==")[0] for pin in pins}

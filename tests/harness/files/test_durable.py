@@ -1,0 +1,335 @@
+"""Files on disks that fill up, of writers that are cut off, in hands of others.
+
+A full disk is that of `full`: no process can write beyond some byte of a file. The
+kernel answers as at the end of a disk: by a short write, then by an error.
+"""
+
+import errno
+import os
+import resource
+import signal
+import sys
+from contextlib import contextmanager
+
+import pytest
+
+from harness import InputError
+from harness.errors import FaultError
+from harness.files.durable import (
+    Lines,
+    full_disk_told,
+    refuse_full_disk,
+    remove_unfinished,
+    replace_file,
+)
+from harness.processes import measurement as remote
+from harness.registry import load_plugin
+from harness.results.faults import FAULTS, Fault, in_words, left, read_faults
+from harness.results.folder import Held, refuse_foreign
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from reports.data.evidence import read_evidence
+from reports.sections.summary import summary
+from tests.support import TOY_PROBLEM
+
+
+@contextmanager
+def full(size=0):
+    """No file can grow beyond `size` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def lines(tmp_path):
+    """Open the same file of lines; what it tells is in ``lines.told``."""
+
+    def lines():
+        return Lines(tmp_path / "folder" / "lines", lines.told.append)
+
+    lines.told = []
+    lines.path = tmp_path / "folder" / "lines"
+    return lines
+
+
+def fault(run_id, **changes):
+    told = {"time": "2026-01-01", "case": "c", "solver": "s", "what": "w"}
+    return Fault(run_id=run_id, **({**told, "tried_again": False} | changes))
+
+
+def test_a_file_is_replaced_whole_and_readable_by_all(tmp_path):
+    path = tmp_path / "new" / "file"
+    for content in (b"old", b"newer"):
+        replace_file(path, content)
+        assert path.read_bytes() == content
+    os.umask(umask := os.umask(0))
+
+    assert path.stat().st_mode & 0o777 == 0o666 & ~umask
+    assert [p.name for p in path.parent.iterdir()] == ["file"]
+
+
+def test_where_the_disk_is_full_the_old_file_stays_and_nothing_beside_it(tmp_path):
+    path = tmp_path / "file"
+    replace_file(path, b"old")
+    with full(100), pytest.raises(OSError, match="File too large"):
+        replace_file(path, bytes(1000))
+
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_cannot_be_synced_does_not_replace(tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    replace_file(path, b"old")
+
+    def fails(fd):
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(OSError, match="full"):
+        replace_file(path, b"new")
+
+    assert path.read_bytes() == b"old"
+
+
+def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
+    with lines() as file:
+        file.append("a" * 50)
+        with full(80), pytest.raises(OSError, match="File too large"):
+            file.append("b" * 50)  # 29 bytes of it fit
+        assert lines.path.read_text() == "a" * 50 + "\n"
+        file.append("c" * 50)
+
+    assert lines.path.read_text().split() == ["a" * 50, "c" * 50]
+
+
+def test_what_follows_the_last_newline_is_cut_off_however_long_it_is(lines):
+    lines.path.parent.mkdir()
+    for tail in (b"x", b"x" * 2**16, b"x" * 200_000, b""):
+        for head in (b"", b"one\n", b"one\n" + b"y" * 2**16 + b"\n"):
+            lines.path.write_bytes(head + tail)
+            with lines() as file:
+                file.append("two")
+            assert lines.path.read_bytes() == head + b"two\n"
+
+
+@pytest.mark.parametrize("folder", [False, True])
+def test_a_file_of_lines_that_was_deleted_is_there_again_with_all_of_them(
+    lines, folder
+):
+    with lines() as file:
+        file.append("one")
+        lines.path.unlink()
+        if folder:
+            lines.path.parent.rmdir()
+        file.append("two")
+        file.append("three")
+
+    assert lines.path.read_text().split() == ["one", "two", "three"]
+    (told,) = lines.told
+    assert "deleted" in told
+
+
+def test_a_file_in_place_of_ours_keeps_its_lines_and_gets_those_it_lacks(lines):
+    with lines() as file:
+        file.append("one")
+        file.append("two")
+        replace_file(lines.path, b"other\ntwo\npart")
+        file.append("three")
+
+    assert lines.path.read_text().split() == ["other", "two", "one", "three"]
+
+
+@pytest.mark.parametrize("change", [b"", b"one\nforeign\n"])
+def test_a_file_that_another_program_writes_is_left_to_it_in_one_line(lines, change):
+    with lines() as file:
+        file.append("one")
+        with lines.path.open("r+b") as other:
+            other.truncate()
+            other.write(change)
+        with pytest.raises(InputError, match="changed by another program"):
+            file.append("two")
+
+    assert lines.path.read_bytes() == change
+
+
+def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
+    said = "free some space, and the same command continues"
+    for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        with pytest.raises(InputError) as e, full_disk_told(tmp_path / "none"):
+            raise OSError(code, os.strerror(code))
+        message = str(e.value)
+        assert message.startswith(f"{tmp_path / 'none'} cannot be written: ")
+        assert message.endswith(said)
+        assert os.strerror(code) in message
+        assert "MiB free" in message
+    with pytest.raises(OSError, match="else"), full_disk_told(tmp_path):
+        raise OSError(errno.EIO, "else")
+
+
+def test_a_failure_is_the_disks_if_it_says_so_or_nothing_can_be_written(tmp_path):
+    refuse_full_disk(tmp_path, "something else")
+    with pytest.raises(InputError, match="No space left on device"):
+        refuse_full_disk(tmp_path, f"exit code 1: {os.strerror(errno.ENOSPC)}: 'x'")
+    with full(100), pytest.raises(InputError, match="File too large"):
+        refuse_full_disk(tmp_path, "something else")
+    refuse_full_disk(tmp_path / "no such folder", "something else")
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_writers_left_unfinished_goes_and_nothing_else(tmp_path):
+    own = [tmp_path / name for name in ("vectors", "cases", "report/tables", "none")]
+    for folder in own[:3]:
+        folder.mkdir(parents=True)
+    ours = [
+        ".mortarbench-0123.tmp", "suite.tmp", "vectors/tmpabc.tmp", "cases/k.new",
+        "cases/.k.new.new", "report/tables/.mortarbench-4567.tmp",
+    ]  # fmt: skip
+    others = ["notes.tmp", "cases/k.npz", "cases/k.lock", "report/tables/a.tex"]
+    for name in (*ours, *others):
+        (tmp_path / name).touch()
+    remove_unfinished(tmp_path, [*own[:2], tmp_path / "report", own[3]])
+
+    files = (p for p in tmp_path.rglob("*") if p.is_file())
+    assert sorted(str(p.relative_to(tmp_path)) for p in files) == sorted(others)
+
+
+def test_a_folder_is_held_although_its_lock_is_deleted(tmp_path):
+    held = Held(tmp_path)
+    (tmp_path / ".lock").unlink()
+
+    assert held.is_there()
+    with pytest.raises(InputError, match="is being written by another run"):
+        Held(tmp_path)
+    held.close()
+    Held(tmp_path).close()
+
+
+def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_path):
+    held = Held(tmp_path)
+    (tmp_path / ".lock").unlink()
+    other = Held(tmp_path)
+
+    with pytest.raises(InputError, match="is being written by another run"):
+        held.is_there()
+    assert other.is_there()
+    held.close()
+    other.close()
+
+
+def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
+    Held(tmp_path).close()
+    (tmp_path / "suite.toml").write_text("")  # and no environment.json yet
+    refuse_foreign(tmp_path)
+
+    (tmp_path / ".lock").write_text("somebody else's")
+    with pytest.raises(InputError, match="is no result folder"):
+        refuse_foreign(tmp_path)
+
+
+def test_of_faults_the_last_of_each_measurement_that_is_missing_counts(tmp_path):
+    every = [fault("a", what="x"), fault("b"), fault("a", what="y"), fault("c")]
+    with Lines(tmp_path / FAULTS, print) as file:
+        for one in every:
+            file.append(one.to_json())
+    with (tmp_path / FAULTS).open("a") as partial:
+        partial.write('{"time')
+
+    assert read_faults(tmp_path) == every
+    assert left(every, {"c"}) == [every[2], every[1]]
+    assert in_words(left(every, "abc")) == ""
+    assert in_words(left(every, "c")) == (
+        "2 measurements could not be made, by no fault of a solver: y, w"
+    )
+    assert read_faults(tmp_path / "no such folder") == []
+
+
+@pytest.mark.parametrize(
+    "line", ["", "[]", "3", "{}", "[" * 10**5, '{"time": 1}', "\udcff", "null"]
+)
+def test_a_damaged_fault_is_named_with_its_line(tmp_path, line):
+    content = fault("a").to_json() + "\n" + line + "\n"
+    (tmp_path / FAULTS).write_bytes(content.encode(errors="surrogateescape"))
+
+    with pytest.raises(InputError, match=r"faults\.jsonl, line 2: damaged; expected"):
+        read_faults(tmp_path)
+
+
+SUITE = """
+name = "toy_problem"
+repeats = 2
+solvers = ["exact", "near"]
+[[problems]]
+family = "well"
+forms = ["dual"]
+"""
+
+
+def first_page(folder, _formats):
+    """Write what the summary of a report says."""
+    (folder / "said").write_text("\n".join(summary(read_evidence(folder)).prose))
+    return []
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Run a command line on the toy problem in an empty folder: code, out, err."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "toy.toml").write_text(SUITE)
+    plugin = load_plugin(TOY_PROBLEM)
+    nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
+    registries = Registries(
+        families=plugin.problems,
+        solvers=plugin.solvers,
+        report=first_page,
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+        **nothing,
+    )
+
+    def cli(*argv):
+        code = main(registries, argv)
+        return code, *capsys.readouterr()
+
+    return cli
+
+
+def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_path):
+    def measured(worker, qp, record, request, **limits):
+        if record.solver == "near":
+            raise FaultError("the worker could not be started")
+        return remote.measured(worker, qp, record, request, **limits)
+
+    monkeypatch.setattr("harness.running.executor.measured", measured)
+    code, out, err = cli("run", "toy.toml", "--out", "d")
+    told = "2 measurements could not be made, by no fault of a solver: the worker could"
+
+    assert code == 1
+    assert f"{told} not be started; the same command tries again\n" in out
+    assert err.count("it is tried again") == err.count("it was not measured") == 2
+    assert told in (tmp_path / "d" / "said").read_text()
+
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = cli("run", "toy.toml", "--out", "d")
+    assert code == 0
+    assert "could not be made" not in out
+    assert told not in (tmp_path / "d" / "said").read_text()
+
+
+def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+
+    def measured(*_, **__):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("harness.running.executor.measured", measured)
+    with pytest.raises(SystemExit) as e:
+        cli("run", "toy.toml", "--out", "d")
+
+    assert e.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is before

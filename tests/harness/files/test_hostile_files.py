@@ -1,0 +1,562 @@
+"""Data files that somebody wrote to do harm: refused in one line, at little cost."""
+
+import io
+import json
+import os
+import resource
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.io import savemat
+from scipy.sparse import csc_array, csc_matrix
+
+from harness import QP, InputError, no_rows
+from harness.files.datafile import VARIABLE
+from harness.files.parquetfile import save_parquet
+from harness.files.qpfile import load_qp, save_qp
+from harness.recipe import Recipe
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from problems import PROBLEMS
+from problems.fem.gmsh_mesh import read_msh
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support.damaged_files import MSH_41, QPS, fuzz, msh_22, tiny_qp
+
+ADDRESS_SPACE = 2**29  #: bytes that refusing may take at most
+
+
+def build(path):
+    """Read a file as cases do."""
+    family = PROBLEMS["file"]
+    return family.build("qp", family.complete({"path": str(path)}), None)
+
+
+@pytest.fixture
+def cheaply():
+    """Have the kernel refuse memory beyond `ADDRESS_SPACE` to this process."""
+    _, hard = before = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + ADDRESS_SPACE, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.fixture
+def command(capsys):
+    """Run the command line; return exit code, stdout and stderr."""
+    bench = Registries(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=lambda out, formats, factor=10: [], plot=None, vtu=None, series=None,
+        paper=None,
+    )  # fmt: skip
+
+    def run(*arguments):
+        return main(bench, [str(a) for a in arguments]), *capsys.readouterr()
+
+    return run
+
+
+# code from data
+
+
+def hostile(path, maker):
+    """Write a QP whose P says to be an operator that `maker` puts together."""
+    arrays = ["/bin/touch", str(path.parent / "SENTINEL")]
+    operators = {maker: lambda arrays: lambda x: x}
+    P = Recipe(2, maker, {"args": np.array(arrays), "d": np.ones(2)}, operators)
+    qp = QP(
+        P=P, q=np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0),
+        lb=np.zeros(2), ub=np.ones(2),
+    )  # fmt: skip
+    save_qp(path, qp, {"name": "hostile"}, recipe=True)
+
+
+MAKERS = ("subprocess:call", "os:system", "builtins:print", "", "diagonal")
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_an_operator_in_a_file_is_refused_and_nothing_runs(tmp_path, command, maker):
+    path = tmp_path / "a.npz"
+    hostile(path, maker)
+    for arguments in (
+        ("solve", f"file:{path}", "--solver", "smalbe"),
+        ("export", f"file:{path}", tmp_path / "out.mat"),
+    ):
+        code, out, err = command(*arguments)
+
+        assert (code, out) == (2, "")
+        assert "P as an operator" in err
+        assert err.count("\n") == 1
+    assert {p.name for p in tmp_path.iterdir()} == {"a.npz"}
+
+
+@pytest.mark.parametrize("maker", MAKERS)
+def test_even_a_file_of_our_own_names_nothing_but_what_is_in_the_table(tmp_path, maker):
+    hostile(tmp_path / "a.npz", maker)
+
+    with pytest.raises(InputError, match=r"P is the operator .*; known: ours"):
+        load_qp(tmp_path / "a.npz", operators={"ours": None})
+
+
+def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
+    """A request without a digest: the file may be anybody's."""
+    hostile(tmp_path / "a.npz", "subprocess:call")
+    program = (
+        "import os, sys; from harness.processes.worker import _Bench; "
+        "qp, out = sys.argv[1:]; "
+        "bench = _Bench(None, {'subprocess:call': os.abort}); "
+        "bench.answer({'qp': qp, 'out': out}, None)"
+    )
+    files = [str(tmp_path / name) for name in ("a.npz", "point.npz")]
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program, *files], capture_output=True, text=True
+    )
+
+    assert "P as an operator" in done.stderr.splitlines()[-1]
+
+
+# what is no regular file
+
+
+@pytest.mark.parametrize("suffix", ["", ".npz", ".mat", ".parquet", ".qps", ".msh"])
+@pytest.mark.parametrize("kind", ["zero", "pipe", "folder", "link to zero"])
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path, kind, suffix):
+    path = tmp_path / f"a{suffix}"
+    match kind:
+        case "pipe":
+            os.mkfifo(path)
+        case "folder":
+            path.mkdir()
+        case "link to zero":
+            path.symlink_to("/dev/zero")
+        case "zero":
+            path = "/dev/zero"
+    read = read_msh if suffix == ".msh" and kind != "zero" else build
+
+    with pytest.raises(InputError, match=r": a (device|folder).*expected"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "name", ["a\0b.npz", "\ud800.npz", "x" * 5000 + ".npz", "\n.npz"]
+)
+def test_odd_names_are_refused_as_input(name):
+    with pytest.raises(InputError):
+        build(name)
+
+
+# more than it holds
+
+
+def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
+    """Write an npz whose q has that many MiB of zeros."""
+    header = io.BytesIO()
+    shape = {"descr": "<f8", "fortran_order": False, "shape": (mib * 2**17,)}
+    np.lib.format.write_array_header_1_0(header, shape)
+    with (
+        zipfile.ZipFile(path, "w", method) as archive,
+        archive.open("q.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(header.getvalue())
+        for _ in range(mib):
+            member.write(bytes(2**20))
+
+
+def mat_element(declared, content):
+    """Write the one variable of a version 5 file, compressed."""
+    text = b"MATLAB 5.0".ljust(124) + struct.pack("<H", 0x100) + b"IM"
+    body = zlib.compress(struct.pack("<II", 14, declared) + content, 9)
+    return text + struct.pack("<II", 15, len(body)) + body
+
+
+def parquet_of_one_value(path, count):
+    """Write lists of one number, again and again: bytes in the file."""
+    table = pa.table({
+        name: pa.array([np.zeros(count)], pa.list_(pa.float64()))
+        for name in ("P", "q", "G", "h", "A", "b", "lb", "ub")
+    })  # fmt: skip
+    pq.write_table(table, path, compression="zstd", use_dictionary=True)
+
+
+def declared(name, values):
+    """Replace the part of a tiny QP's npz by other arrays; `None` leaves it out."""
+
+    def write(path):
+        save_qp(path, tiny_qp(), {})
+        with np.load(path) as stored:
+            arrays = dict(stored)
+        for key, value in values.items():
+            arrays[key] = value
+        np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+
+    return pytest.param(write, name, id=name)
+
+
+def header_only(text):
+    """Write an npz whose q has a header of that text, and eight bytes."""
+    head = text.encode().ljust(117) + b"\n"
+    member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(8)
+
+    def write(path):
+        save_qp(path, tiny_qp(), {})
+        with zipfile.ZipFile(path) as archive:
+            members = {n: archive.read(n) for n in archive.namelist()}
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in {**members, "q.npy": member}.items():
+                archive.writestr(name, content)
+
+    return write
+
+
+def header(shape="(1,)", descr="'<f8'"):
+    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}"
+
+
+def pickled(path):
+    np.savez(path, q=np.array([object], dtype=object), allow_pickle=True)
+
+
+def encrypted(path):
+    save_qp(path, tiny_qp(), {})
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 8] |= 1  # the flag in the central directory
+    path.write_bytes(data)
+
+
+def unknown_method(path):
+    save_qp(path, tiny_qp(), {})
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x01\x02") + 10] = 97
+    path.write_bytes(data)
+
+
+def twice(path):
+    save_qp(path, tiny_qp(), {})
+    with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(path, "a") as z:
+        z.writestr("q.npy", z.read("q.npy"))
+
+
+N = 10**9
+HOSTILE_NPZ = [
+    (encrypted, "not an npz file"),
+    (unknown_method, "not an npz file"),
+    (twice, "not an npz file"),
+    (pickled, "not an npz file"),
+    (header_only(header(f"({N}, {N})")), "not an npz file"),
+    (header_only(header("(-1,)")), "not an npz file"),
+    (header_only(header("(2,)")), "not an npz file"),
+    (header_only(header(descr="'|O'")), "not an npz file"),
+    (header_only(header(descr="[('a', '<f4'), ('b', '<f4')]")), "not an npz file"),
+    (header_only("(" * 110), "not an npz file"),
+    (header_only("x" * 60000), "not an npz file"),
+]
+
+
+def test_an_archive_that_expands_is_refused_before_it_is_read(
+    tmp_path, monkeypatch, cheaply
+):
+    zeros(tmp_path / "a.npz", 16)
+    assert (tmp_path / "a.npz").stat().st_size < 2**16
+    monkeypatch.setenv(VARIABLE, "8")
+
+    with pytest.raises(InputError, match=r"would take 16 MiB.*at most 8"):
+        build(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(("write", "message"), HOSTILE_NPZ)
+def test_a_hostile_archive_is_refused_before_it_is_read(
+    tmp_path, cheaply, write, message
+):
+    write(tmp_path / "a.npz")
+
+    with pytest.raises(InputError, match=message) as caught:
+        build(tmp_path / "a.npz")
+    assert "\n" not in str(caught.value)
+
+
+def text(value):
+    return np.array(json.dumps(value) if not isinstance(value, str) else value)
+
+
+ONE = (
+    ("data", np.ones(1)), ("indices", np.zeros(1, int)), ("indptr", np.array([0, 1])),
+    ("shape", np.array([1, 1])),
+)  # fmt: skip
+ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        declared("P is not symmetric", {"P_data": np.ones(7),
+            "P_indices": np.array([0, 1, 2, 3, 4, 5, 0]),
+            "P_indptr": np.array([0, 1, 2, 3, 4, 5, 7])}),
+        declared("P_data holds NaN or inf", {"P_data": np.full(3, np.nan)}),
+        declared("A is no matrix", {"A_indices": np.array([N])}),
+        declared("A is no matrix", {"A_indices": np.array([-1])}),
+        declared("A is no matrix", {"A_shape": np.array([-1, 6])}),
+        declared("A is no matrix", {"A_shape": np.array([1, N])}),
+        declared("QP.A has shape", {"A_shape": np.array([2**40, 6])}),
+        declared("A is no matrix", {"A_indptr": np.zeros((7, 2), dtype=int)}),
+        declared("indptr decreases", {
+            "A_indptr": np.array([0, 1, -2**31, -1, 1, 1, 1], dtype=np.int32)}),
+        declared("must hold integers", {"A_indices": np.array([0.5])}),
+        declared("q is of type", {"q": np.array(["1"] * 6)}),
+        declared("q is of type", {"q": np.ones(6, dtype=complex)}),
+        declared("QP.q holds NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
+        declared("bounds hold NaN", {"lb": np.full(6, np.nan)}),
+        declared("QP.h has shape", {"h": np.ones((2, 1))}),
+        declared("meta is no text", {"meta": np.array([1, 2])}),
+        declared("meta is no JSON object", {"meta": text([])}),
+        declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
+        declared("constant are no finite", {"meta": text({"scale": 10**400})}),
+        declared("constant are no finite", {"meta": text('{"scale": NaN}')}),
+        declared("constant are no finite", {"meta": text({"scale": True})}),
+        declared("Exceeds the limit", {"meta": text('{"scale": 1' + "0" * 5000 + "}")}),
+        declared("dense is no list", {"meta": text({"dense": 3})}),
+        declared("dense is no list", {"meta": text({"dense": [["P"]]})}),
+        declared("A, dense and 1099511627776 × 6, would take", {
+            "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
+        declared("do not fit each other", {"fixed": np.array([9]), **ONE_BY_ONE}),
+    ],
+)  # fmt: skip
+def test_numbers_that_make_no_qp_are_named(tmp_path, cheaply, write, message):
+    write(tmp_path / "a.npz")
+
+    with pytest.raises(InputError, match=message) as caught:
+        build(tmp_path / "a.npz")
+    assert len(str(caught.value)) < 500
+
+
+UNSYMMETRIC = np.array([[1.0, 0.5], [0.0, 1.0]])
+TWO = {
+    "q": np.ones(2), "G": csc_matrix((0, 2)), "h": np.zeros(0), "A": csc_matrix((0, 2)),
+    "b": np.zeros(0), "lb": np.zeros(2), "ub": np.ones(2),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
+@pytest.mark.parametrize("dense", [True, False])
+def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, dense):
+    """The example of the message: P[0, 1] and P[1, 0] differ by a half."""
+    path = tmp_path / f"a.{suffix}"
+    P = UNSYMMETRIC if dense else csc_array(UNSYMMETRIC)
+    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=P)
+    if suffix == "npz":
+        save_qp(path, qp, {})
+    elif suffix == "parquet":
+        save_parquet(path, qp, {})
+    else:
+        meta = json.dumps({"dense": ["P"] if dense else []})
+        savemat(path, {**TWO, "P": csc_matrix(UNSYMMETRIC), "meta": meta})
+
+    with pytest.raises(
+        InputError, match=r"P is not symmetric: P\[\d, \d\] and .* differ by 0\.5"
+    ):
+        build(path)
+
+
+def test_entries_in_any_order_are_added_up(tmp_path):
+    """2 = 1.5 + 0.5 on the diagonal, the last row first."""
+    parts = {
+        "P_data": np.array([1.0, 0.5, 1.5, 2.0]), "P_indices": np.array([1, 0, 0, 1]),
+        "P_indptr": np.array([0, 3, 4]), "P_shape": np.array([2, 2]),
+    }  # fmt: skip
+    parts["P_data"][0] = 0.0
+    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=np.eye(2))
+    save_qp(tmp_path / "a.npz", qp, {})
+    with np.load(tmp_path / "a.npz") as stored:
+        np.savez(tmp_path / "b.npz", **{**stored, **parts, "meta": np.array("{}")})
+
+    P = build(tmp_path / "b.npz").qp.P
+    np.testing.assert_array_equal(P.toarray(), 2 * np.eye(2))
+
+
+def test_rounding_does_not_make_p_unsymmetric(tmp_path):
+    P = np.array([[1.0, 1 / 3], [1 / 3 * (1 + 1e-15), 1.0]])
+    qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=P)
+    save_qp(tmp_path / "a.npz", qp, {})
+
+    assert build(tmp_path / "a.npz").qp.q.size == 2
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (mat_element(3 * 2**30, bytes(2**20)), "would take 3072 MiB"),
+        (mat_element(8, bytes(2**26)), "not a .mat file"),
+        (mat_element(2**30, bytes(2**20)), "not a .mat file"),
+        (mat_element(64, bytes(64))[:-7], "not a .mat file"),
+        (mat_element(64, bytes(64))[:150] + b"damaged", "not a .mat file"),
+        (b"\0" * 200, "not a .mat file|P is missing"),
+    ],
+)
+def test_a_hostile_mat_file_is_refused_before_it_is_read(
+    tmp_path, cheaply, data, message
+):
+    (tmp_path / "a.mat").write_bytes(data)
+
+    with pytest.raises(InputError, match=message):
+        build(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"P": np.array([[np.inf]])}, "inf"),
+        ({"q": np.array([[1.0, "a"]], dtype=object)}, "q is no matrix of numbers"),
+        ({"q": np.ones(1) * 1j}, "q is no matrix of numbers"),
+        ({"q": {"a": 1}}, "q is no matrix of numbers"),
+        ({"q": np.ones((1, 1, 2))}, "q has 3 dimensions"),
+        ({"l": csc_matrix((2**31 - 1, 1))}, "would take 1638. MiB|would take"),
+        ({"lb": np.array([np.nan]), "ub": np.ones(1), "h": 0, "G": 0}, "NaN|missing"),
+    ],
+)
+def test_a_mat_file_of_odd_numbers_is_named(tmp_path, cheaply, changes, message):
+    maros = {"P": 1.0, "q": 1.0, "A": np.eye(1), "l": 0.0, "u": 1.0}
+    savemat(tmp_path / "a.mat", maros | changes)
+
+    with pytest.raises(InputError, match=message):
+        build(tmp_path / "a.mat")
+
+
+def test_a_parquet_file_that_expands_is_refused_before_it_is_read(
+    tmp_path, monkeypatch
+):
+    parquet_of_one_value(tmp_path / "a.parquet", 2**20)
+    assert (tmp_path / "a.parquet").stat().st_size < 2**16
+    monkeypatch.setenv(VARIABLE, "32")
+
+    with pytest.raises(
+        InputError, match="would take 64 MiB of memory; expected at most"
+    ):
+        build(tmp_path / "a.parquet")
+
+
+def test_the_limit_can_be_raised_and_is_checked(tmp_path, monkeypatch):
+    zeros(tmp_path / "a.npz", 3)
+    monkeypatch.setenv(VARIABLE, "2")
+    with pytest.raises(InputError, match=f"set {VARIABLE} to allow more"):
+        build(tmp_path / "a.npz")
+    monkeypatch.setenv(VARIABLE, "4")
+    with pytest.raises(InputError, match="missing"):  # all the other arrays
+        build(tmp_path / "a.npz")
+    for odd in ("0", "-1", "many", "1e400"):
+        monkeypatch.setenv(VARIABLE, odd)
+        with pytest.raises(InputError, match=f"{VARIABLE} = .*positive number of MiB"):
+            build(tmp_path / "a.npz")
+
+
+def test_a_file_above_the_limit_is_not_even_digested(tmp_path):
+    with (tmp_path / "a.qps").open("wb") as file:
+        file.truncate(2**40)  # holes
+
+    with pytest.raises(InputError, match="the file would take 1048576 MiB"):
+        build(tmp_path / "a.qps")
+
+
+# QPS
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"1.5", b"1_5", "'1_5' is no number"),
+        (b"1.5", b"1e400", "'1e400' exceeds"),
+        (b"1.5", b"inf", "'inf' is no finite number"),
+        (b"1.5", b"nan", "'nan' is no number"),
+        (b"1.5", "\u0661".encode(), "is no number"),
+        (b"-3.0", b"inf", "constant of the objective is infinite"),
+        (b"2.5", b"-1e999", "'-1e999' exceeds"),
+        (b" UP BND", b" UP" * 10**5 + b" BND", "line 18"),
+        (b"QUADOBJ", b"Q" * 10**6, "line 20: unknown section 'QQQ"),
+        (b" N  COST", b"", "not among ROWS|no row of type N"),
+    ],
+)
+def test_a_hostile_qps_text_is_refused_with_its_line(tmp_path, old, new, message):
+    (tmp_path / "a.qps").write_bytes(QPS.replace(old, new, 1))
+
+    with pytest.raises(InputError, match=message) as caught:
+        build(tmp_path / "a.qps")
+    assert len(str(caught.value)) < 700
+
+
+def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path):
+    rows = "".join(f" G R{i}\n" for i in range(20000))
+    sections = "QSECTION\n" * 20000
+    (tmp_path / "a.qps").write_text(f"ROWS\n{rows}{sections}")
+
+    with pytest.raises(InputError, match="no ENDATA"):
+        build(tmp_path / "a.qps")
+
+
+# gmsh
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"$Nodes\n6", b"$Nodes\n999999999999", "not a .msh|would take"),
+        (b"6 2 1 0", b"2000000000 2 1 0", "not a .msh|would take"),
+        (b"2 5 4", b"2 5 77", "not a .msh|not in the file"),
+        (b"1 2 5 4", b"1 2 5 0", "nodes below 1"),
+        (b"1 2 5 4", b"1 2 5 -1", "nodes below 1"),
+        (b"6 2 1 0", b"6 inf 1 0", "coordinates beyond"),
+        (b"6 2 1 0", b"6 1e308 1 0", "coordinates beyond"),
+        (b"6 2 1 0", b"6 nan 1 0", "coordinates beyond"),
+        (b"6 2 1 0", b"6 1 1 0", "not convex"),
+        (b"2 3 6 5", b"2 6 3 5", "not convex"),
+        (b"2 3 6 5", b"2 2 2 2", "not convex"),
+        (b"$Elements\n3", b"$Elements\n999999999999", "not a .msh"),
+        (b"3 3 2 2 1", b"3 3 0", "not a .msh|not every cell"),
+        (b"$EndNodes", b"", "no named surface"),
+        (b"2.2 0 8", b"2.2 1 8", "not a .msh"),
+        (b"2.2 0 8", b"\xff", "not a .msh"),
+    ],
+)
+def test_a_hostile_mesh_is_refused(tmp_path, cheaply, old, new, message):
+    (tmp_path / "a.msh").write_bytes(msh_22().replace(old, new, 1))
+
+    with pytest.raises(InputError, match=message):
+        read_msh(tmp_path / "a.msh")
+
+
+@pytest.mark.parametrize("node", [b"0", b"-3"])
+def test_nodes_below_one_are_refused_in_format_4_too(tmp_path, node):
+    (tmp_path / "a.msh").write_bytes(MSH_41.replace(b"2 1 2 5 4", b"2 1 2 5 " + node))
+
+    with pytest.raises(InputError, match=r"nodes below 1|not a \.msh"):
+        read_msh(tmp_path / "a.msh")
+
+
+def test_the_mesh_that_these_are_made_of_is_read(tmp_path):
+    (tmp_path / "a.msh").write_bytes(msh_22())
+
+    assert len(read_msh(tmp_path / "a.msh").cells) == 2
+
+
+# damaged at random
+
+KINDS = ("npz", "mat", "qps", "msh", "parquet")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
+    fuzz(kind, 2 if kind == "parquet" else 30, 11, tmp_path, seconds=120)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_a_thousand_damaged_files_none_raises_or_hangs(tmp_path, kind):
+    survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
+
+    assert 0 < survived < 500  # or the damage is none, or all there is

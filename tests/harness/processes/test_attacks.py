@@ -1,0 +1,503 @@
+"""Solvers that attack the run: what it makes of them, and that neighbours are safe."""
+
+import itertools
+import os
+import re
+import secrets
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from harness import Solution, Status, Verdict
+from harness.errors import FaultError
+from harness.files.qpfile import save_qp
+from harness.names import CaseName
+from harness.processes import supervisor
+from harness.processes.measurement import _believed, measured, scratch_folder
+from harness.processes.protocol import ForeignReplyError, checked_answer, event_of
+from harness.processes.reaper import lives
+from harness.processes.supervisor import REPLACED, Clock, Reply, WorkerProcess
+from harness.registry import SolverSpec, load_plugin, resolve
+from harness.results.journal import read_journal
+from harness.results.work_unit import Commands
+from harness.running.run import run
+from harness.suite.suite import Suite
+from harness.verify.measure import SAMPLE_SECONDS
+from harness.verify.optimum import proves
+from harness.verify.verdicts import new_record
+from solvers.reference.solve import reference_solution
+from tests.support import ATTACKERS
+
+PLUGIN = ATTACKERS
+START = [sys.executable, "-P", str(PLUGIN)]
+ATTACKERS = load_plugin(PLUGIN)
+TINY = ATTACKERS.problems["tiny"]
+CASE = CaseName(family="tiny", params=dict(TINY.defaults), form="plain")
+
+FOREIGN = "came, expected 'timed'"
+SUSPECT = "is kept between measurements"
+OURS = "the time is ours"
+#: verdict, what the message says; None where an own fault is reported
+OUTCOMES = {
+    "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
+    "writeshalfaline": (Verdict.FAILED, "expected a reply"),
+    "writesdone": (Verdict.FAILED, FOREIGN),
+    "writesatimed": (Verdict.FAILED, "an answer to another request"),
+    "writesnesting": (Verdict.FAILED, r"'\[\[\[.*…"),
+    "writesahugenumber": (Verdict.FAILED, "999.*…"),
+    "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
+    "forges": (Verdict.FAILED, "its point came back as no file"),
+    "negativecounts": (Verdict.FAILED, "iterations = -5, expected 0 to"),
+    "hugecounts": (Verdict.FAILED, "far out of range"),
+    "text": (Verdict.FAILED, "x has dtype <U1, expected real numbers"),
+    "complex": (Verdict.FAILED, "x has dtype complex128, expected real numbers"),
+    "objects": (Verdict.FAILED, "x has dtype object, expected real numbers"),
+    "bombs": (Verdict.FAILED, "malformed Solution: .it cannot be shown"),
+    "leavesafifo": (Verdict.FAILED, "its point came back as a FIFO"),
+    "leavesalink": (Verdict.FAILED, "its point came back as a symbolic link"),
+    "leavesafolder": (Verdict.FAILED, "its point came back as a folder"),
+    "leavesgigabytes": (Verdict.FAILED, "its point came back as 8589934592 bytes"),
+    "leavesanotherpoint": (Verdict.FAILED, r"Solution.x has shape \(3,\)"),
+    "leavestext": (Verdict.FAILED, "its point came back as no point: x has dtype <U1"),
+    "faults": (None, "TypeError"),
+    "daemon": (Verdict.VERIFIED, "^$"),
+    "executeddaemon": (Verdict.VERIFIED, "^$"),
+    "forkbomb": (Verdict.VERIFIED, "^$"),
+    "hangswithadaemon": (Verdict.TIME_LIMIT, "killed after 1 s"),
+    "burns": (Verdict.VERIFIED, REPLACED),
+    "pools": (Verdict.VERIFIED, "^$"),
+    "hoardsinmemfd": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
+    "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
+    "sharespages": (Verdict.VERIFIED, "^$"),
+    "hoardsinadaemon": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
+    "patchestheclock": (Verdict.VERIFIED, OURS),
+    "sleepsbehindtheclock": (Verdict.VERIFIED, OURS),
+    "killsitsreaper": (Verdict.CRASHED, "^SIGKILL$"),
+    "stopsitself": (Verdict.TIME_LIMIT, "killed after 1 s"),
+    "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
+    "closesall": (Verdict.CRASHED, "Bad file descriptor"),
+    "blockssignals": (Verdict.TIME_LIMIT, "killed after 1 s"),
+}
+#: each kind once; the others are slow tests
+QUICK = {
+    "writesnoise", "writesendlessly", "forges", "text", "complex",
+    "bombs", "leavesafifo", "leavesafolder", "leavesgigabytes", "faults", "daemon",
+    "forkbomb", "burns", "hoardsinshm", "hoardsinadaemon", "sleepsbehindtheclock",
+    "killsitsreaper", "closesall", "sharespages",
+}  # fmt: skip
+ANSWER = dict(
+    claimed="solved", message="", iterations=1, counts={"products": 3},
+    reported={"linear_solver": "ldl", "seconds": 0.1, "none": None},
+    prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6, first_seconds=None,
+    peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None, inner=1,
+    canary_seconds=1e-6,
+)  # fmt: skip
+RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "leavesafifo", "patchestheclock")
+
+
+@pytest.fixture
+def attacked(monkeypatch):
+    """Name this test to the processes that it starts."""
+    name = secrets.token_hex(8)
+    monkeypatch.setenv("ATTACKED", name)
+    return name
+
+
+@pytest.fixture(scope="module")
+def beside_a_witness(tmp_path_factory):
+    """Measure a solver beside one that lives on, and looks for what is left."""
+    with pytest.MonkeyPatch.context() as patch:
+        name = secrets.token_hex(8)
+        patch.setenv("ATTACKED", name)
+        bench = Bench(tmp_path_factory.mktemp("attacks"))
+        assert bench("witness").status is Verdict.VERIFIED
+        alone = left(name)
+
+        def measured_beside(attacker, time_limit):
+            patch.setenv("ATTACKED", name)
+            try:
+                record = bench(attacker, time_limit=time_limit)
+                assert len(set(left(name)) - set(alone)) in (0, 2)  # worker, sub-reaper
+                assert bench("witness").status is Verdict.VERIFIED
+                return record
+            finally:
+                bench.workers.pop(attacker).close()
+                assert left(name) == alone
+                assert not list(Path("/dev/shm").glob(f"{name}*"))
+
+        yield measured_beside
+        bench.close()
+    assert left(name) == []
+
+
+def left(attacked):
+    """The processes of a test that live, but for this one."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            environment = (entry / "environ").read_bytes().split(b"\0")
+            mine = f"ATTACKED={attacked}".encode() in environment
+            if mine and int(entry.name) != os.getpid() and lives(int(entry.name)):
+                found.append(int(entry.name))
+    return found
+
+
+def soon(condition):
+    deadline = time.monotonic() + 60
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return condition()
+
+
+class Bench:
+    """Has solvers measured on the tiny QP, each by a worker of its own."""
+
+    def __init__(self, folder, *, memory_limit=400.0):
+        self.folder, self.workers = folder, {}
+        self.qp = TINY.build("plain", TINY.defaults, None).qp
+        self.digest = save_qp(folder / "qp.npz", self.qp, {})
+        self.memory_limit = memory_limit
+
+    def __call__(self, solver, *, command=None, time_limit=30.0):
+        if solver not in self.workers:
+            log = self.folder / f"{solver}.log"
+            self.workers[solver] = WorkerProcess(command or [*START, solver], log)
+        record = new_record(
+            CASE, "tiny/plain", SolverSpec(name=solver, label=solver),
+            options={}, tol=1e-6, repeat=0, environment="",
+        ).but(qp=self.digest)  # fmt: skip
+        request = dict(
+            qp=str(self.folder / "qp.npz"), out=str(self.folder / "point.npz"),
+            sample_seconds=SAMPLE_SECONDS,
+        )  # fmt: skip
+        worker = self.workers[solver]
+        return measured(
+            worker, self.qp, record, request, time_limit=time_limit,
+            memory_limit=self.memory_limit, prove=proves(reference_solution),
+        )[0]  # fmt: skip
+
+    def process(self, solver):
+        return self.workers[solver]._worker
+
+    def close(self):
+        for worker in self.workers.values():
+            worker.close()
+
+
+@pytest.fixture
+def bench(tmp_path, attacked):
+    bench = Bench(tmp_path)
+    yield bench
+    bench.close()
+    assert left(attacked) == []
+
+
+@pytest.mark.parametrize(
+    "attacker",
+    [a if a in QUICK else pytest.param(a, marks=pytest.mark.slow) for a in OUTCOMES],
+)
+def test_an_attack_costs_its_own_verdict_and_nothing_of_it_is_left(
+    beside_a_witness, attacker
+):
+    verdict, message = OUTCOMES[attacker]
+    if verdict is None:
+        with pytest.raises(FaultError, match=message):
+            beside_a_witness(attacker, 30.0)
+        return
+    hangs = verdict is Verdict.TIME_LIMIT
+    record = beside_a_witness(attacker, 1.0 if hangs else 30.0)
+
+    assert record.status is verdict, record.message
+    assert re.search(message, record.message), record.message
+    assert len(record.message) < 500
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"total_seconds": "fast"}, "total_seconds = '\"fast\"'"),
+        ({"iterations": -1}, "iterations = '-1'"),
+        ({"iterations": True}, "iterations = 'true'"),
+        ({"iterations": 10**30}, "iterations = '1000"),
+        ({"counts": {"products": 0.5}}, "counts = "),
+        ({"counts": {f"{i}": i for i in range(2000)}}, "counts = .*…$"),
+        ({"claimed": ["solved"]}, "claimed = "),
+        ({"claimed": "verified"}, "claimed = "),
+        ({"message": "x" * 10_000}, "message = .*…$"),
+        ({"reported": {"a": []}}, "reported = "),
+        ({"peak_mib": -1.0}, "peak_mib = '-1.0'"),
+        ({"inner": 0}, "inner = '0'"),
+        ({"solve_seconds": None}, "some of its times missing"),
+        ({"status": "verified"}, "fields are not ours: status"),
+    ],
+)
+def test_an_answer_of_another_form_is_refused(change, message):
+    checked_answer({"qp": ""}, dict(ANSWER))
+    with pytest.raises(ForeignReplyError, match=message) as e:
+        checked_answer({"qp": ""}, ANSWER | change)
+
+    assert len(str(e.value)) < 300
+
+
+CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
+
+
+@pytest.mark.parametrize(
+    ("prepare", "solve", "first", "inner", "is_believed"),
+    [
+        (0.05, 0.06, None, 1, True),
+        (0.001, 0.001, 0.1, 10, True),
+        (0.15, 0.06, None, 1, False),  # longer than from request to end
+        (0.05, 0.04, None, 1, False),  # shorter than the CPU time
+        (0.001, 0.001, 0.01, 10, False),
+        (-0.05, 0.16, None, 1, False),
+        (-1e-6, -1e-6, None, 1, False),
+    ],
+)
+def test_a_time_is_believed_within_what_the_parent_knows(
+    prepare, solve, first, inner, is_believed
+):
+    seconds = dict(
+        prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
+        first_seconds=first, inner=inner,
+    )  # fmt: skip
+    qp = TINY.build("plain", TINY.defaults, None).qp
+    reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
+    m, *notes = _believed(reply, Solution.without_point(qp, Status.FAILED))
+
+    assert bool(notes) is not is_believed
+    if is_believed:
+        assert m.total_seconds == prepare + solve
+    else:
+        assert m.total_seconds == 0.15 / (inner + (first is not None))
+        assert m.prepare_seconds is m.solve_seconds is None
+
+
+def test_a_total_that_is_not_the_sum_of_its_phases_is_ours():
+    seconds = dict(prepare_seconds=0.01, solve_seconds=0.01, total_seconds=0.15)
+    qp = TINY.build("plain", TINY.defaults, None).qp
+    m, note = _believed(
+        Reply(answer=ANSWER | seconds, clock=CLOCK),
+        Solution.without_point(qp, Status.FAILED),
+    )
+
+    assert OURS in note
+    assert m.total_seconds == CLOCK.seen
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"", b"\xff\xfe\x00", b'"text"', b"[]", b'{"event": []}', b"[" * 100_000,
+        b'{"event": "done", "nonce": "n", "a": NaN}', b"9" * 100_000, b"{" * 1000,
+        b'{"event": "done"}', b'{"event": "done", "nonce": ["n"]}',
+        b'{"event": "start", "nonce": "n"}',
+    ],
+)  # fmt: skip
+def test_a_line_that_is_no_reply_to_the_request_is_refused(line):
+    assert event_of(b'{"event": "done", "nonce": "n"}', "n", "done")
+    with pytest.raises(ForeignReplyError) as e:
+        event_of(line, "n", "done")
+
+    assert len(str(e.value)) < 300
+
+
+def suite(*solvers, repeats=2):
+    return Suite(
+        name="attacked", tolerances=(1e-6,), repeats=repeats, time_limit=10.0,
+        memory_limit=400.0, cases=(CASE,), text='name = "attacked"\n',
+        solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
+    )  # fmt: skip
+
+
+class Silent:
+    def start(self, total):
+        pass
+
+    say = warn = advance = start
+
+
+def attack(out, *solvers):
+    given = suite(*solvers)
+    run(
+        given, families={"tiny": TINY}, out=out, environment={"machine": "test"},
+        commands=Commands(
+            solvers={s: [*START, s] for s in solvers}, generator=[*START, "generator"]
+        ),
+        resolve=lambda spec: resolve(spec, ATTACKERS.solvers), digest="here",
+        progress=Silent(),
+    )  # fmt: skip
+    return {s: [r for r in read_journal(out) if r.solver == s] for s in solvers}
+
+
+def check_neighbours(tmp_path, attacked, attackers):
+    got = attack(tmp_path, "witness", *attackers, "honest")
+
+    for neighbour in ("witness", "honest"):
+        found = [(r.status, r.message) for r in got[neighbour]]
+        assert found == [(Verdict.VERIFIED, "")] * 2
+    for attacker in attackers:
+        assert {r.status for r in got[attacker]} == {OUTCOMES[attacker][0]}
+    assert left(attacked) == []
+
+
+def test_neighbours_of_attackers_keep_their_measurements_and_are_alone(
+    tmp_path, attacked
+):
+    check_neighbours(tmp_path, attacked, RUN_TOGETHER)
+
+
+@pytest.mark.slow
+def test_neighbours_of_all_attackers_together_are_alone(tmp_path, attacked):
+    others = [name for name, (verdict, _) in OUTCOMES.items() if verdict is not None]
+    check_neighbours(tmp_path, attacked, others)
+
+
+def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
+    bench("pools")
+    pool = bench.process("pools")
+    bench("pools")
+    bench("burns")
+
+    assert bench.process("pools") == pool
+    assert bench.process("burns") == 0
+
+
+def test_a_time_that_the_clock_of_the_worker_denies_is_ours(bench):
+    record = bench("patchestheclock")
+
+    assert record.total_seconds >= 0.002
+    assert record.prepare_seconds is record.solve_seconds is None
+
+
+def test_what_is_done_in_declines_is_timed(bench):
+    record = bench("worksindeclines")
+
+    assert record.prepare_seconds >= 0.02
+    assert record.message == ""
+
+
+def test_a_cache_between_measurements_is_reported(bench):
+    first, second = bench("remembers"), bench("remembers")
+
+    assert first.message == ""
+    assert SUSPECT in second.message
+
+
+def test_a_worker_that_is_killed_before_its_solve_is_a_fault(bench):
+    kills = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+    command = [sys.executable, "-c", kills]
+
+    with pytest.raises(FaultError, match="before solving: SIGKILL"):
+        bench("honest", command=command)
+
+
+def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
+    bench, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("KILLED", str(tmp_path / "killed"))
+    record = bench("killedoncewarmingup")
+
+    assert (tmp_path / "killed").exists()
+    assert record.status is Verdict.VERIFIED
+    assert record.threads is not None  # told by the warm-up
+
+
+@pytest.mark.parametrize(("limit", "is_fault"), [(float("inf"), True), (1.0, False)])
+def test_a_kill_for_want_of_memory_is_the_solvers_where_it_held_the_memory(
+    bench, monkeypatch, limit, is_fault
+):
+    counts = itertools.count()
+    monkeypatch.setattr(supervisor, "_oom_kills", lambda: next(counts))
+    monkeypatch.setattr(supervisor.limits, "memory_limit_mib", lambda: limit)
+    if is_fault:
+        with pytest.raises(FaultError, match="SIGKILL: the machine ran out of memory"):
+            bench("killsitself")
+    else:
+        assert bench("killsitself").status is Verdict.MEMORY_LIMIT
+
+
+def test_a_command_that_does_not_exist_is_a_fault(bench):
+    with pytest.raises(FaultError, match="no-such-python cannot be started"):
+        bench("honest", command=["no-such-python"])
+
+
+def test_a_plug_in_that_dies_of_its_import_fails_by_itself(bench):
+    record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
+
+    assert record.status is Verdict.CRASHED
+
+
+def test_a_log_that_cannot_be_written_is_a_fault(bench, tmp_path):
+    (tmp_path / "honest.log").mkdir()
+
+    with pytest.raises(FaultError, match="Is a directory"):
+        bench("honest")
+
+
+def test_a_qp_that_changed_on_disk_is_a_fault(bench):
+    bench("honest")
+    (bench.folder / "qp.npz").write_bytes(b"something else")
+
+    with pytest.raises(FaultError, match="not an npz file"):
+        bench("honest")
+
+
+def test_a_full_disk_is_a_fault_and_no_crash(bench):
+    limit = (
+        "import resource, signal, runpy, sys\n"
+        "import harness.processes.worker as w\n"
+        "def full(*_): raise OSError(28, 'No space left on device')\n"
+        "w._write_new = full\n"
+        f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"
+        "import attackers\n"
+        "w.serve(attackers.SOLVERS['honest'], *map(int, sys.argv[1:]))\n"
+    )
+
+    with pytest.raises(FaultError, match="No space left on device"):
+        bench("honest", command=[sys.executable, "-c", limit])
+
+
+def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
+    bench("honest")
+    os.kill(bench.process("honest"), signal.SIGKILL)
+
+    assert bench("honest").status is Verdict.VERIFIED
+
+
+RUNS = f"""
+import sys
+from pathlib import Path
+sys.path.insert(0, {str(PLUGIN.parent)!r})
+from tests.harness.processes.test_attacks import Bench
+Bench(Path(sys.argv[1]))("hangswithadaemon", time_limit=3600)
+"""
+
+
+def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, attacked):
+    parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)])
+    try:
+        # run, sub-reaper, worker, daemon
+        assert soon(lambda: len(left(attacked)) == 4)
+    finally:
+        parent.kill()
+        parent.wait()
+
+    assert soon(lambda: left(attacked) == [])
+
+
+def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    stale = tmp_path / "mortarbench-scratch-1"
+    stale.mkdir()
+    (stale / "in-use").touch()
+    with scratch_folder() as used, scratch_folder():
+        assert sorted(tmp_path.iterdir()).count(used) == 1
+        assert not stale.exists()
+
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,279 @@
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from select import select
+
+import pytest
+
+from harness import Verdict
+from harness.files.qpfile import save_qp
+from harness.processes import supervisor
+from harness.processes.reaper import descendants
+from harness.processes.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
+from harness.registry import load_plugin
+from tests.support import ADVERSARIES
+
+PLUGIN = ADVERSARIES
+
+#: a worker that tells how it was started instead of measuring
+SHOWS = """
+import json, os, sys
+requests, replies = map(int, sys.argv[1:])
+nonce = ""
+def reply(**event):
+    os.write(replies, (json.dumps(event | {"nonce": nonce}) + "\\n").encode())
+reply(event="ready")
+for line in os.fdopen(requests):
+    nonce = json.loads(line)["nonce"]
+    if "warm_up" in line:
+        reply(event="warm")
+        continue
+    reply(event="start")
+    reply(
+        event="done",
+        pid=os.getpid(),
+        cpus=list(os.sched_getaffinity(0)),
+        threads=os.environ["OPENBLAS_NUM_THREADS"],
+    )
+"""
+#: a parent that asks one worker
+ASKS = """
+import json, sys
+from pathlib import Path
+from harness.processes.supervisor import WorkerProcess
+command, request, log = map(json.loads, sys.argv[1:])
+WorkerProcess(command, Path(log)).ask(request, time_limit=60, memory_limit=2000)
+"""
+
+
+def command(solver):
+    return [sys.executable, "-P", str(PLUGIN), solver]
+
+
+def running(process):
+    """Whether a process exists and is no zombie."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except FileNotFoundError:
+        return False
+    return "State:\tZ" not in status
+
+
+def ignores_sigterm(process):
+    status = Path(f"/proc/{process}/status").read_text()
+    mask = next(line for line in status.splitlines() if line.startswith("SigIgn:"))
+    return bool(int(mask.split()[1], 16) & 1 << (signal.SIGTERM - 1))
+
+
+def soon(condition):
+    deadline = time.monotonic() + 20
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return condition()
+
+
+@pytest.fixture
+def ask(tmp_path):
+    """Start workers on demand and ask them to solve the tiny QP."""
+    tiny = load_plugin(PLUGIN).problems["tiny"]
+    qp = tmp_path / "qp.npz"
+    save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})
+    request = {"qp": str(qp), "tol": 1e-6, "out": str(tmp_path / "point.npz")}
+    workers = {}
+
+    def ask(solver, *, start=None, time_limit=30.0, memory_limit=2000.0):
+        if solver not in workers:
+            log = tmp_path / f"{solver}.log"
+            workers[solver] = WorkerProcess(start or command(solver), log)
+        return workers[solver].ask(
+            request, time_limit=time_limit, memory_limit=memory_limit
+        )
+
+    yield ask
+    for worker in workers.values():
+        worker.close()
+
+
+def test_one_process_serves_every_measurement_on_one_cpu_with_one_thread(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    worker = WorkerProcess([sys.executable, "-c", SHOWS], tmp_path / "log")
+    limits = {"time_limit": 30.0, "memory_limit": 2000.0}
+    first, second = (worker.ask({}, **limits).answer for _ in range(2))
+    worker.close()
+
+    assert first["pid"] == second["pid"]
+    assert first["cpus"] == [max(os.sched_getaffinity(0))]
+    assert first["threads"] == "1"
+    assert not running(first["pid"])
+
+
+def test_a_worker_that_dies_is_replaced_and_its_last_words_are_kept(ask):
+    first, second = ask("dies"), ask("dies")
+
+    assert (first.verdict, first.message) == (
+        Verdict.CRASHED, "exit code 7: my last words",
+    )  # fmt: skip
+    assert (second.verdict, second.message) == (first.verdict, first.message)
+
+
+def test_a_death_between_measurements_is_not_blamed_on_the_next_one(ask):
+    first = ask("dieslater")
+    assert soon(lambda: not running(first.answer["counts"]["process"]))
+
+    assert ask("dieslater").answer["claimed"] == "solved"
+
+
+def test_a_signal_is_called_by_its_name(ask):
+    reply = ask("segfaults")
+
+    assert (reply.verdict, reply.message) == (Verdict.CRASHED, "SIGSEGV")
+
+
+def test_a_solver_that_hangs_and_ignores_sigterm_is_killed_at_the_time_limit(ask):
+    reply = ask("hangs", time_limit=0.3)
+
+    assert (reply.verdict, reply.message) == (
+        Verdict.TIME_LIMIT, "killed after 0.3 s",
+    )  # fmt: skip
+
+
+def test_a_solver_that_hangs_in_the_warm_up_is_killed_at_the_time_limit(
+    ask, monkeypatch
+):
+    monkeypatch.setattr(supervisor, "WARM_UP_SECONDS", 0.2)
+
+    assert ask("alwayshangs", time_limit=0.2).verdict is Verdict.TIME_LIMIT
+
+
+def test_a_solver_that_crashes_in_the_warm_up_crashes_in_its_measurement(ask):
+    reply = ask("alwayssegfaults")
+
+    assert (reply.verdict, reply.message) == (Verdict.CRASHED, "SIGSEGV")
+
+
+def test_memory_is_limited_and_the_peak_is_told(ask):
+    reply = ask("leaks", memory_limit=400.0)
+
+    assert reply.verdict is Verdict.MEMORY_LIMIT
+    assert reply.peak_mib > 400
+    assert "above the limit of 400 MiB" in reply.message
+
+
+def test_what_a_solver_prints_is_dropped_before_it_fills_the_disk(ask, tmp_path):
+    reply = ask("prints")
+
+    assert reply.answer["claimed"] == "solved"
+    assert (tmp_path / "prints.log").stat().st_size <= LOG_BYTES
+
+
+def test_children_of_a_solver_end_with_its_measurement(ask):
+    child = ask("forks").answer["counts"]["child"]
+
+    assert soon(lambda: not running(child))
+    assert ask("forks").answer["claimed"] == "solved"
+
+
+def test_of_a_solver_that_returns_twice_only_the_worker_itself_answers(ask):
+    answers = [ask("returnstwice").answer for _ in range(2)]
+
+    assert [a["counts"]["above"] for a in answers] == [os.getpid()] * 2
+
+
+def test_a_qp_that_a_solver_spoilt_is_whole_in_the_next_measurement(ask, tmp_path):
+    answers = []
+    for _ in range(2):
+        ask("mutatesbyforce")
+        answers.append((tmp_path / "point.npz").read_bytes())
+
+    assert answers[0] == answers[1]
+
+
+def test_a_worker_that_cannot_start_says_why(ask):
+    start = [sys.executable, "-c", "raise SystemExit('no such plug-in')"]
+    reply = ask("absent", start=start)
+
+    assert reply.verdict is Verdict.CRASHED
+    assert reply.message == "before solving: exit code 1: no such plug-in"
+
+
+def test_a_worker_that_never_gets_ready_is_no_time_limit_of_the_solver(
+    ask, monkeypatch
+):
+    monkeypatch.setattr(supervisor, "START_SECONDS", 0.2)
+    start = [sys.executable, "-c", "import time; time.sleep(3600)"]
+    reply = ask("slow", start=start)
+
+    assert reply.verdict is Verdict.FAILED
+    assert reply.message == "before solving: killed after 0.2 s"
+
+
+def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
+    tiny = load_plugin(PLUGIN).problems["tiny"]
+    save_qp(tmp_path / "qp.npz", tiny.build("plain", tiny.defaults, None).qp, {})
+    request = {"qp": str(tmp_path / "qp.npz"), "tol": 1e-6, "out": "unused"}
+    arguments = [command("hangs"), request, str(tmp_path / "log")]
+    parent = os.spawnv(
+        os.P_NOWAIT,
+        sys.executable,
+        [sys.executable, "-P", "-c", ASKS, *map(json.dumps, arguments)],
+    )
+    assert soon(lambda: len(descendants(parent)) == 2)  # the sub-reaper, the worker
+    worker = descendants(parent)[1]
+    assert soon(lambda: ignores_sigterm(worker))
+    os.kill(parent, signal.SIGKILL)
+    os.waitpid(parent, 0)
+
+    assert soon(lambda: not running(worker))
+
+
+@pytest.mark.parametrize(
+    ("message", "peak", "expected"),
+    [
+        ("SIGSEGV", 95.0, True),
+        ("SIGSEGV", 50.0, False),
+        ("SIGSEGV", None, False),
+        ("MemoryError: Unable to allocate 8.00 TiB for an array", 1.0, True),
+        ("SIGABRT: terminate called: std::bad_alloc", 1.0, True),
+        ("SIGABRT: memory allocation of 64 bytes failed", 1.0, True),
+        ("ScsWork allocation error", 1.0, True),
+        ("numerical difficulties", 1.0, False),
+        ("step size could not be allocated a sign", 1.0, False),
+    ],
+)
+def test_want_of_memory_is_told_from_the_peak_and_from_the_words(
+    message, peak, expected
+):
+    assert out_of_memory(message, peak, 100.0) is expected
+
+
+def test_replies_that_come_together_are_not_waited_for(tmp_path, monkeypatch):
+    both = SHOWS.replace('    reply(event="start")\n', "").replace(
+        "    reply(\n        event=\"done\",",
+        '    both = ""\n'
+        '    for event in ("start", "done"):\n'
+        '        both += json.dumps({"event": event, "nonce": nonce}) + "\\n"\n'
+        "    os.write(replies, both.encode())\n"
+        '    dict(',
+    )  # fmt: skip
+    worker = WorkerProcess([sys.executable, "-c", both], tmp_path / "log")
+    limits = dict(time_limit=60, memory_limit=2000)
+    waited = []
+
+    def watched(*args):
+        found = select(*args)
+        waited.append(found[0] == [])
+        return found
+
+    try:
+        assert worker.ask({}, **limits).answer == {}
+        monkeypatch.setattr(supervisor, "POLL_SECONDS", 5.0)
+        monkeypatch.setattr(supervisor, "select", watched)
+        assert worker.ask({}, **limits).answer == {}
+    finally:
+        worker.close()
+    assert waited == [False]

@@ -1,0 +1,231 @@
+"""Result folders that somebody sent: they run nothing, and lead nowhere else."""
+
+import os
+
+import numpy as np
+import pytest
+
+from harness import InputError, Record, Verdict
+from harness.files.store import load_fields, load_history, load_solution, save
+from harness.results.folder import environment_of
+from harness.results.journal import Journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from problems import PROBLEMS
+from reports import write_report
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.harness.files.test_hostile_files import hostile
+
+SUITE = 'name = "s"\nsolvers = ["clarabel"]\n[[problems]]\nfamily = "file"\n'
+FIELDS = {
+    "points": np.zeros((4, 2)), "cells": np.array([[0, 1, 2, 3]]),
+    "bodies": np.zeros(1, dtype=int), "displacement": np.zeros((4, 2)),
+}  # fmt: skip
+
+
+def record(path, **changes):
+    """A verified measurement of a QP from a file."""
+    given = dict(
+        run_id="a1", case=f"file:{path}", family="file", params={"path": str(path)},
+        form="qp", sizes={"variables": 2}, solver="clarabel", options={}, tol=1e-6,
+        repeat=0, block=0, status=Verdict.VERIFIED, claimed="solved", primal=0.0,
+        dual=0.0, gap=0.0, complementarity=0.0, total_seconds=1e-3, environment="e1",
+    )  # fmt: skip
+    return Record(**given | changes)
+
+
+@pytest.fixture
+def sent(tmp_path):
+    """Write a result folder of some records."""
+
+    def write(*records):
+        folder = tmp_path / "sent"
+        folder.mkdir()
+        with Journal(folder, "e1") as journal:
+            for each in records:
+                journal.append(each)
+        (folder / "suite.toml").write_text(f'{SUITE}params = {{ path = ["a.npz"] }}\n')
+        (folder / "environment.json").write_text('{"digest": "e1"}')
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def command(capsys, monkeypatch, tmp_path):
+    """Run the command line; return exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+    bench = Registries(
+        families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
+        report=write_report, plot=None, vtu=None, series=None, paper=None,
+    )  # fmt: skip
+
+    def run(*arguments):
+        return main(bench, [str(a) for a in arguments]), *capsys.readouterr()
+
+    return run
+
+
+def everything(folder):
+    """Names and content of all that lies in a folder, links as they are."""
+    return {
+        path.relative_to(folder): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+def one_line(err):
+    return len([line for line in err.splitlines() if line.startswith("mortar")]) == 1
+
+
+# code
+
+
+def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path):
+    path = tmp_path / "a.npz"
+    hostile(path, "subprocess:call")
+    vectors = {"x": np.zeros(2), "y": np.zeros(0), "z": np.zeros(0)}
+    folder = sent(record(path))
+    point = save(folder, vectors | {"z_box": np.zeros(2)})
+    with Journal(folder, "e1") as journal:
+        journal.append(record(path, run_id="b2", vectors=point))
+    environment = '{"digest": "e1", "plugins": {"evil.py": "0"}}'
+    (folder / "environment.json").write_text(environment)
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'SENTINEL')!r}, 'w')")
+    (tmp_path / "evil.py").rename(folder / "evil.py")
+
+    assert command("report", folder, "--format", "md")[0] == 0
+    code, out, err = command("validate", folder)
+    assert code in (0, 1, 2)
+    assert "P as an operator" in out + err
+    code, out, err = command("replay", folder, "b2")
+    assert (code, out) == (2, "")
+    assert "P as an operator" in err
+
+    assert not (tmp_path / "SENTINEL").exists()
+
+
+# paths
+
+
+@pytest.mark.parametrize(
+    "digest",
+    ["../../outside", "/etc/passwd", "a\0b", "", "A" * 16, "\ud800", "x" * 5000],
+)
+def test_what_is_no_digest_leads_nowhere(tmp_path, digest):
+    folder = tmp_path / "a" / "b"
+    save(folder, FIELDS)
+    np.savez(tmp_path / "outside.npz", **FIELDS)
+
+    for load in (load_fields, load_history, lambda f, d: load_solution(f, d, "solved")):
+        with pytest.raises(InputError, match="is no digest"):
+            load(folder, digest)
+
+
+@pytest.mark.parametrize("digest", ["../environment", "/etc/x", "a\0b", "", "x" * 5000])
+def test_an_environment_lies_in_the_folder(tmp_path, digest):
+    (tmp_path / "environment.json").write_text('{"digest": "e1"}')
+
+    with pytest.raises(InputError, match="no environment's digest"):
+        environment_of(tmp_path, digest)
+
+
+def test_stored_fields_with_another_content_are_refused(tmp_path):
+    digest = save(tmp_path, FIELDS)
+    changed = {**FIELDS, "displacement": np.ones((4, 2))}
+    np.savez(tmp_path / "vectors" / f"{digest}.npz", **changed)
+
+    with pytest.raises(InputError, match="content is not what was stored"):
+        load_fields(tmp_path, digest)
+
+
+def test_commands_on_records_whose_digests_lead_out_read_nothing_there(
+    sent, command, tmp_path
+):
+    np.savez(tmp_path / "outside.npz", **FIELDS)
+    out = "../../outside"
+    folder = sent(record("a.npz", vectors=out, fields=out, environment=out))
+
+    code, _, err = command("report", folder, "--format", "md")
+    assert (code, err) == (0, "")
+    assert "is no digest" in (folder / "report" / "report.md").read_text()
+    for arguments in (("validate", folder), ("replay", folder, "a1")):
+        code, _, err = command(*arguments)
+        assert code == 2
+        assert one_line(err)
+
+
+# links, pipes
+
+
+LINKS = (
+    "journal", "vectors", "cases", "references", "environments", "report", ".scratch",
+    "environment.json", "suite.toml", "validation.json", "validation.tmp", ".lock",
+    "discretisation.json", "report/index.html", "report/report.md", "report/figures",
+    "report/tables/evil", "vectors/evil.npz", "references/evil.npz",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_a_link_in_a_folder_is_refused_and_what_it_leads_to_stays(
+    sent, command, tmp_path, name
+):
+    folder = sent(record("a.npz"))
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").write_text("precious")
+    link = folder / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if link.is_dir():
+        link.rename(tmp_path / "away")
+    link.unlink(missing_ok=True)
+    link.symlink_to(outside / "precious" if "." in name[1:] else outside)
+    suite = tmp_path / "s.toml"
+    suite.write_text(f'{SUITE}params = {{ path = ["a.qps"] }}\n')
+    (tmp_path / "a.qps").write_text("ROWS\n N a\nENDATA\n")
+    before = everything(outside)
+
+    for arguments in (
+        ("report", folder),
+        ("validate", folder),
+        ("replay", folder, "a1"),
+        ("run", suite, "--out", folder, "--fresh"),
+    ):
+        code, _, err = command(*arguments)
+        assert code == 2, arguments
+        assert "is a link, pipe or device" in err or "no journal" in err
+        assert one_line(err)
+    assert everything(outside) == before
+    assert link.is_symlink()
+
+
+@pytest.mark.parametrize(
+    "name", ["journal/e2.jsonl", "suite.toml", "environment.json", "report/index.html"]
+)
+def test_a_pipe_in_a_folder_is_refused_at_once(sent, command, name):
+    folder = sent(record("a.npz"))
+    pipe = folder / name
+    pipe.parent.mkdir(exist_ok=True)
+    pipe.unlink(missing_ok=True)
+    os.mkfifo(pipe)
+
+    for arguments in (
+        ("report", folder),
+        ("validate", folder),
+        ("replay", folder, "a"),
+    ):
+        code, _, err = command(*arguments)
+        assert code == 2
+        assert f"{pipe} is a link, pipe or device" in err
+
+
+def test_links_to_a_whole_folder_and_beside_ours_are_the_user_s_business(
+    sent, command, tmp_path
+):
+    folder = sent(record("a.npz"))
+    (folder / "notes").symlink_to(tmp_path)
+    (tmp_path / "latest").symlink_to(folder)
+
+    assert command("report", tmp_path / "latest", "--format", "md")[0] == 0

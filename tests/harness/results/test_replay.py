@@ -1,0 +1,311 @@
+"""A stored measurement, made again: what must be the same, what must be told."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.files.qpfile import load_qp, save_qp
+from harness.registry import load_plugin
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from tests.support import TOY_PROBLEM
+
+#: one process has the run that all replay
+pytestmark = pytest.mark.xdist_group("replay")
+
+PLUGIN = load_plugin(TOY_PROBLEM)
+SUITE = """
+name = "toy_problem"
+repeats = 2
+time_limit = 30
+solvers = [
+    "exact", "liar", "picky", "dies",
+    { name = "exact", label = "half", options = { factor = 0.5 } },
+]
+[[problems]]
+family = "well"
+forms = ["primal"]
+params = { depth = [1, 2] }
+"""
+
+
+def no_report(folder, formats):
+    return []
+
+
+@pytest.fixture(scope="module")
+def registries():
+    nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
+    return Registries(
+        families=PLUGIN.problems,
+        solvers=PLUGIN.solvers,
+        report=no_report,
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+        **nothing,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(registries, tmp_path_factory):
+    """The folder of a run, which no test may write to."""
+    folder = tmp_path_factory.mktemp("finished")
+    suite = folder / "toy.toml"
+    suite.write_text(SUITE)
+    assert main(registries, ["run", str(suite), "--out", str(folder / "done")]) == 0
+    return folder / "done"
+
+
+@pytest.fixture
+def cli(registries, capsys, monkeypatch, tmp_path):
+    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def cli(*argv, registries=registries):
+        code = main(registries, argv)
+        return code, *capsys.readouterr()
+
+    return cli
+
+
+@pytest.fixture
+def stored(finished, tmp_path):
+    """The records of a run, by solver, depth and repeat, in the folder `done`."""
+    shutil.copytree(finished, tmp_path / "done")
+    records = read_journal(tmp_path / "done")
+    return {(r.solver, r.params["depth"], r.repeat): r for r in records}
+
+
+@pytest.mark.parametrize("solver", ["exact", "liar", "picky", "dies", "half"])
+def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, solver):
+    then = stored[solver, 2, 0]
+    code, out, _ = cli("replay", "done", then.run_id, "--json")
+    told = json.loads(out)
+
+    assert code == 0
+    assert told["reproduced"] is True
+    assert told["now"]["run_id"] == told["then"]["run_id"] == then.run_id
+    assert told["now"]["status"] == then.status
+    assert (told["same_qp"], told["same_options"], told["same_counts"]) == (True,) * 3
+    assert told["environment"] == []
+
+
+def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
+    then = [stored["half", 1, repeat] for repeat in (0, 1)]
+    told = json.loads(cli("replay", "done", then[0].run_id, "--json")[1])
+    ratio, least, greatest = told["ratios"]["solve_seconds"]
+    middle = (then[0].solve_seconds + then[1].solve_seconds) / 2
+
+    assert told["distance"] == 0
+    assert ratio == pytest.approx(told["now"]["solve_seconds"] / middle)
+    assert least + greatest == pytest.approx(2)  # two repeats about their median
+
+
+def test_the_ratio_of_times_says_what_it_is_of(cli, stored):
+    """Not of the time beside it, which is that of one of the stored repeats."""
+    then = stored["half", 1, 0]
+    out = cli("replay", "done", then.run_id)[1]
+    (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]
+    ratio, middle = re.search(r"([\d.]+) of ([\d.e-]+), the median of 2", row).groups()
+    times = [stored["half", 1, repeat].solve_seconds for repeat in (0, 1)]
+    now = float(row.split()[3])
+
+    assert float(middle) == pytest.approx(np.mean(times), rel=5e-3)
+    assert float(ratio) == pytest.approx(now / np.mean(times), rel=1e-2, abs=6e-3)
+
+
+def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):
+    def content():
+        files = (f for f in (tmp_path / "done").rglob("*") if f.is_file())
+        return {f: f.read_bytes() for f in files}
+
+    before = content()
+    cli("replay", "done", stored["exact", 1, 0].run_id)
+
+    assert content() == before
+
+
+def rewrite(record, **changes):
+    """Replace a record in the journal as if it had been measured so."""
+    (journal,) = Path("done/journal").glob("*.jsonl")
+    others = [
+        line
+        for line in journal.read_text().splitlines()
+        if json.loads(line)["run_id"] != record.run_id
+    ]
+    journal.write_text("\n".join([*others, record.but(**changes).to_json()]) + "\n")
+
+
+def test_another_verdict_is_told_and_counts_as_no(cli, stored):
+    then = stored["exact", 1, 0]
+    rewrite(then, status="wrong")
+    code, out, _ = cli("replay", "done", then.run_id)
+
+    assert code == 1
+    assert out.endswith("Not reproduced: wrong then, verified now.\n")
+
+
+def test_another_qp_is_told_and_counts_as_no(cli, stored):
+    then = stored["exact", 1, 0]
+    rewrite(then, qp="0123456789abcdef")
+    code, out, _ = cli("replay", "done", then.run_id)
+
+    assert code == 1
+    assert "another QP" in out
+
+
+def test_a_journal_without_digests_of_qps_is_no_reason_to_complain(cli, stored):
+    then = stored["exact", 1, 0]
+    rewrite(then, qp=None)
+    code, out, _ = cli("replay", "done", then.run_id)
+
+    assert code == 0
+    assert "not recorded" in out
+
+
+SEQUENCE = """
+name = "steps"
+repeats = 1
+null_arm = "exact"
+solvers = ["exact", "liar"]
+[[problems]]
+family = "well"
+forms = ["primal"]
+params = { depth = [1, 2, 3] }
+sequence = "depth"
+"""
+
+
+@pytest.mark.parametrize("solver", ["exact (A/A)", "liar"])
+def test_a_step_of_a_sequence_is_made_again_after_those_before(cli, tmp_path, solver):
+    (tmp_path / "steps.toml").write_text(SEQUENCE)
+    assert cli("run", "steps.toml", "--out", "done")[0] == 0
+    records = [r for r in read_journal(tmp_path / "done") if r.solver == solver]
+    (then,) = [r for r in records if r.params["depth"] == 3]
+    told = json.loads(cli("replay", "done", then.run_id, "--json")[1])
+
+    assert told["reproduced"] is True
+    assert told["now"]["mode"] == "sequence"
+    assert told["now"]["run_id"] == then.run_id
+    assert told["now"]["params"]["depth"] == 3
+
+
+def test_what_differs_in_the_environment_is_named(cli, stored, tmp_path):
+    path = tmp_path / "done" / "environment.json"
+    environment = json.loads(path.read_text())
+    environment["versions"]["numpy"] = "1.2.3"
+    environment["threads"]["pools"][0]["threads"] = 7
+    path.write_text(json.dumps(environment))
+    code, out, _ = cli("replay", "done", stored["exact", 1, 0].run_id)
+    told = [line.split() for line in out.splitlines()]
+
+    assert code == 0
+    assert ["versions.numpy", "1.2.3"] in [words[:2] for words in told]
+    assert any(w[:1] and w[0].startswith("threads.pools.") and "7" in w for w in told)
+    assert "threads.variables" not in out
+
+
+def test_the_first_digits_of_a_run_id_suffice(cli, stored):
+    ids = [r.run_id for r in stored.values()]
+    then = stored["exact", 1, 0].run_id
+    short = next(
+        then[:n] for n in range(1, 13) if sum(i.startswith(then[:n]) for i in ids) == 1
+    )
+
+    assert then in cli("replay", "done", short)[1]
+
+
+def test_a_run_id_that_is_none_is_one_line_with_the_nearest(cli, stored):
+    then = stored["exact", 1, 0].run_id
+    other = "x" + then[1:]
+    code, out, err = cli("replay", "done", other)
+
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert f"'{other}'" in err
+    assert f"the nearest is {then}" in err
+
+
+@pytest.mark.parametrize("run_id", ["", "g"])
+def test_digits_that_name_none_or_many_are_refused(cli, stored, run_id):
+    code, _, err = cli("replay", "done", run_id)
+
+    assert (code, err.count("\n")) == (2, 1)
+
+
+def test_a_folder_without_a_journal_is_one_line(cli):
+    code, _, err = cli("replay", "nowhere", "0123")
+
+    assert (code, err.count("\n")) == (2, 1)
+    assert "nowhere" in err
+
+
+@pytest.mark.parametrize("missing", ["suite.toml", "environment.json"])
+def test_a_capsule_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
+    (tmp_path / "done" / missing).unlink()
+    code, _, err = cli("replay", "done", stored["exact", 1, 0].run_id)
+
+    assert (code, err.count("\n")) == (2, 1)
+    assert "done" in err
+
+
+@pytest.mark.parametrize("lost", [{"solvers": {}}, {"families": {}}])
+def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
+    (tmp_path / "toy.toml").write_text(SUITE)
+    (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
+    little = ("--solver", "exact", "--repeats", "1")
+    cli("run", "toy.toml", "--out", "done", "--plugin", "empty.py", *little)
+    run_id = read_journal(tmp_path / "done")[0].run_id
+    code, _, err = cli("replay", "done", run_id, registries=replace(registries, **lost))
+
+    assert (code, err.count("\n")) == (2, 1)
+    assert "unknown" in err
+    assert "--plugin empty.py" in err
+
+
+def real(*arguments, folder):
+    return subprocess.run(
+        [sys.executable, "-m", "harness", *arguments],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_a_case_whose_file_has_changed_is_refused(planted, tmp_path):
+    qp, _ = planted("box")
+    save_qp(tmp_path / "a.npz", qp, {})
+    (tmp_path / "a.toml").write_text(
+        'name = "a"\nrepeats = 1\nsolvers = ["osqp"]\n'
+        '[[problems]]\nfamily = "file"\nparams = { path = "a.npz" }\n'
+    )
+    done = real("run", "a.toml", "--out", "done", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (record,) = read_journal(tmp_path / "done")
+    same = real("replay", "done", record.run_id, folder=tmp_path)
+    save_qp(tmp_path / "a.npz", replace(qp, q=2 * qp.q), {})
+    changed = real("replay", "done", record.run_id, folder=tmp_path)
+
+    assert (same.returncode, "Reproduced" in same.stdout) == (0, True)
+    assert (changed.returncode, changed.stderr.count("\n")) == (2, 1)
+    assert record.run_id in changed.stderr
+    assert "the file changed" in changed.stderr
+
+
+@pytest.mark.parametrize("shape", ["box", "everything"])
+def test_equal_qps_have_one_digest_and_others_another(planted, tmp_path, shape):
+    qp, _ = planted(shape)
+    file = tmp_path / "a.npz"
+    digest = save_qp(file, qp, {"name": "whatever"})
+    loaded, _ = load_qp(file)
+
+    assert save_qp(file, loaded, {}) == digest  # over the file that it is mapped from
+    assert (loaded.q == qp.q).all()
+    for change in ({"q": 2 * qp.q}, {"P": 2 * qp.P}, {"ub": qp.ub + 1}):
+        assert save_qp(file, replace(qp, **change), {}) != digest

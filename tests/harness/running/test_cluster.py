@@ -1,0 +1,395 @@
+"""Runs on a real Dask scheduler with two worker processes, some of which are lost."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from harness import InputError
+from harness.environment.environment import capture, digest
+from harness.registry import load_plugin
+from harness.results.folder import environment_of
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from tests.support import TOY_PROBLEM
+
+pytest.importorskip("distributed")
+
+PLUGIN = load_plugin(TOY_PROBLEM)
+SOLVERS = 4  #: measurements of a whole block
+SUITE = """
+name = "toy_problem"
+repeats = {repeats}
+time_limit = 30
+solvers = ["exact", "slow", "picky", "dies"]
+[[problems]]
+family = "well"
+params = {{ depth = [1, 2, 3, 4, 5, 6], n = 3 }}
+forms = ["dual"]
+"""
+
+
+def started(*arguments, env):
+    command = [sys.executable, "-m", "dask", *arguments]
+    return subprocess.Popen(
+        command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+class Cluster:
+    """A scheduler, and workers that can be killed."""
+
+    def __init__(self, folder, *options):
+        self.folder = folder
+        self.starts = folder / "starts"
+        self.starts.touch()
+        self._env = os.environ | {"STARTS": str(self.starts)}
+        self._file = folder / "scheduler.json"
+        self.scheduler = started(
+            "scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
+            "--scheduler-file", str(self._file), *options, env=self._env,
+        )  # fmt: skip
+        self.workers = []
+        while not (self._file.exists() and self._file.read_text()):
+            time.sleep(0.05)
+
+    @property
+    def address(self):
+        return json.loads(self._file.read_text())["address"]
+
+    def join(self, nthreads=1):
+        worker = started(
+            "worker", "--scheduler-file", str(self._file), "--nthreads", str(nthreads),
+            "--no-nanny", "--no-dashboard", "--memory-limit", "0",
+            "--local-directory", str(self.folder), env=self._env,
+        )  # fmt: skip
+        self.workers.append(worker)
+        return worker
+
+    def started_solvers(self):
+        """The process of every start of a slow solve, in order."""
+        return [int(line.split()[0]) for line in self.starts.read_text().splitlines()]
+
+    def close(self):
+        for process in (*self.workers, self.scheduler):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    cluster = Cluster(tmp_path)
+    yield cluster
+    cluster.close()
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Run a command line on the toy problem in an empty folder: code, out, err."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+    monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
+    (tmp_path / "toy.toml").write_text(SUITE.format(repeats=1))
+    nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
+    registries = Registries(
+        families=PLUGIN.problems,
+        solvers=PLUGIN.solvers,
+        report=lambda folder, formats: [],
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+        **nothing,
+    )
+
+    def cli(*argv):
+        code = main(registries, argv)
+        return code, *capsys.readouterr()
+
+    return cli
+
+
+def measured(folder):
+    """Every run_id in a journal with its verdict; fails on one that is there twice."""
+    records = read_journal(Path(folder))
+    found = {r.run_id: r.status for r in records}
+    assert len(found) == len(records)
+    return found
+
+
+def halved(folder):
+    """The numbers of blocks of which some measurements are in a journal, not all."""
+    with suppress(InputError):
+        counts = Counter(r.block for r in read_journal(Path(folder)))
+        return [number for number, count in counts.items() if count < SOLVERS]
+    return []
+
+
+def node_of(solver):
+    """The Dask worker that a solver process works for: its sub-reaper's parent."""
+    reaper = parent(solver)
+    return None if reaper is None else parent(reaper)
+
+
+def parent(process):
+    """The parent of a process; None when it has ended."""
+    with suppress(OSError):
+        return int(
+            Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1]
+        )
+
+
+@contextmanager
+def meanwhile(action):
+    thread = threading.Thread(target=action)
+    thread.start()
+    yield
+    thread.join()
+
+
+def wait_for(condition):
+    """Wait however long it takes; what never comes is given up after ten minutes."""
+    end = time.monotonic() + 600
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+@pytest.mark.alone  # each node takes a CPU
+def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
+    cli, cluster, tmp_path
+):
+    cli("run", "toy.toml", "--out", "alone")
+    victim = cluster.join()
+    cluster.join()
+    cluster.starts.write_text("")
+
+    def kill():
+        wait_for(lambda: victim.pid in map(node_of, cluster.started_solvers()))
+        victim.kill()  # in the middle of a measurement
+
+    with meanwhile(kill):
+        code, _, err = cli(
+            "run", "toy.toml", "--out", "both", "--dask", cluster.address
+        )
+    records = read_journal(tmp_path / "both")
+    cpus = {line.partition(" ")[2] for line in cluster.starts.read_text().splitlines()}
+    slow = [r for r in records if r.solver == "slow"]
+
+    assert code == 0, err
+    assert len(cluster.started_solvers()) > len(slow)  # a lost one was made again
+    assert measured("both") == measured("alone")
+    assert victim.poll() == -signal.SIGKILL
+    assert {r.node for r in records} == {os.uname().nodename}
+    assert len(cpus) == min(2, len(os.sched_getaffinity(0)))  # a CPU for each
+    (there,) = {r.environment for r in records}
+    stored = environment_of(tmp_path / "both", there)
+    assert stored.pop("digest") == digest(stored) == there
+    for number in {r.block for r in records}:  # blocks are of one case
+        assert len({r.case for r in records if r.block == number}) == 1
+
+
+def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
+    cli, cluster, tmp_path
+):
+    victim = cluster.join()
+    cut = []
+
+    def kill():
+        wait_for(lambda: cut or cut.extend(halved("d")))
+        victim.kill()  # what it had given back of that block is in the journal
+        cluster.join()
+
+    with meanwhile(kill):
+        code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
+    records = read_journal(tmp_path / "d")
+    blocks = {}
+    for r in records:
+        blocks.setdefault(r.block, []).append(r)
+    (number,) = cut
+
+    assert code == 0, err
+    assert len(measured("d")) == 6 * SOLVERS
+    assert len(blocks) == 6 + 1
+    (rest,) = [
+        n for n, block in blocks.items() if n != number
+        and block[0].case == blocks[number][0].case
+    ]  # fmt: skip
+    both = blocks[number] + blocks[rest]
+    assert sorted(r.solver for r in both) == ["dies", "exact", "picky", "slow"]
+    assert 0 < len(blocks[number]) < SOLVERS
+
+
+def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
+    cluster.join(nthreads=2)
+    code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
+
+    assert code == 2
+    assert "--nthreads 1" in err.splitlines()[-1]
+
+
+def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
+    monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", ""):
+        code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
+        assert code == 2
+        assert err.splitlines()[-1].startswith(f"mortarbench: --dask {address}:")
+
+
+def test_without_dask_one_line_says_what_to_install(cli, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", "local")
+
+    assert (code, err.count("\n")) == (2, 1)
+    assert "[cluster]" in err
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
+    cli, cluster, tmp_path
+):
+    cluster.join()
+
+    def kill():
+        wait_for(lambda: halved("d"))  # a worker is in the middle of a block
+        cluster.scheduler.kill()
+
+    with meanwhile(kill):
+        code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
+    before = measured("d")
+    assert code == 2
+    assert err.splitlines()[-1].endswith("the same command continues")
+
+    cluster.close()
+    assert cli("run", "toy.toml", "--out", "d")[0] == 0
+    cli("run", "toy.toml", "--out", "alone")
+    assert measured("d") == measured("alone")
+    assert 0 < len(before) < len(measured("d"))
+
+
+def descendants(process):
+    """The processes that one has started, and those that these have started."""
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    children = [int(child) for task in tasks for child in task.read_text().split()]
+    return [*children, *(d for child in children for d in descendants(child))]
+
+
+def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
+    worker = cluster.join()
+    idle = []
+
+    def look():
+        wait_for(cluster.started_solvers)
+        idle.extend(descendants(worker.pid))
+
+    with meanwhile(look):
+        run = ("run", "toy.toml", "--out", "d", "--case", "well/depth=2/dual")
+        assert cli(*run, "--dask", cluster.address)[0] == 0
+
+    assert len(idle) >= 2  # a solver and the generator
+    wait_for(lambda: not descendants(worker.pid))
+
+
+@pytest.mark.slow
+def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
+    cli, cluster, tmp_path
+):
+    worker = cluster.join()
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
+        "from mortarbench.cli.main import main; "
+        "from mortarbench.cli.registries import Registries; "
+        "nothing = dict.fromkeys(('reference', 'plot', 'vtu', 'series', 'paper')); "
+        "main(Registries(families=toy_problem.PROBLEMS, solvers=toy_problem.SOLVERS, "
+        "report=lambda *_: [], start=(sys.executable, '-P', toy_problem.__file__), "
+        "**nothing), sys.argv[2:])"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        program,
+        str(TOY_PROBLEM.parent),
+        "run",
+        "toy.toml",
+    ]
+    run = subprocess.Popen([*command, "--out", "d", "--dask", cluster.address])
+    wait_for(lambda: halved("d"))  # the worker is in the middle of a block
+    run.kill()
+    run.wait()
+    before = measured("d")
+
+    assert cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)[0] == 0
+    cli("run", "toy.toml", "--out", "alone")
+    assert measured("d") == measured("alone")
+    assert 0 < len(before) < len(measured("d"))
+    wait_for(lambda: not descendants(worker.pid))
+
+
+@pytest.mark.slow
+def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured(
+    cli, tmp_path
+):
+    code, out, err = cli(
+        "run", "toy.toml", "--out", "d", "--dask", "local",
+        "--solver", "exact", "--solver", "murders",
+    )  # fmt: skip
+
+    assert code == 1
+    assert "well/depth=4/dual was given up" in err
+    assert "1 case could not be built: well/depth=4/dual" in out
+    made = {(r.solver, r.params["depth"]) for r in read_journal(tmp_path / "d")}
+    assert {("murders", depth) for depth in (1, 2, 3, 5, 6)} < made
+    assert {("exact", depth) for depth in (1, 2, 3, 5, 6)} < made
+    assert len(measured("d")) == len(made)
+    assert ("murders", 4) not in made
+
+
+@pytest.fixture
+def meet():
+    """What a parent does with the environment of a node; what it keeps and says."""
+    from harness.running.cluster import Nodes
+
+    kept, said = {}, []
+    here = capture()
+    nodes = Nodes(here, kept.__setitem__, said.append)
+
+    def meet(change):
+        there = json.loads(json.dumps(here))
+        change(there)
+        nodes.meet("node07", digest(there), there)
+        return kept, said
+
+    return meet
+
+
+def test_an_equal_node_is_kept_in_silence(meet):
+    kept, said = meet(lambda there: there["now"].update(load=3.0))
+    assert (len(kept), said) == (1, [])
+
+
+def test_another_environment_is_kept_and_told_once(meet):
+    for _ in range(2):
+        kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
+    assert len(kept) == 1
+    assert len(said) == 1
+    assert "node07" in said[0]
+    assert "machine.cpu" in said[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda there: there["versions"].update(mortarbench="9.9"),
+        lambda there: there.update(source={"commit": "0", "dirty": False}),
+        lambda there: there["plugins"].update({"a.py": "0123456789ab"}),
+    ],
+)
+def test_a_node_with_other_code_is_refused(meet, change):
+    with pytest.raises(InputError, match="node07 runs other code"):
+        meet(change)

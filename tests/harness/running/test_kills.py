@@ -1,0 +1,232 @@
+"""Runs that are killed, or run out of disk, at random instants, and continued."""
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from unittest.mock import ANY
+
+import pytest
+
+from harness.results.journal import read_journal
+from tests.support import ADVERSARIES
+
+PLUGIN = ADVERSARIES
+SUITE = """
+name = "killed"
+repeats = {repeats}
+time_limit = 20
+solvers = ["sleeps", "honest", "dies", "declines", "chains"]
+[[problems]]
+family = "tiny"
+params = {{ h = [0.5, 1.0] }}
+[[problems]]
+family = "tiny"
+sequence = "h"
+params = {{ h = [0.5, 1.0, 1.5] }}
+"""
+#: a run in a process of its own: suite, folder
+RUNS = f"""
+import sys
+from pathlib import Path
+from harness import InputError
+from harness.results.work_unit import Commands
+from harness.running.progress import shown_on
+from harness.registry import load_plugin, resolve
+from harness.running.run import run
+from harness.suite.suite import load_suite
+
+start = [sys.executable, "-P", {str(PLUGIN)!r}]
+plugin = load_plugin(Path({str(PLUGIN)!r}))
+suite = load_suite(Path(sys.argv[1]), plugin.problems, plugin.solvers)
+try:
+    with shown_on(sys.stderr) as progress:
+        run(
+            suite, families=plugin.problems, out=Path(sys.argv[2]),
+            commands=Commands(
+                solvers={{s.label: [*start, s.name] for s in suite.solvers}},
+                generator=[*start, "generator"],
+            ),
+            resolve=lambda spec: resolve(spec, plugin.solvers),
+            environment={{}}, digest="here", progress=progress,
+        )
+except InputError as e:
+    print(e, file=sys.stderr)
+    sys.exit(2)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+#: how a run may end that was asked to, before its first line or later
+ASKED = {
+    signal.SIGINT: (130, -signal.SIGINT, 1, 0),
+    signal.SIGTERM: (143, -signal.SIGTERM, 0),
+}
+
+
+def started(suite, out):
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", RUNS, str(suite), str(out)],
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def ended(run):
+    """How a run ended, and the last line that it said."""
+    said = run.communicate()[1].splitlines()
+    return run.returncode, said[-1] if said else ""
+
+
+def children(process):
+    tasks = Path(f"/proc/{process}/task").glob("*/children")
+    with suppress(OSError):
+        return [int(child) for task in tasks for child in task.read_text().split()]
+    return []
+
+
+def family(process):
+    """A process, then those that it started, and those that these did."""
+    yield process
+    for child in children(process):
+        yield from family(child)
+
+
+def kill_one(run, rng, out):
+    """Kill the run or one of its processes."""
+    if rng.random() < 0.5 and (young := children(run.pid)):
+        with suppress(ProcessLookupError):
+            os.kill(rng.choice(young), signal.SIGKILL)
+        return
+    run.kill()
+    run.communicate()
+
+
+def ask_to_end(run, rng, out):
+    """Send what Ctrl-C or a batch system sends."""
+    number = rng.choice(list(ASKED))
+    run.send_signal(number)
+    assert ended(run)[0] in ASKED[number]
+
+
+def fill_by_limit(run, rng, out):
+    """Have no process of the run write another byte into a file."""
+    for process in family(run.pid):  # which those that they start inherit
+        with suppress(ProcessLookupError, PermissionError):
+            hard = resource.prlimit(process, resource.RLIMIT_FSIZE)[1]
+            resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
+    assert_told(run)
+
+
+def fill_by_files(run, rng, out):
+    """Fill the file system that the folder is on."""
+    filler = out.parent / "filler"
+    try:
+        with suppress(OSError), filler.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+        assert_told(run)
+    finally:
+        filler.unlink()
+
+
+def assert_told(run):
+    """A run on a full disk ends, in one line, unless it had nothing left to write."""
+    code, said = ended(run)
+    assert code in (0, 2), (code, said)
+    if code == 2:
+        assert said.endswith("free some space, and the same command continues")
+
+
+def disturbed(suite, out, events, rng, longest):
+    """Have all of `events` happen to runs, at random instants; then let one end."""
+    run = started(suite, out)
+    for event in events:
+        with suppress(subprocess.TimeoutExpired):
+            run.wait(rng.uniform(0.0, longest))
+        if run.poll() is None:
+            event(run, rng, out)
+        if run.poll() is None:
+            continue
+        if not run.stderr.closed:  # it ended by itself
+            assert ended(run) == (0, ANY)
+        run = started(suite, out)
+    assert ended(run)[0] == 0
+    assert ended(started(suite, out))[0] == 0  # what could not be built, again
+
+
+def check(tmp_path, events, seed, out=None, repeats=4):
+    suite = tmp_path / "suite.toml"
+    suite.write_text(SUITE.format(repeats=repeats))
+    begin = time.monotonic()
+    assert ended(started(suite, tmp_path / "whole"))[0] == 0
+    longest = (time.monotonic() - begin) / 2
+    whole = read_journal(tmp_path / "whole")
+    assert len(whole) == 5 * (4 * repeats + 1)
+
+    rng = random.Random(seed)
+    rng.shuffle(events)
+    out = out or tmp_path / "disturbed"
+    disturbed(suite, out, events, rng, longest)
+    got = read_journal(out)
+
+    assert len({r.run_id for r in got}) == len(got)  # exactly once
+    assert {r.run_id for r in got} == {r.run_id for r in whole}
+    verdicts = {r.run_id: r.status for r in whole}
+    changed = [r for r in got if r.status != verdicts[r.run_id]]
+    assert len(changed) <= 3 * events.count(
+        kill_one
+    )  # those whose worker was killed: a sequence at most
+    for record in changed:
+        assert record.message.endswith("SIGKILL"), record
+    assert not list(out.glob(".scratch/*"))
+    assert not list(out.rglob("*.tmp"))
+
+
+def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path):
+    check(tmp_path, [kill_one, ask_to_end, fill_by_limit], seed=161803, repeats=1)
+
+
+@pytest.mark.slow
+def test_so_does_one_of_four_repeats(tmp_path):
+    check(tmp_path, [kill_one] * 2 + [ask_to_end] + [fill_by_limit] * 2, seed=161803)
+
+
+@pytest.mark.slow
+def test_a_run_killed_fifty_times_ends_as_an_undisturbed_one(tmp_path):
+    check(tmp_path, [kill_one] * 50, seed=141421)
+
+
+@pytest.mark.slow
+def test_twenty_kills_and_eight_full_disks_cost_no_measurement_and_no_verdict(tmp_path):
+    check(tmp_path, [kill_one] * 20 + [fill_by_limit] * 8, seed=271828)
+
+
+@pytest.mark.slow
+def test_a_file_system_that_fills_up_costs_no_measurement_and_no_verdict(small_disk):
+    tmp_path, fill = small_disk
+    check(tmp_path, [fill] * 8, seed=173205, out=tmp_path / "disk" / "out")
+
+
+@pytest.mark.slow
+def test_a_run_that_is_asked_to_end_twenty_times_continues(tmp_path):
+    check(tmp_path, [ask_to_end] * 20, seed=223606)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder with a file system ``disk`` of 8 MiB, and what fills that.
+
+    Who may not mount one gets a limit of the size of files instead.
+    """
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        yield tmp_path, fill_by_limit
+        return
+    yield tmp_path, fill_by_files
+    subprocess.run(["umount", str(disk)], check=True)

@@ -1,0 +1,829 @@
+"""Whole runs: of solvers that misbehave, interrupted, resumed, on shared folders."""
+
+import errno
+import json
+import logging
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from harness import InputError, Status, Verdict
+from harness.errors import FaultError
+from harness.files.store import load_fields, load_solution
+from harness.names import CaseName
+from harness.processes import measurement as remote
+from harness.registry import SolverSpec, load_plugin, resolve
+from harness.results.faults import left, read_faults
+from harness.results.journal import read_journal
+from harness.results.work_unit import Commands
+from harness.running.run import run
+from harness.suite.suite import Suite
+from reports.data.evidence import read_evidence
+from reports.data.size_series import size_series
+from tests.support import ADVERSARIES
+
+PLUGIN = ADVERSARIES
+SIZES = (10, 20, 40, 80)
+START = [sys.executable, "-P", str(PLUGIN)]
+SOLVERS = load_plugin(PLUGIN).solvers
+FAMILIES = load_plugin(PLUGIN).problems
+
+
+class Tally:
+    """A progress that remembers what it was told, and may act after some records."""
+
+    def __init__(self, interrupt_after=None, after=None, act=None):
+        self.total = None
+        self.records = []
+        self.warnings = []
+        self.skipped = 0
+        self.unbuilt = None
+        self._left = interrupt_after
+        self._after, self._act = after, act
+
+    def start(self, total):
+        self.total = total
+
+    def say(self, text):
+        pass
+
+    def warn(self, text):
+        self.warnings.append(text)
+
+    def advance(self, record):
+        if record is None:
+            self.skipped += 1
+            return
+        self.records.append(record)
+        if len(self.records) == self._after:
+            self._act()
+        if self._left is not None and len(self.records) == self._left:
+            raise KeyboardInterrupt
+
+
+def suite(*solvers, cases=({},), **changes):
+    defaults = FAMILIES["tiny"].defaults
+    fixed = Suite(
+        name="test",
+        tolerances=(1e-6,),
+        repeats=1,
+        time_limit=30.0,
+        memory_limit=2000.0,
+        solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
+        cases=tuple(
+            CaseName(family="tiny", params={**defaults, **case}, form="plain")
+            for case in cases
+        ),
+        text='name = "test"\n',
+    )
+    return replace(fixed, **changes)
+
+
+@pytest.fixture
+def measure(tmp_path):
+    """Run a suite in worker processes and return what it told while doing so."""
+
+    def measure(
+        suite,
+        *,
+        interrupt_after=None,
+        after=None,
+        act=None,
+        digest="here",
+        fresh=False,
+        out=tmp_path,
+        environment=None,
+    ):
+        tally = Tally(interrupt_after, after, act)
+        missing = run(
+            suite,
+            families=FAMILIES,
+            out=out,
+            commands=Commands(
+                solvers={spec.label: [*START, spec.name] for spec in suite.solvers},
+                generator=[*START, "generator"],
+            ),
+            resolve=lambda spec: resolve(spec, SOLVERS),
+            environment=environment or {"machine": "test"},
+            digest=digest,
+            progress=tally,
+            fresh=fresh,
+        )
+        tally.unbuilt, tally.faults = missing.unbuilt, missing.faults
+        return tally
+
+    return measure
+
+
+OUTCOMES = {
+    "honest": (Verdict.VERIFIED, "solved", ""),
+    "raises": (Verdict.FAILED, "failed", "ValueError: first line second line"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3"),
+    "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
+    "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
+    "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
+    "prints": (Verdict.VERIFIED, "solved", ""),
+    "leaks": (Verdict.MEMORY_LIMIT, None, None),
+    "printsendlessly": (Verdict.TIME_LIMIT, None, None),
+    "asksforthemoon": (Verdict.MEMORY_LIMIT, "failed", None),
+    "abortsformemory": (
+        Verdict.MEMORY_LIMIT, None, "SIGABRT: memory allocation of 64 bytes failed",
+    ),
+    "spikesunseen": (Verdict.MEMORY_LIMIT, ..., None),
+    "forksahoarder": (Verdict.MEMORY_LIMIT, None, None),
+    "wrongsign": (Verdict.WRONG, "solved", ""),
+    "forks": (Verdict.VERIFIED, "solved", ""),
+    "wrongshape": (
+        Verdict.FAILED, "failed", "Solution.x has shape (3,), expected (2,)",
+    ),
+    "returnsnone": (
+        Verdict.FAILED, "failed", "returned NoneType, expected Solution",
+    ),
+    "returnsnan": (Verdict.WRONG, "solved", ""),
+    "zero": (Verdict.WRONG, "solved", ""),
+    "mutates": (
+        Verdict.FAILED, "failed", "ValueError: assignment destination is read-only",
+    ),
+    "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
+    "declines": (Verdict.DECLINED, "declined", "never on a Monday"),
+}  # fmt: skip
+
+
+def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
+    measure, tmp_path
+):
+    cases = [{"h": 0.5}, {"h": 1.0}]
+    measure(suite(*OUTCOMES, cases=cases, time_limit=3.0, memory_limit=300.0))
+    records = read_journal(tmp_path)
+
+    assert len(records) == 2 * len(OUTCOMES)
+    for case in ("tiny/h=0.5/plain", "tiny/plain"):
+        got = {r.solver: r for r in records if r.case == case}
+        for solver, (status, claimed, message) in OUTCOMES.items():
+            assert got[solver].status == status, (solver, case)
+            assert claimed in (..., got[solver].claimed), (solver, case)
+            assert message in (None, got[solver].message)
+
+
+def test_a_verified_record_holds_what_was_measured_and_what_the_case_says(
+    measure, tmp_path
+):
+    measure(suite("honest", cases=[{"h": 0.5}]))
+    (r,) = read_journal(tmp_path)
+
+    assert r.objective == 0.25 - 2.0
+    assert r.quantities == {"first": 0.5, "all": [0.5, 0.0], "number": 2}
+    assert r.sizes == {"variables": 2, "equalities": 0, "inequalities": 1, "bounds": 2}
+    assert r.params == {"h": 0.5, "fault": "none"}
+    assert r.options == {"level": 3}
+    assert max(r.primal, r.dual, r.complementarity, r.gap) == 0
+    assert r.peak_mib > 10
+    assert r.environment == "here"
+    assert load_solution(tmp_path, r.vectors, Status.SOLVED).x.tolist() == [0.5, 0.0]
+    assert load_fields(tmp_path, r.fields).displacement[2].tolist() == [0.5, 0.5]
+
+
+def test_the_answer_to_another_problem_is_wrong(measure, tmp_path):
+    measure(suite("answersanotherproblem", cases=[{"h": 0.5}, {"h": 1.0}]))
+
+    verdicts = [r.status for r in read_journal(tmp_path)]
+    assert verdicts == [Verdict.VERIFIED, Verdict.WRONG]
+
+
+def test_a_record_tells_its_phases_and_where_it_was_measured(measure, tmp_path):
+    measure(suite("honest", "sleeps"))
+    got = {r.solver: r for r in read_journal(tmp_path)}
+
+    quick, slow = got["honest"], got["sleeps"]
+    assert (slow.inner, slow.threads, slow.cpu) == (1, 1, max(os.sched_getaffinity(0)))
+    assert slow.solve_seconds >= 0.02
+    assert quick.inner > 1  # far below a millisecond
+    assert quick.total_seconds < 0.001
+    assert min(quick.build_seconds, quick.recover_seconds, quick.canary_seconds) > 0
+    assert quick.dualise_seconds is None
+    peaks = (quick.prepare_peak_mib, quick.solve_peak_mib)
+    assert quick.peak_mib == max(peaks) > 10
+
+
+def three_steps(*solvers, **changes):
+    steps = [{**FAMILIES["tiny"].defaults, "h": h} for h in (0.5, 1.0, 1.5)]
+    names = [CaseName(family="tiny", params=p, form="plain") for p in steps]
+    return suite(*solvers, cases=(), sequences=(tuple(names),), **changes)
+
+
+def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
+    tally = measure(three_steps("chains", "honest", repeats=2))
+    records = read_journal(tmp_path)
+
+    assert tally.total == len(records) == 12
+    assert {r.mode for r in records} == {"sequence"}
+    assert {r.status for r in records} == {Verdict.VERIFIED}
+    for repeat in (0, 1):
+        chain = [r for r in records if (r.solver, r.repeat) == ("chains", repeat)]
+        assert [(r.params["h"], r.iterations) for r in chain] == [
+            (0.5, 1), (1.0, 2), (1.5, 3),
+        ]  # fmt: skip
+    assert {r.iterations for r in records if r.solver == "honest"} == {1}
+
+
+def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_path):
+    both = three_steps("honest")
+    measure(replace(both, cases=both.sequences[0][:1]))
+    first = [r for r in read_journal(tmp_path) if r.params["h"] == 0.5]
+
+    assert {r.mode for r in first} == {"cold", "sequence"}
+    assert len({r.run_id for r in first}) == 2
+    evidence = read_evidence(tmp_path)
+    assert evidence.solvers == ("honest", "honest (sequence)")
+    assert all(len(o.records) == 1 for o in evidence.flat)
+
+
+def test_a_sequence_that_breaks_says_where(measure, tmp_path):
+    measure(three_steps("breaksitschain"))
+
+    records = read_journal(tmp_path)
+    assert [r.status for r in records] == [
+        Verdict.VERIFIED, Verdict.CRASHED, Verdict.CRASHED,
+    ]  # fmt: skip
+    assert records[2].message == "the sequence ended at tiny/plain: exit code 9"
+
+
+def test_a_sequence_cut_off_is_driven_again_from_its_first_step(measure, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        measure(three_steps("chains"), interrupt_after=2)
+    measure(three_steps("chains"))
+
+    records = read_journal(tmp_path)
+    assert [r.iterations for r in records] == [1, 2, 3]
+    assert len({r.run_id for r in records}) == 3
+
+
+def test_answers_of_a_sweep_are_judged_at_one_accuracy(measure, tmp_path):
+    sweep = suite("honest", "zero", tolerances=(0.1, 1e-8), accuracy=1e-6)
+    measure(sweep)
+
+    records = read_journal(tmp_path)
+    assert {(r.tol, r.accuracy, r.solver, r.status) for r in records} == {
+        (0.1, 1e-6, "honest", Verdict.VERIFIED), (0.1, 1e-6, "zero", Verdict.WRONG),
+        (1e-8, 1e-6, "honest", Verdict.VERIFIED), (1e-8, 1e-6, "zero", Verdict.WRONG),
+    }  # fmt: skip
+
+
+@pytest.mark.slow  # it sleeps, and other programs must not
+def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
+    measure, tmp_path
+):
+    sizes = [CaseName(family="sized", params={"n": n}, form="plain") for n in SIZES]
+    measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
+    (series,) = size_series(read_evidence(tmp_path))
+    law = series.time_law("sleepsbypower")
+
+    assert law.points == len(SIZES)
+    assert law.low <= 1.5 <= law.high
+    assert law.high - law.low < 0.1
+
+
+def test_a_damaged_case_on_disk_is_built_again(measure, tmp_path):
+    measure(suite("honest"))
+    (built,) = (tmp_path / "cases").glob("*.npz")
+    whole = built.read_bytes()
+    built.write_bytes(whole[:-3] + b"bad")
+    measure(suite("honest", repeats=2))
+
+    assert [r.status for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
+    assert built.read_bytes() == whole
+
+
+def test_a_case_is_built_once_however_often_it_is_measured(measure, tmp_path):
+    measure(suite("honest"))
+    (built,) = (tmp_path / "cases").glob("*.npz")
+    before = built.stat().st_mtime_ns
+    measure(suite("honest", "warm", repeats=3))
+
+    assert built.stat().st_mtime_ns == before
+
+
+def test_a_multiplier_of_the_wrong_sign_is_wrong(measure, tmp_path):
+    measure(suite("honest", cases=[{"h": 3.0}]))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.status, r.claimed) == (Verdict.WRONG, "solved")
+    assert r.primal == r.complementarity == r.gap == 0 < r.dual
+    assert r.vectors is not None
+    assert r.fields is None
+
+
+def test_a_point_with_nan_has_neither_quantities_nor_vectors(measure, tmp_path):
+    measure(suite("returnsnan"))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.objective, r.vectors, r.quantities) == (None, None, {})
+
+
+def test_repeats_are_cold_and_the_state_is_stored_for_the_first_only(measure, tmp_path):
+    measure(suite("warm", repeats=3))
+    records = read_journal(tmp_path)
+
+    assert [r.iterations for r in records] == [9, 9, 9]
+    assert [r.repeat for r in records] == [0, 1, 2]
+    assert len({r.vectors for r in records}) == 1
+    assert [r.fields is None for r in records] == [False, True, True]
+
+
+def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
+    two = suite("declines", "honest", repeats=2, tolerances=(1e-4, 1e-6))
+    tally = measure(two)
+    refusals = [r for r in read_journal(tmp_path) if r.solver == "declines"]
+
+    assert [(r.tol, r.repeat) for r in refusals] == [(1e-4, 0), (1e-6, 0)]
+    assert (tally.total, len(tally.records), tally.skipped) == (8, 6, 2)
+    assert measure(two).records == []
+
+
+def test_a_block_is_every_solver_once_in_an_order_that_changes(measure, tmp_path):
+    names = ("honest", "warm", "zero", "mutatesbyforce")
+    measure(suite(*names, repeats=6))
+    records = read_journal(tmp_path)
+    blocks = [[r for r in records if r.block == i] for i in range(6)]
+
+    assert all(sorted(r.solver for r in block) == sorted(names) for block in blocks)
+    assert all(len({r.repeat for r in block}) == 1 for block in blocks)
+    orders = [[r.solver for r in block] for block in blocks]
+    assert orders[1::2] == [order[::-1] for order in orders[::2]]
+    assert orders[0] != orders[2] or orders[0] != orders[4]
+    assert [r.block for r in records] == sorted(r.block for r in records)
+
+
+def test_the_schedule_is_the_same_every_time(measure, tmp_path):
+    twice = suite("honest", "warm", "zero", repeats=3)
+    orders = []
+    for _ in range(2):
+        measure(twice, fresh=True)
+        orders.append([r.run_id for r in read_journal(tmp_path)])
+
+    assert orders[0] == orders[1]
+
+
+def test_run_ids_tell_every_cell_apart_and_equal_cells_alike(measure, tmp_path):
+    cells = suite(
+        "honest", cases=[{}, {"h": 0.5}], tolerances=(1e-4, 1e-6), repeats=2,
+        solvers=(
+            SolverSpec(name="honest", label="a"),
+            SolverSpec(name="honest", label="b"),
+            SolverSpec(name="honest", label="c", options={"level": 5}),
+        ),
+    )  # fmt: skip
+    measure(cells)
+    first = {r.run_id for r in read_journal(tmp_path)}
+    renamed = suite("honest", solvers=(replace(cells.solvers[2], options={}),))
+    measure(renamed, fresh=True)
+    (other,) = read_journal(tmp_path)
+
+    assert len(first) == 2 * 2 * 2 * 3
+    assert other.run_id not in first  # other options, same label
+
+
+@pytest.mark.parametrize("cut", [1, 50, 3000])
+def test_a_run_cut_off_continues_with_each_measurement_exactly_once(
+    measure, tmp_path, cut
+):
+    whole = suite("honest", "dies", "declines", repeats=2, cases=[{}, {"h": 0.5}])
+    measure(whole)
+    (file,) = (tmp_path / "journal").iterdir()
+    before = [r.run_id for r in read_journal(tmp_path)]
+    file.write_bytes(file.read_bytes()[:-cut])
+    kept = len(read_journal(tmp_path))
+
+    tally = measure(whole)
+    after = [r.run_id for r in read_journal(tmp_path)]
+
+    assert kept < len(before) == 10
+    assert len(tally.records) == 10 - kept
+    assert len(tally.records) + tally.skipped == tally.total == 12
+    assert sorted(after) == sorted(before)
+    assert len(set(after)) == 10
+
+
+def test_an_interrupted_run_leaves_a_whole_journal_and_continues(measure, tmp_path):
+    whole = suite("honest", "zero", repeats=3)
+    with pytest.raises(KeyboardInterrupt):
+        measure(whole, interrupt_after=2)
+    assert len(read_journal(tmp_path)) == 2
+
+    assert len(measure(whole).records) == 4
+    assert len({r.run_id for r in read_journal(tmp_path)}) == 6
+
+
+def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
+    whole = suite("honest", "zero", repeats=2)
+    with pytest.raises(KeyboardInterrupt):
+        measure(whole, interrupt_after=1)
+    measure(whole)
+
+    assert [r.block for r in read_journal(tmp_path)] == [0, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("build", "ZeroDivisionError: no stiffness"),
+        ("input", "tiny: fault=input is out of range"),
+        ("memory", "it needs more memory than there is"),
+        ("exit", "SystemExit: 3"),
+    ],
+)
+def test_a_case_that_cannot_be_built_is_said_and_tried_again(
+    measure, tmp_path, caplog, fault, reason
+):
+    whole = suite("honest", "zero", cases=[{"fault": fault}, {}], repeats=2)
+    with caplog.at_level(logging.DEBUG):
+        first, second = measure(whole), measure(whole)
+    case = f"tiny/fault={fault}/plain"
+
+    assert {r.case for r in read_journal(tmp_path)} == {"tiny/plain"}
+    assert (len(first.records), len(second.records)) == (4, 0)
+    for tally in (first, second):
+        assert tally.unbuilt == [case]
+        assert tally.warnings == [f"{case} could not be built: {reason}"]
+        assert len(tally.records) + tally.skipped == tally.total
+    assert "Traceback" in caplog.text
+    assert all(entry.levelno < logging.WARNING for entry in caplog.records)
+
+
+@pytest.mark.parametrize(
+    ("fault", "note"),
+    [
+        ("quantities", "no quantities: ZeroDivisionError: no quantity"),
+        ("fields", "no fields: ZeroDivisionError: no field"),
+    ],
+)
+def test_what_a_case_cannot_evaluate_costs_a_note(measure, tmp_path, fault, note):
+    measure(suite("honest", cases=[{"fault": fault}]))
+    (r,) = read_journal(tmp_path)
+
+    assert (r.status, r.message) == (Verdict.VERIFIED, note)
+    assert r.vectors is not None
+
+
+def test_the_folder_tells_suite_and_environment(measure, tmp_path):
+    measure(suite("honest"))
+
+    assert (tmp_path / "suite.toml").read_text() == 'name = "test"\n'
+    environment = json.loads((tmp_path / "environment.json").read_text())
+    assert environment == {"digest": "here", "machine": "test"}
+    assert (tmp_path / "journal" / "here.jsonl").exists()
+
+
+def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_path):
+    measure(suite("honest"))
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "validation.json").write_text("{}")  # what was concluded from it
+    (tmp_path / "references").mkdir()
+
+    other = suite("zero", text='name = "other"\n')
+    with pytest.raises(InputError, match=r"holds another suite .* --fresh"):
+        measure(other)
+    with pytest.raises(InputError, match=r"another environment \(here, now there\)"):
+        measure(suite("honest"), digest="there")
+    assert [r.solver for r in read_journal(tmp_path)] == ["honest"]
+
+    measure(other, digest="there", fresh=True)
+    assert [r.solver for r in read_journal(tmp_path)] == ["zero"]
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "validation.json").exists()
+    assert not (tmp_path / "references").exists()
+
+
+def test_another_environment_is_refused_with_what_differs(measure):
+    machine = {"cpu": "A", "cores": 2, "kernel": "6.1", "governor": None}
+    now = {"now": {"load": 1.0}, "plugins": {}}
+    measure(suite("honest"), environment={"machine": machine, **now})
+    faster = {"cpu": "B", "cores": 4, "kernel": "6.2", "governor": None, "turbo": True}
+    with pytest.raises(InputError, match=r"machine\.cpu, machine\.turbo changed\)"):
+        measure(
+            suite("honest"), digest="there",
+            environment={"machine": machine | {"cpu": "B", "turbo": True}, **now},
+        )  # fmt: skip
+    with pytest.raises(InputError) as e:
+        measure(
+            suite("honest"), digest="there",
+            environment={"machine": faster, "now": {}, "plugins": {"a.py": "0" * 12}},
+        )  # fmt: skip
+
+    expected = ": machine.cores, machine.cpu, machine.kernel and 2 more changed)"
+    assert expected in str(e.value)
+
+
+def test_a_comment_makes_no_other_suite(measure, tmp_path):
+    measure(suite("honest"))
+    commented = suite("honest", text='name = "test"  # for tests\n')
+
+    assert measure(commented).records == []
+    assert (tmp_path / "suite.toml").read_text() == commented.text
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize(
+    "name", ["journal/a.txt", "vectors/a.npz", "report/a.html", "suite.toml"]
+)
+def test_a_folder_with_other_things_under_our_names_is_left_alone(
+    measure, tmp_path, name, fresh
+):
+    mine = tmp_path / "home" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text("mine")
+
+    with pytest.raises(InputError, match="but is no result folder"):
+        measure(suite("honest"), out=tmp_path / "home", fresh=fresh)
+
+    files = [p for p in (tmp_path / "home").rglob("*") if p.is_file()]
+    assert files == [mine]
+    assert mine.read_text() == "mine"
+
+
+def test_a_journal_alone_is_a_result_folder(measure, tmp_path):
+    measure(suite("honest"))
+    for name in ("suite.toml", "environment.json"):
+        (tmp_path / name).unlink()
+
+    assert measure(suite("honest")).records == []
+
+
+def test_scratch_files_lie_in_the_folder_while_a_run_lasts(
+    measure, tmp_path, monkeypatch
+):
+    seen = []
+    old = tmp_path / ".scratch" / "of a run that was killed"
+    old.mkdir(parents=True)
+    monkeypatch.setattr(
+        Tally, "advance", lambda *_: seen.append([*old.parent.iterdir()])
+    )
+    measure(suite("honest"))
+
+    (files,) = seen
+    assert {"point.npz", "worker-0.log"} <= {file.name for file in files}
+    assert old not in files
+    assert not old.parent.exists()
+
+
+def test_an_interrupted_run_leaves_no_scratch(measure, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        measure(suite("honest", repeats=2), interrupt_after=1)
+
+    assert not (tmp_path / ".scratch").exists()
+
+
+def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
+    measure, tmp_path
+):
+    hold = (
+        "import sys; from pathlib import Path\n"
+        "from harness.results.folder import locked\n"
+        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", hold, str(tmp_path)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as first:  # fmt: skip
+        assert first.stdout.readline() == b"held\n"
+        with pytest.raises(InputError, match="is being written by another run"):
+            measure(suite("honest"), fresh=True)
+        first.stdin.close()
+        first.wait()
+
+    assert len(measure(suite("honest")).records) == 1
+
+
+def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
+    (tmp_path / ".lock").mkdir()
+
+    with pytest.raises(InputError, match="expected a folder that can be written"):
+        measure(suite("honest"))
+
+
+def once_each(folder, count):
+    """The records of a journal, of which no measurement is there twice."""
+    records = read_journal(folder)
+    assert len({r.run_id for r in records}) == len(records) == count
+    return records
+
+
+@pytest.mark.parametrize("lost", ["journal", "vectors", "cases", ".scratch", ".lock"])
+def test_what_is_deleted_during_a_run_costs_no_measurement(measure, tmp_path, lost):
+    def delete():
+        path = tmp_path / lost
+        path.unlink() if path.is_file() else shutil.rmtree(path)
+
+    tally = measure(suite("honest", "zero", repeats=2), after=1, act=delete)
+
+    records = once_each(tmp_path, 4)
+    assert (len(tally.records), tally.skipped, tally.total) == (4, 0, 4)
+    assert {r.solver: r.status for r in records} == {
+        "honest": Verdict.VERIFIED, "zero": Verdict.WRONG,
+    }  # fmt: skip
+    assert tally.faults == []
+    assert load_solution(tmp_path, records[-1].vectors, Status.SOLVED).x.size == 2
+
+
+def test_a_run_whose_folder_is_moved_ends_and_continues_there(measure, tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    whole = suite("honest", repeats=3)
+    with pytest.raises(InputError, match=f"was moved to {there} .* continues"):
+        measure(whole, out=here, after=1, act=lambda: here.rename(there))
+
+    assert not here.exists()
+    once_each(there, 1)
+    measure(whole, out=there)
+    once_each(there, 3)
+
+
+def test_a_run_whose_folder_is_deleted_keeps_its_journal_and_continues(
+    measure, tmp_path
+):
+    out = tmp_path / "out"
+    whole = suite("honest", repeats=3)
+    with pytest.raises(InputError, match=r"was deleted .* same command continues"):
+        measure(whole, out=out, after=1, act=lambda: shutil.rmtree(out))
+
+    assert 0 in {r.repeat for r in once_each(out, len(read_journal(out)))}
+    measure(whole, out=out)
+    once_each(out, 3)
+
+
+def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
+    measure, tmp_path, monkeypatch
+):
+    whole = suite("honest", "zero")
+    real, said = os.fsync, set()
+    for writes in range(100):
+        left = [writes]
+
+        def fsync(fd, left=left):
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            real(fd)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        try:
+            measure(whole)
+            break
+        except InputError as e:
+            said.add(str(e).partition("; ")[2])
+        assert not [*tmp_path.rglob("*.tmp")]
+
+    assert said == {"free some space, and the same command continues"}
+    records = once_each(tmp_path, 2)
+    assert {r.status for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
+    assert writes > 6  # suite and environment alone are four
+
+
+@pytest.mark.parametrize("size", [600, 4000])
+def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, size):
+    """A point takes more than 600 bytes, a case more than 4000; the rest less."""
+    whole = suite("honest", "prints")
+    if size == 600:
+        measure(suite("zero"))
+        shutil.rmtree(tmp_path / "journal")
+        shutil.rmtree(tmp_path / "vectors")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        with pytest.raises(InputError, match=r"File too large .* command continues"):
+            measure(whole)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert read_journal(tmp_path) == []
+
+    measure(whole)
+    assert {r.status for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
+
+
+@pytest.fixture
+def faults(monkeypatch):
+    """Have the measurements of which `prevented` is true end by a fault of ours."""
+
+    def faults(prevented):
+        def measured(worker, qp, record, request, **limits):
+            if prevented(record):
+                raise FaultError("the worker was killed before its solve")
+            return remote.measured(worker, qp, record, request, **limits)
+
+        monkeypatch.setattr("harness.running.executor.measured", measured)
+
+    return faults
+
+
+def test_a_measurement_that_a_fault_prevents_is_made_again_at_once(
+    measure, tmp_path, faults
+):
+    tries = []
+    faults(lambda record: tries.append(record.run_id) or len(tries) == 2)
+    tally = measure(suite("honest", "zero"))
+
+    once_each(tmp_path, 2)
+    assert len(tries) == 3
+    (fault,) = read_faults(tmp_path)
+    assert (fault.tried_again, fault.run_id) == (True, tries[1])
+    assert tries[1] == tries[2] != tries[0]
+    assert tally.faults == []
+    assert len(tally.records) == 2
+
+
+def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
+    measure, tmp_path, faults
+):
+    whole = suite("honest", "zero", repeats=2)
+    faults(lambda record: (record.solver, record.repeat) == ("zero", 0))
+    tally = measure(whole)
+
+    once_each(tmp_path, 3)
+    (fault,) = tally.faults
+    assert (fault.solver, fault.case) == ("zero", "tiny/plain")
+    assert [f.tried_again for f in read_faults(tmp_path)] == [True, False]
+    assert (len(tally.records), tally.skipped, tally.total) == (3, 1, 4)
+
+    faults(lambda record: False)
+    again = measure(whole)
+    assert again.faults == []
+    assert len(again.records) == 1
+    once_each(tmp_path, 4)
+    assert left(read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]) == []
+
+
+def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
+    measure, tmp_path, faults
+):
+    tries = []
+    faults(lambda r: tries.append(r.params["h"]) or tries == [0.5, 1.0])
+    tally = measure(three_steps("chains"))
+
+    assert tries == [0.5, 1.0, 0.5, 1.0, 1.5]
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+    assert (len(tally.records), tally.skipped) == (3, 0)
+
+
+def family(process):
+    """A process, then those that it started, and those that these did."""
+    yield process
+    for tasks in Path(f"/proc/{process}/task").glob("*/children"):
+        with suppress(OSError):
+            for child in tasks.read_text().split():
+                yield from family(int(child))
+
+
+def kill_worker(solver):
+    """Kill what serves a solver: our processes with its name as an argument."""
+    for process in list(family(os.getpid()))[1:]:
+        with suppress(OSError):
+            words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
+            if solver.encode() in words:
+                os.kill(process, signal.SIGKILL)
+
+
+def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
+    measure, tmp_path
+):
+    measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
+
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+    assert [f.tried_again for f in read_faults(tmp_path)] == [True]
+
+
+def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
+    measure, tmp_path, faults
+):
+    faults(lambda record: record.params["h"] == 1.0)
+    tally = measure(three_steps("chains"))
+    assert [f.case for f in tally.faults] == ["tiny/plain", "tiny/h=1.5/plain"]
+    assert (len(tally.records), tally.skipped, tally.total) == (1, 2, 3)
+
+    faults(lambda record: False)
+    measure(three_steps("chains"))
+    assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
+
+
+def test_what_a_killed_run_left_unfinished_goes_when_the_next_begins(measure, tmp_path):
+    measure(suite("honest"))
+    stale = [
+        tmp_path / name
+        for name in (
+            ".mortarbench-0.tmp", "suite.tmp", "vectors/tmp0.tmp", "cases/0.new",
+            "report/.mortarbench-0.tmp",
+        )
+    ]  # fmt: skip
+    (tmp_path / "report").mkdir()
+    for path in (*stale, tmp_path / "my.tmp"):
+        path.touch()
+    measure(suite("honest"))
+
+    assert not any(path.exists() for path in stale)
+    assert (tmp_path / "my.tmp").exists()

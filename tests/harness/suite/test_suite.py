@@ -1,0 +1,493 @@
+"""Suites: what a TOML asks for, and what is wrong with it."""
+
+import tomllib
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import pytest
+
+import problems
+import solvers
+from harness import InputError
+from harness.names import canonical
+from harness.registry import SolverSpec
+from harness.suite.overrides import with_overrides
+from harness.suite.suite import load_suite
+from mortarbench.__main__ import BEYOND
+from tests.support import ROOT
+
+
+@dataclass(frozen=True)
+class Method:
+    max_iter: int = 200
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Timed(Method):
+    time_limit: int = 1
+
+
+def check(params):
+    if params["n"] < 1:
+        raise InputError(f"well: n={params['n']} must be at least 1")
+
+
+SOLVERS = {"osqp": Method(), "clarabel": Method(9), "other": Method(3)}
+WELL = SimpleNamespace(
+    name="well",
+    defaults={"n": 1, "m": 1, "kind": "soft"},
+    forms=("primal", "dual"),
+    check=check,
+)
+FAMILIES = {"well": WELL}
+
+HEAD = 'name = "demo"\nsolvers = ["osqp"]\n'
+BLOCK = '[[problems]]\nfamily = "well"\n'
+MINIMAL = HEAD + BLOCK
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(text, solvers=SOLVERS):
+        path = tmp_path / "demo.toml"
+        path.write_text(text)
+        return load_suite(path, FAMILIES, solvers)
+
+    return load
+
+
+def names(suite):
+    return [canonical(case, FAMILIES[case.family]) for case in suite.cases]
+
+
+def test_what_is_left_out_takes_its_default(load):
+    suite = load(MINIMAL)
+
+    assert suite.name == "demo"
+    assert suite.tolerances == (1e-6,)
+    assert (suite.repeats, suite.time_limit, suite.memory_limit) == (3, 60.0, 4096.0)
+    assert suite.solvers == (SolverSpec(name="osqp", label="osqp"),)
+    assert names(suite) == ["well/primal", "well/dual"]
+    assert suite.text == MINIMAL
+
+
+def test_what_is_given_is_what_is_measured(load):
+    suite = load(
+        """
+        name = "demo"
+        tolerances = [1e-3, 1e-9]
+        repeats = 7
+        time_limit = 0.5
+        memory_limit = 100
+        solvers = ["osqp",
+                   { name = "clarabel", label = "patient", options = { max_iter = 5 } }]
+        [[problems]]
+        family = "well"
+        forms = ["dual"]
+        params = { n = 2 }
+        """
+    )
+
+    assert suite.tolerances == (1e-3, 1e-9)
+    assert (suite.repeats, suite.time_limit, suite.memory_limit) == (7, 0.5, 100.0)
+    assert suite.solvers[1] == SolverSpec(
+        name="clarabel", label="patient", options={"max_iter": 5}
+    )
+    assert names(suite) == ["well/n=2/dual"]
+
+
+def test_lists_span_a_grid_with_the_first_key_slowest(load):
+    suite = load(
+        MINIMAL + 'forms = ["dual"]\nparams = { m = [2, 3], kind = "hard", n = [4, 5] }'
+    )
+
+    assert [(c.params["m"], c.params["n"]) for c in suite.cases] == [
+        (2, 4), (2, 5), (3, 4), (3, 5)
+    ]  # fmt: skip
+    assert {c.params["kind"] for c in suite.cases} == {"hard"}
+
+
+def test_forms_of_the_same_parameters_are_neighbours(load):
+    suite = load(MINIMAL + "params = { n = [2, 3] }")
+
+    assert names(suite) == [
+        "well/n=2/primal", "well/n=2/dual", "well/n=3/primal", "well/n=3/dual"
+    ]  # fmt: skip
+
+
+def test_zipped_lists_run_together_where_the_first_of_them_stands(load):
+    suite = load(
+        MINIMAL
+        + 'forms = ["dual"]\nzip = [["m", "n"]]\n'
+        + 'params = { n = [2, 3], kind = ["soft", "hard"], m = [8, 9] }'
+    )
+
+    assert [tuple(c.params.values()) for c in suite.cases] == [
+        (2, 8, "soft"), (2, 8, "hard"), (3, 9, "soft"), (3, 9, "hard")
+    ]  # fmt: skip
+
+
+def test_a_case_of_two_blocks_is_measured_once(load):
+    assert names(load(MINIMAL + BLOCK + "params = { n = [1, 2] }")) == [
+        "well/primal", "well/dual", "well/n=2/primal", "well/n=2/dual"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "repeat = 3\n" + MINIMAL,
+            "unknown key 'repeat'; did you mean 'repeats'? know",
+        ),
+        ("repeats = 0\n" + MINIMAL, "repeats = 0; expected an integer of at least 1"),
+        ("repeats = 2.0\n" + MINIMAL, "repeats = 2.0; expected an integer of at least"),
+        ("repeats = true\n" + MINIMAL, "repeats = True; expected an integer of at"),
+        ("time_limit = 0\n" + MINIMAL, "time_limit = 0; expected a positive number"),
+        ("time_limit = inf\n" + MINIMAL, "time_limit = inf; expected a positive numb"),
+        ("time_limit = '5'\n" + MINIMAL, "time_limit = '5'; expected a positive numb"),
+        ("memory_limit = -1\n" + MINIMAL, "memory_limit = -1; expected a positive nu"),
+        ("memory_limit = nan\n" + MINIMAL, "memory_limit = nan; expected a positive"),
+        ("tolerances = 1e-6\n" + MINIMAL, "tolerances = 1e-06; expected a list"),
+        ("tolerances = []\n" + MINIMAL, "tolerances is empty; expected at least one"),
+        ("tolerances = [1.0]\n" + MINIMAL, "tolerances = [1.0]; expected distinct num"),
+        ("tolerances = [0]\n" + MINIMAL, "tolerances = [0]; expected distinct numbers"),
+        ("tolerances = ['a']\n" + MINIMAL, "tolerances = ['a']; expected distinct num"),
+        ("tolerances = [0.1, 0.1]\n" + MINIMAL, "tolerances = [0.1, 0.1]; expected d"),
+        (BLOCK, "name is missing"),
+        ("name = 3\nsolvers = ['osqp']\n" + BLOCK, "name = 3; expected a text"),
+        (
+            "name = 'a/b'\nsolvers = ['osqp']\n" + BLOCK,
+            "name = 'a/b' is no name of a f",
+        ),
+        ("name = '..'\nsolvers = ['osqp']\n" + BLOCK, "name = '..' is no name of a fo"),
+        ("name = 'a'\n" + BLOCK, "solvers is missing"),
+        ("name = 'a'\nsolvers = []\n" + BLOCK, "solvers is empty; expected at least"),
+        ("name = 'a'\nsolvers = 'osqp'\n" + BLOCK, "solvers = 'osqp'; expected a list"),
+        (HEAD, "problems is missing"),
+        (HEAD + "problems = []", "problems is empty; expected at least one entry"),
+        (HEAD + "problems = [1]", "problems[0]: entry = 1; expected a table"),
+        (HEAD + "[[problems]]", "problems[0]: family is missing"),
+        (
+            MINIMAL + "form = []",
+            "problems[0]: unknown key 'form'; did you mean 'forms'",
+        ),
+        (MINIMAL + "forms = []", "problems[0]: forms is empty; expected at least one"),
+        (MINIMAL + "forms = [1]", "problems[0]: forms = 1; expected a text"),
+        (MINIMAL + "forms = ['duel']", "problems[0]: well: unknown form 'duel'; did y"),
+        (MINIMAL + "params = 3", "problems[0]: params = 3; expected a table"),
+        (MINIMAL + "params = { n = [] }", "problems[0]: params.n is empty; expected"),
+        (MINIMAL + "params = { k = 1 }", "problems[0]: well: unknown key 'k'; "),
+        (
+            MINIMAL + "params = { n = 2.0 }",
+            "problems[0]: well: n=2.0; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = '4' }",
+            "problems[0]: well: n='4'; expected an integer, such as 4",
+        ),
+        (
+            MINIMAL + "params = { n = true }",
+            "problems[0]: well: n=True; expected an integer, such as 4",
+        ),
+        (f"repeats = {5000 * '9'}\n" + MINIMAL, "an integer with too many digits"),
+        (f"time_limit = {400 * '9'}\n" + MINIMAL, "time_limit = 999"),
+        (
+            MINIMAL + f"params = {{ n = {20 * '9'} }}",
+            "problems[0]: well: n=99999999999999999999; expected an integer, such as 4",
+        ),
+        (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
+        (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
+        (MINIMAL + "zip = ['n']", "problems[0]: zip = 'n'; expected a list"),
+        (MINIMAL + "zip = [['n', 'm']]", "problems[0]: zip: 'n' is no list in params"),
+        (
+            MINIMAL + "zip = [['n', 'n']]\nparams = { n = [2, 3] }",
+            "problems[0]: zip: 'n' is no list in params, or is paired twice; expected",
+        ),
+        (
+            MINIMAL + "zip = [['n', 'm']]\nparams = { n = [2, 3], m = [2, 3, 4] }",
+            "problems[0]: zip: n has 2, m has 3 values; expected equally many",
+        ),
+        (
+            HEAD + "[[problems]]\nfamily = 'wall'",
+            "problems[0]: unknown family 'wall'; did you mean 'well'? known: well",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said_with_file_place_and_remedy(
+    load, tmp_path, text, message
+):
+    with pytest.raises(InputError) as e:
+        load(text)
+
+    assert str(e.value).startswith(f"{tmp_path / 'demo.toml'}: {message}")
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("'oskp'", "solvers[1]: unknown solver 'oskp'; did you mean 'osqp'? known: "),
+        ("3", "solvers[1]: entry = 3; expected a name or a table"),
+        ("{ label = 'a' }", "solvers[1]: name is missing"),
+        ("{ name = 'osqp', lable = 'a' }", "solvers[1]: unknown key 'lable'; did you"),
+        ("{ name = 'osqp', label = 3 }", "solvers[1]: label = 3; expected a text, not"),
+        (
+            "{ name = 'osqp', label = 'b', options = 3 }",
+            "solvers[1]: options = 3; expe",
+        ),
+        ("'osqp'", "solvers[1]: label 'osqp' is used twice; expected a label of its o"),
+        (
+            "{ name = 'clarabel', options = { max_itr = 9 } }",
+            "solvers[1]: clarabel: unknown option 'max_itr'; did you mean 'max_iter'?",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_solver_is_said_with_its_place(load, entry, message):
+    with pytest.raises(InputError) as e:
+        load(f"name = 'a'\nsolvers = ['osqp', {entry}]\n{BLOCK}")
+
+    assert f"demo.toml: {message}" in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name = \n", "line 1, column 8: Invalid value"),
+        ("name = 'a'\nname = 'b'\n", "line 2, column 11: Cannot overwrite a value"),
+        ("name = [", "end of document: Invalid value"),
+    ],
+)
+def test_malformed_toml_is_named_by_line(load, text, message):
+    with pytest.raises(InputError, match=rf"demo\.toml: {message}"):
+        load(text)
+
+
+def test_a_suite_that_cannot_be_read_is_refused(tmp_path):
+    latin = tmp_path / "latin.toml"
+    latin.write_bytes(b"name = '\xe9'")
+
+    with pytest.raises(
+        InputError, match=r"gone\.toml: No such file .* expected a TOML"
+    ):
+        load_suite(tmp_path / "gone.toml", FAMILIES, SOLVERS)
+    with pytest.raises(InputError, match=r"latin\.toml: not UTF-8; expected a TOML"):
+        load_suite(latin, FAMILIES, SOLVERS)
+
+
+@pytest.fixture
+def narrowed(load):
+    suite = load(
+        "time_limit = 9\nname = 'demo'\n"
+        "solvers = ['osqp', { name = 'clarabel', label = 'patient' }]\n"
+        "[[problems]]\nfamily = 'well'\nparams = { n = [2, 12] }\n"
+    )
+    return lambda **changes: with_overrides(suite, FAMILIES, SOLVERS, **changes)
+
+
+def test_solvers_are_chosen_by_label_or_added_by_name(narrowed):
+    chosen = narrowed(solvers=["other", "patient", "other"]).solvers
+
+    assert [(s.name, s.label) for s in chosen] == [
+        ("other", "other"), ("clarabel", "patient")
+    ]  # fmt: skip
+
+
+def test_patterns_choose_cases_in_the_suite_s_order(narrowed):
+    chosen = narrowed(cases=["*/n=12/*", "well/n=2/dual", "*/n=12/dual"])
+
+    assert names(chosen) == ["well/n=2/dual", "well/n=12/primal", "well/n=12/dual"]
+
+
+@pytest.mark.parametrize(
+    "written", ["well/n=2/kind=soft/dual", "well/m=1/n=+2/dual", "well/n=2/dual"]
+)
+def test_a_case_may_be_named_in_any_way_that_parses(narrowed, written):
+    assert names(narrowed(cases=[written])) == ["well/n=2/dual"]
+
+
+def test_a_pattern_in_vain_is_told_what_there_is(narrowed):
+    with pytest.raises(InputError) as e:
+        narrowed(cases=["well/n=3/dual"])
+
+    assert str(e.value).endswith(
+        "there are well/n=2/primal, well/n=2/dual, well/n=12/primal and 1 more"
+    )
+
+
+def test_limits_change_the_suite_as_run_and_nothing_else_does(narrowed):
+    before = narrowed()
+    after = narrowed(time_limit=2.5, memory_limit=100, repeats=1, cases=["*/dual"])
+
+    assert (after.time_limit, after.memory_limit, after.repeats) == (2.5, 100, 1)
+    assert tomllib.loads(after.text) == tomllib.loads(before.text) | {
+        "time_limit": 2.5, "memory_limit": 100
+    }  # fmt: skip
+    assert narrowed(repeats=1, solvers=["osqp"]).text == before.text
+
+
+@pytest.mark.parametrize("head", ["", "time_limit = 7\n"])
+def test_a_limit_of_the_suite_is_no_option_of_a_solver(load, head):
+    text = head + (
+        "name = 'demo'\n[[solvers]]\nname = 'osqp'\n"
+        "[solvers.options]\nmax_iter = 3\ntime_limit = 9\n" + BLOCK
+    )
+    solvers = {"osqp": Timed()}
+    suite = load(text, solvers)
+
+    after = with_overrides(suite, FAMILIES, solvers, time_limit=2.5)
+
+    assert tomllib.loads(after.text) == tomllib.loads(text) | {"time_limit": 2.5}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            dict(solvers=["patent"]),
+            "--solver: unknown solver 'patent'; did you mean 'p",
+        ),
+        (dict(cases=["well"]), "--case 'well' matches none of the 4 cases of suite 'd"),
+        (dict(cases=["*", "x*"]), "--case 'x.' matches none of the 4 cases of suite"),
+        (dict(repeats=0), "--repeats = 0; expected an integer of at least 1"),
+        (dict(time_limit=0.0), "--time-limit = 0.0; expected a positive number"),
+        (dict(memory_limit=-1.0), "--memory-limit = -1.0; expected a positive number"),
+    ],
+)
+def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
+    with pytest.raises(InputError, match=message):
+        narrowed(**changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "cases"),
+    [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6)],
+)
+def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
+    path = ROOT / "suites" / f"{name}.toml"
+    suite = load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
+
+    assert suite.name == name
+    assert suite.text.startswith("# ")
+    assert len(suite.cases) == cases
+    assert [s.label for s in suite.solvers] == ["smalbe", "osqp", "clarabel", "proxqp"]
+
+
+def shipped(name):
+    path = ROOT / "suites" / f"{name}.toml"
+    return load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
+
+
+def test_crossval_has_every_family_in_every_form_and_many_solvers():
+    crossval = shipped("crossval")
+
+    assert crossval.tolerances == (1e-8,)
+    assert len(crossval.cases) >= 40
+    assert len(crossval.solvers) >= 10
+    assert {(c.family, c.form) for c in crossval.cases} == {
+        (name, form)
+        for name, family in problems.PROBLEMS.items()
+        for form in family.forms
+    }
+
+
+def paths_of(suite):
+    return [c.params["path"] for c in suite.cases if "path" in c.params]
+
+
+def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    elsewhere = paths_of(shipped("crossval"))
+    monkeypatch.chdir(ROOT / "suites")
+    here = paths_of(shipped("crossval"))
+
+    assert set(here) == {"crossval/punch.toml", "crossval/hs76.qps"}
+    assert all(path.endswith(name) for path, name in zip(elsewhere, here, strict=True))
+    assert all((tmp_path / path).is_file() for path in elsewhere)
+
+
+def test_the_suite_of_the_load_path_is_one_sequence_per_form():
+    path = shipped("path")
+
+    assert path.cases == ()
+    assert [[c.params["step"] for c in s] for s in path.sequences] == [
+        list(range(1, 11))
+    ] * 2
+    assert [{c.form for c in s} for s in path.sequences] == [{"dual"}, {"dual-bounds"}]
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
+    """Six repeats are the fewest whose median has a 95 % interval."""
+    suite = shipped(name)
+    narrowed = with_overrides(
+        suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
+    )  # fmt: skip
+
+    assert (suite.name, suite.repeats) == (name, 6)
+    assert 0 < len(narrowed.cases) < len(suite.cases)
+    assert {"smalbe", "osqp", "piqp"} == {s.label for s in narrowed.solvers}
+
+
+def test_the_suite_of_accuracies_judges_at_one():
+    sweep = shipped("accuracy")
+
+    assert sweep.accuracy == 1e-6
+    assert len(sweep.tolerances) == 8
+
+
+def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():
+    paper = shipped("paper")
+
+    assert len(paper.cases) == 30
+    assert [(s.label, s.arm) for s in paper.solvers if s.name == "smalbe"] == [
+        ("smalbe", ""), ("smalbe (A/A)", "null"),
+    ]  # fmt: skip
+    assert (paper.precision, paper.max_repeats) == (0.1, 15)
+    kept = with_overrides(paper, problems.PROBLEMS, solvers.SOLVERS, solvers=["smalbe"])
+    assert [s.label for s in kept.solvers] == ["smalbe", "smalbe (A/A)"]
+
+
+def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
+    kept = with_overrides(
+        shipped("path"), problems.PROBLEMS, solvers.SOLVERS, cases=["*/step=3/dual"]
+    )
+
+    assert [[c.form for c in s] for s in kept.sequences] == [["dual"] * 10]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("precision = 2", "precision = 2; expected a number between 0 and 1"),
+        ("precison = 0.1", "unknown key 'precison'.*precision"),
+        ("max_repeats = 0", "max_repeats = 0; expected an integer of at least 1"),
+        ("budget = -1", "budget = -1; expected a positive number"),
+        ("accuracy = 'high'", "accuracy = 'high'; expected a number between 0 and 1"),
+        ("null_arm = 'smalb'", "unknown null_arm 'smalb'.*smalbe"),
+    ],
+)
+def test_a_schedule_that_makes_no_sense_is_refused(tmp_path, line, message):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        f"name = 's'\nsolvers = ['smalbe']\n{line}\n[[problems]]\nfamily = 'obstacle'\n"
+    )
+    with pytest.raises(InputError, match=message):
+        load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
+
+
+@pytest.mark.parametrize("key", ["'dim'", "'m'", "3"])
+def test_a_sequence_along_no_list_is_refused(tmp_path, key):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        "name = 's'\nsolvers = ['smalbe']\n[[problems]]\nfamily = 'obstacle'\n"
+        f"sequence = {key}\nparams = {{ dim = 2, n = [4, 8] }}\n"
+    )
+    with pytest.raises(InputError, match=r"problems\[0\]: sequence = "):
+        load_suite(file, problems.PROBLEMS, solvers.SOLVERS)

@@ -1,0 +1,329 @@
+"""Certificates where contact alone holds bodies, or bodies move far as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from harness import Case, Solution, Status, UncertifiableError, certify
+from harness.build import build
+from harness.mechanics import Extended, Mechanics, Real, _cancelling
+from harness.names import parse
+from harness.verify.admissible import _newton, admissible, balanced
+from harness.verify.certificate import Certificate, _Reach, _rounding
+from harness.verify.kkt import kkt_residuals
+from harness.verify.references import reference_point
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support.held_by_contact import disc_between_plates, stored_solution
+
+ROUNDED = 1 + 1e-9
+
+
+def named(name: str) -> Case:
+    family = PROBLEMS[name.partition("/")[0]]
+    return build(parse(f"{name}/primal", PROBLEMS), family, reference_solution)
+
+
+disc = partial(partial, disc_between_plates)
+RATIOS = [
+    f"contact-patch/lower=3/upper=2/ratio=1e{e}" for e in (-12, -9, -6, -3, 6, 12)
+]
+MAKERS: dict[str, Callable[[], Case]] = {
+    **{name: partial(named, name) for name in (
+        *RATIOS,
+        "contact-patch/lower=3/upper=2/ratio=1e-9/slave=lower",
+        "contact-patch/lower=3/upper=2/ratio=1e-6/slave=lower/contact=nts",
+        "hertz-plane/n=3", "obstacle/n=8", "beam-ring/Nr=2/Nh=2/step=5",
+        "beam-ring/Nr=2/Nh=2/step=3/contact=mortar",
+    )},
+    "disc that slides": disc(),
+    "disc under rollers": disc(rollers=True),
+    "tilted disc": disc(tilt=0.5),
+    "disc as master": disc(disc_is_slave=False),
+    "tilted disc as master": disc(disc_is_slave=False, tilt=0.5),
+    "mortar disc that rolls": disc(contact="mortar", disc_is_slave=False),
+    "tilted mortar disc": disc(contact="mortar", disc_is_slave=False, tilt=0.5),
+    "soft disc": disc(E=(70e9, 70e3, 70e9)),
+    "stiff disc": disc(E=(70e6, 70e14, 70e6)),
+    "soft plate": disc(E=(70e3, 70e9, 70e12)),
+}  # fmt: skip
+#: its solution in rational arithmetic takes many seconds: a slow test
+LONG = "hertz-plane/n=3"
+NAMES = [n if n != LONG else pytest.param(n, marks=pytest.mark.slow) for n in MAKERS]
+
+
+@cache
+def known(name: str) -> tuple[Mechanics, Extended, Extended, float]:
+    """Give the problem, its solution u and λ, and the norm of u."""
+    mechanics = MAKERS[name]().mechanics
+    assert mechanics is not None
+    point = reference_point(mechanics, reference_solution)
+    closed = point.multipliers > 1e-9 * point.multipliers.max()
+    u, lam = stored_solution(mechanics, closed, point.u)
+    return mechanics, u, lam, mechanics.norm(u)
+
+
+def answer(u: Extended, lam: Extended) -> Solution:
+    x, z, none = u.astype(np.float64), lam.astype(np.float64), np.zeros(0)
+    return Solution(status=Status.SOLVED, x=x, y=none, z=z, z_box=0 * x)
+
+
+def _noise(m, s, size, rng):
+    return replace(
+        s, x=s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size),
+        z=s.z + size * s.z.max() * rng.standard_normal(s.z.size),
+    )  # fmt: skip
+
+
+def _relative_noise(m, s, size, rng):
+    x = s.x * (1 + size * rng.standard_normal(s.x.size))
+    return replace(s, x=x, z=s.z * (1 + size * rng.standard_normal(s.z.size)))
+
+
+def _scaled(m, s, size, rng):
+    return replace(s, x=(1 + size) * s.x, z=(1 - size) * s.z)
+
+
+def _moved_bodies(m, s, size, rng):
+    """Move every body rigidly, as far as supports leave them."""
+    R = m.inverse.kernel
+    if not R.shape[1]:
+        return _scaled(m, s, size, rng)
+    far = size * np.linalg.norm(s.x) * rng.standard_normal(R.shape[1])
+    return replace(s, x=s.x + R @ far)
+
+
+def _shifted_multipliers(m, s, size, rng):
+    """Move multipliers along the null space of Gᵀ, so that balance shows nothing."""
+    d = rng.standard_normal(s.z.size) * (s.z + 0.1 * s.z.max() * (rng.random() < 0.5))
+    G = m.primal.G @ m.inverse.kernel
+    if G.shape[1]:
+        d = d - G @ np.linalg.lstsq(G.T @ G, G.T @ d, rcond=1e-12)[0]
+    return replace(s, z=s.z + size * d)
+
+
+def _swapped_rows(m, s, size, rng):
+    z = s.z.copy()
+    i = rng.integers(z.size, size=2)
+    z[i] = z[i[::-1]]
+    return replace(s, z=z, x=s.x * (1 + size))
+
+
+def _softest_modes(m, s, size, rng):
+    """Disturb by what little force bends most."""
+    v = m.relaxed(m.relaxed(rng.standard_normal(s.x.size).astype(Real)))
+    return replace(s, x=s.x + (size * m.norm(s.x) / m.norm(v) * v).astype(np.float64))
+
+
+KINDS = (
+    _noise, _relative_noise, _scaled, _moved_bodies, _shifted_multipliers,
+    _swapped_rows, _softest_modes,
+)  # fmt: skip
+
+
+def attack(name: str, count: int) -> tuple[list[str], list[float]]:
+    """Tell exceeded bounds and missing ones; give bound over true error."""
+    mechanics, u, lam, length = known(name)
+    rng, told, sharp = np.random.default_rng(sum(map(ord, name))), [], []
+    for i in range(count):
+        kind, size = KINDS[i % len(KINDS)], 10 ** rng.uniform(-12, 0)
+        s = kind(mechanics, answer(u, lam), size, rng)
+        try:
+            found = certify(mechanics, s)
+        except UncertifiableError as e:
+            if mechanics.norm(s.x.astype(Real) - u) < length:  # others need none
+                told.append(f"{kind.__name__} {size:.0e}: {e}")
+            continue
+        errors = errors_of(mechanics, u, s, found)
+        if max(errors) > ROUNDED * found.bound * length:
+            told.append(
+                f"{kind.__name__} {size:.0e}: {errors} > {found.bound * length}"
+            )
+        if found.bound > 1e-7:  # below, rounding is what is bounded
+            sharp.append(found.bound * length / max(errors))
+    return told, sharp
+
+
+def errors_of(
+    mechanics: Mechanics, u: Extended, s: Solution, found: Certificate
+) -> list[float]:
+    points = (s.x.astype(Real), found.u, found.equilibrium)
+    return [mechanics.norm(v - u) for v in points]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_answer_is_further_from_the_stored_problem_than_its_bound(name):
+    told, _ = attack(name, 7)
+    assert told == []
+
+
+@pytest.mark.slow
+def test_none_of_ten_thousand_is_and_bounds_are_sharp():
+    results = [attack(name, 10_000 // len(MAKERS) + 1) for name in MAKERS]
+    assert [told for told, _ in results] == [[]] * len(MAKERS)
+    assert np.median([e for _, sharp in results for e in sharp]) <= 2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_stored_solution_is_certified_to_six_digits(name):
+    mechanics, u, lam, _ = known(name)
+    assert certify(mechanics, answer(u, lam)).bound <= 1e-6
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize("tilt", [0.0, 0.5])
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+def test_a_disc_between_plates_is_certified_to_six_digits(form, tilt, contact):
+    """Contact does not feel the disc slide, nor, with its own normals, roll."""
+    case = disc_between_plates(
+        8, form=form, tilt=tilt, contact=contact, disc_is_slave=contact == "nts"
+    )
+    s = SOLVERS["piqp"].prepare(case.qp, 1e-10)()
+    assert kkt_residuals(case.qp, s).worst < 1e-9
+    found = certify(case.mechanics, case.mechanics.back(s))
+    assert found.bound <= 1e-6
+    assert found.seminorm
+
+
+def test_a_load_that_nothing_balances_is_named():
+    mechanics = disc_between_plates(push=0.1).mechanics
+    s = answer(0 * mechanics.exact.f, np.ones_like(mechanics.exact.c))
+    with pytest.raises(UncertifiableError, match="load of body upper along x"):
+        certify(mechanics, s)
+
+
+def test_a_load_that_contact_would_have_to_pull_is_another_cause():
+    mechanics = disc_between_plates().mechanics
+    lifted = replace(mechanics, primal=replace(mechanics.primal, q=-mechanics.primal.q))
+    s = answer(0 * lifted.exact.f, np.ones_like(lifted.exact.c))
+    with pytest.raises(UncertifiableError, match="contact would have to pull"):
+        certify(lifted, s)
+
+
+def test_contact_feels_no_sliding_but_all_else():
+    """Two bodies, three motions each; along the plates neither is felt, however tilted.
+
+    The disc as master of pointwise rows is a polygon, which feels them all.
+    """
+    for tilt in (0.0, 0.5, 1.0):
+        motions = disc_between_plates(tilt=tilt).mechanics.motions
+        assert (motions.felt.shape[1], motions.free.shape[1]) == (4, 2)
+    motions = disc_between_plates(disc_is_slave=False).mechanics.motions
+    assert (motions.felt.shape[1], motions.free.shape[1]) == (6, 0)
+
+
+def test_what_rigid_motions_do_to_a_stored_matrix_is_known_to_its_last_digits():
+    from fractions import Fraction
+
+    mechanics = disc_between_plates().mechanics
+    K, R = mechanics.primal.P.toarray(), mechanics.inverse.kernel[:, :1]
+    found = _cancelling(mechanics.primal.P.tocsr(), R.astype(Real))[:, 0]
+    for i in range(60, 90):
+        terms = [Fraction(a) * Fraction(b) for a, b in zip(K[i], R[:, 0], strict=True)]
+        exact = sum(terms)
+        error = abs(
+            Fraction(float(found[i]))
+            + Fraction(float(found[i] - float(found[i])))
+            - exact
+        )
+        assert error <= Fraction(1, 2**80) * sum(map(abs, terms))
+
+
+def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
+    """|B_i v| ≤ φ_i‖v‖ for every v without rigid motion, and one v attains it."""
+    mechanics = disc_between_plates().mechanics
+    for i in (0, 3):
+        row = mechanics.exact.B[[i]].toarray()[0]
+        v = mechanics.relaxed(row)
+        attained = float(row @ v) / mechanics.norm(v)
+        assert attained == pytest.approx(mechanics.compliance[i], rel=1e-9)
+
+
+def test_the_charge_of_rounding_solves_its_inequality():
+    """One held motion: γ ≤ 2√s, s = 1 + charge, charge ≥ 2γρ + √(8s)γσ + 2γ²κ."""
+    mechanics = disc_between_plates().mechanics
+    motions = mechanics.motions
+    one = np.zeros((motions.felt.shape[1], 1))
+    one[0] = 1
+    reach = _Reach(one, np.zeros(1), np.full(1, 2.0), np.zeros(1))
+
+    def charge(rho: float, sigma: float, kappa: float) -> float:
+        mechanics.__dict__["motions"] = motions._replace(
+            strain=sigma**2 * np.eye(len(one)), curvature=-kappa * np.eye(len(one))
+        )
+        return _rounding(mechanics, reach, rho * one[:, 0], 0.0, 1.0)
+
+    for rho, sigma, kappa in ((1e-3, 0, 0), (0, 1e-3, 0), (0, 0, 1e-3)):
+        s = 1 + charge(rho, sigma, kappa)
+        gamma = 2 * np.sqrt(s)
+        needed = 2 * gamma * rho + np.sqrt(8 * s) * gamma * sigma + 2 * gamma**2 * kappa
+        assert needed <= s - 1 <= 1.05 * needed
+    assert charge(0, 0, 1.0) == np.inf  # it is stronger than all that holds the motion
+
+
+def test_a_gap_that_is_closed_from_the_start_lets_nothing_shrink():
+    """θu with θ < 1 is no way out where u = 0 penetrates, c < 0."""
+    mechanics = named("obstacle/dim=1/n=16").mechanics
+    primal = mechanics.primal
+    blocked = replace(primal, h=np.full_like(primal.h, -1.0), G=0 * primal.G)
+    u = np.ones(primal.q.size, dtype=Real)
+    none = np.zeros(primal.h.size, dtype=bool)
+    with np.errstate(all="ignore"):
+        assert admissible(replace(mechanics, primal=blocked), u, none) is None
+
+
+@pytest.mark.parametrize("name", ["disc that slides", "soft plate", RATIOS[0]])
+def test_admissible_points_do_not_penetrate_in_exact_arithmetic(name):
+    from fractions import Fraction
+
+    mechanics, u, lam, _ = known(name)
+    found = certify(mechanics, answer(u, lam)).u
+    exact = [Fraction(float(v)) + Fraction(float(v - float(v))) for v in found]
+    B = mechanics.primal.G.tocsr()
+    for i, c in enumerate(mechanics.primal.h):
+        row = slice(B.indptr[i], B.indptr[i + 1])
+        reach = sum(
+            Fraction(b) * exact[j]
+            for j, b in zip(B.indices[row], B.data[row], strict=True)
+        )
+        assert reach <= Fraction(c)
+
+
+@pytest.mark.parametrize("name", ["disc that slides", RATIOS[0], RATIOS[-1]])
+def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
+    mechanics, u, lam, _ = known(name)
+    rng, motions = np.random.default_rng(1), mechanics.motions
+    for size in (1e-12, 1e-3):
+        start = np.maximum(lam * (1 + size * rng.standard_normal(lam.size)), 0)
+        found = balanced(mechanics, start, u)
+        left = (
+            motions.felt.T @ mechanics.exact.f - motions.KR.T @ u - motions.G.T @ found
+        )
+        terms = motions.largest.T @ np.abs(mechanics.exact.f)
+        assert (found >= 0).all()
+        assert (np.abs(left) <= 1e-16 * terms.max()).all()
+
+
+def test_balance_is_not_sought_beyond_what_rounding_allows():
+    """Sums of terms that cancel are known to the rounding of the terms only."""
+    G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
+    lam = np.ones(2, dtype=Real)
+    found = _newton(lam, lam, G, load, lambda lam: np.abs(G).T @ lam)
+    assert found is not None
+    assert (found == lam).all()
+
+
+@pytest.mark.parametrize("name", ["disc under rollers", "stiff disc"])
+def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
+    """Contact pushes, but not where the answer says: that is no reason for a null."""
+    mechanics, u, lam, _ = known(name)
+    rng = np.random.default_rng(sum(map(ord, name)))
+    s = answer(u, lam)
+    for _ in range(40):
+        assert certify(mechanics, _swapped_rows(mechanics, s, 1e-6, rng)).bound > 0

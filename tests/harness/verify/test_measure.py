@@ -1,0 +1,182 @@
+"""The clock in this process; what kills a process is in test_run.py."""
+
+import gc
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import harness.verify.measure
+from harness import Status
+from harness.registry import load_plugin
+from harness.verify.measure import measure
+from tests.support import ADVERSARIES
+
+PLUGIN = load_plugin(ADVERSARIES)
+
+
+@pytest.fixture
+def qp():
+    tiny = PLUGIN.problems["tiny"]
+    return tiny.build("plain", tiny.defaults, None).qp
+
+
+def outcome(solver, qp):
+    s = measure(PLUGIN.solvers[solver], qp, 1e-6).solution
+    return s.status, s.message
+
+
+@pytest.mark.parametrize(
+    ("solver", "status", "message"),
+    [
+        ("honest", Status.SOLVED, ""),
+        ("raises", Status.FAILED, "ValueError: first line second line"),
+        ("exits", Status.FAILED, "SystemExit: 3"),
+        ("mutates", Status.FAILED, "ValueError: assignment destination is read-only"),
+        ("declines", Status.DECLINED, "never on a Monday"),
+        ("returnsnone", Status.FAILED, "returned NoneType, expected Solution"),
+        ("wrongshape", Status.FAILED, "Solution.x has shape (3,), expected (2,)"),
+        (
+            "lacks",
+            Status.DECLINED,
+            "not installed: a_library_nobody_has (pip install a_library_nobody_has)",
+        ),
+    ],
+)
+def test_whatever_a_solver_does_is_a_status_and_one_line(qp, solver, status, message):
+    assert outcome(solver, qp) == (status, message)
+
+
+def test_both_phases_are_timed_and_add_up(qp):
+    m = measure(PLUGIN.solvers["honest"], qp, 1e-6)
+
+    assert m.prepare_seconds > 0
+    assert m.solve_seconds > 0
+    assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
+
+
+@pytest.mark.parametrize("sample_seconds", [0.0, 0.1])
+def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_seconds):
+    """By a clock that only the solver moves: 1 ms to prepare, 4 ms to solve."""
+    now = [0.0]
+    honest = PLUGIN.solvers["honest"]
+
+    class Moves(type(honest)):
+        def prepare(self, qp, tol):
+            solve = super().prepare(qp, tol)
+            now[0] += 0.001
+
+            def moving():
+                now[0] += 0.004
+                return solve()
+
+            return moving
+
+    clock = sys.modules["harness.verify.measure"]
+    monkeypatch.setattr(clock, "perf_counter", lambda: now[0])
+    m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds)
+
+    assert (m.prepare_seconds, m.solve_seconds) == pytest.approx((0.001, 0.004))
+    assert m.total_seconds == pytest.approx(0.005)
+    assert m.inner == (20 if sample_seconds else 1)
+    assert now[0] == pytest.approx(0.105 if sample_seconds else 0.005)
+
+
+def test_each_phase_has_a_peak_of_its_own(qp):
+    """What preparing needed and gave back is not counted where it solves."""
+    honest = PLUGIN.solvers["honest"]
+
+    class Hungry(type(honest)):
+        def prepare(self, qp, tol):
+            np.ones(2**24)  # 128 MiB
+            return super().prepare(qp, tol)
+
+    m = measure(Hungry(), qp, 1e-6)
+
+    assert m.prepare_peak_mib > m.solve_peak_mib + 100
+    assert m.peak_mib == m.prepare_peak_mib
+
+
+def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
+    class Hungry(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            np.ones(2**24)  # 128 MiB
+            return super().act(qp)
+
+    modest = PLUGIN.solvers["honest"]
+    before = measure(modest, qp, 1e-6).peak_mib
+    hungry = measure(Hungry(), qp, 1e-6).peak_mib
+    after = measure(modest, qp, 1e-6).peak_mib
+
+    assert before + 100 < hungry < before + 300
+    assert after < before + 50
+
+
+def test_values_that_only_look_plain_become_plain(qp):
+    s = measure(PLUGIN.solvers["numpyscalars"], qp, 1e-6).solution
+
+    assert s.status is Status.SOLVED
+    assert type(s.iterations) is int
+    assert type(s.counts["products"]) is int
+
+
+def test_garbage_is_not_collected_while_the_clock_runs(qp):
+    class Looks(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            raise ValueError(f"gc is {gc.isenabled()}")
+
+    assert measure(Looks(), qp, 1e-6).solution.message == "ValueError: gc is False"
+    assert gc.isenabled()
+
+
+def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
+    monkeypatch.setattr(harness.verify.measure, "_inner", lambda *_: 3)
+    seen = []
+
+    class Sees(type(PLUGIN.solvers["honest"])):
+        def prepare(self, qp, tol):
+            seen.append(qp)
+            return super().prepare(qp, tol)
+
+    measure(Sees(), qp, 1e-6, sample_seconds=1.0)
+
+    for part in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
+        assert len({id(getattr(qp, part)) for qp in seen}) == 4, part
+    assert len({id(qp.P.data) for qp in seen}) == 4
+    for other in seen:
+        assert (other.P - qp.P).nnz == (other.G - qp.G).nnz == 0
+        assert np.array_equal(other.q, qp.q)
+        assert not other.q.flags.writeable
+
+
+def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
+    asked = []
+    clock = iter(range(100))
+
+    class Asks(type(PLUGIN.solvers["honest"])):
+        def declines(self, qp):
+            asked.append(next(clock))
+
+    monkeypatch.setattr(harness.verify.measure, "perf_counter", lambda: next(clock))
+    m = measure(Asks(), qp, 1e-6)
+
+    assert asked == [1]  # the clock had been read once
+    assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked
+
+
+def test_processes_of_runs_import_nothing_that_they_never_call():
+    """They start tens of times a run: statistics alone would double what that takes."""
+    needless = {
+        "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.spatial",
+        "matplotlib", "pandas", "pyarrow", "distributed", "rich",
+    }  # fmt: skip
+    program = "import sys, mortarbench.__main__; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert needless & set(done.stdout.split()) == set()

@@ -1,0 +1,740 @@
+"""The command line: what it prints where, and with which exit code."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from harness.files.qpfile import load_qp
+from harness.processes.reaper import lives
+from harness.registry import load_plugin
+from harness.results.journal import Journal, read_journal
+from harness.running.progress import shown_on
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from tests.support import TOY_PROBLEM
+
+SOLVERS = load_plugin(TOY_PROBLEM).solvers
+FAMILIES = load_plugin(TOY_PROBLEM).problems
+
+
+def report(folder, formats, *, factor=10.0):
+    name = "index" if factor == 10 else f"index-{factor:g}"
+    return [folder / f"{name}.{f}" for f in formats]
+
+
+def paper(out, quick, say):
+    say("Figure 1")
+    return [out / f"index-{quick}.html", out / "figure1.pdf"]
+
+
+@pytest.fixture
+def registries(tmp_path):
+    suites = tmp_path / "suites"
+    suites.mkdir()
+    (suites / "tiny.toml").write_text(
+        "# For tests.\nname = 'tiny'\nsolvers = ['exact']\n"
+        "[[problems]]\nfamily = 'well'\n"
+    )
+    return Registries(
+        families=FAMILIES,
+        solvers=SOLVERS,
+        reference=lambda qp: SOLVERS["exact"].prepare(qp, 0.0)(),
+        report=report,
+        plot=lambda fields, path: path.write_bytes(b"picture"),
+        vtu=lambda fields, path: path.write_bytes(b"grid"),
+        series=lambda states, path: path.write_bytes(b"series"),
+        paper=paper,
+        suites=suites,
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+    )
+
+
+@pytest.fixture
+def cli(registries, capsys, monkeypatch, tmp_path):
+    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+
+    def cli(*argv):
+        code = main(registries, [str(word) for word in argv])
+        streams = capsys.readouterr()
+        return code, streams.out, streams.err
+
+    return cli
+
+
+def test_problems_are_listed_with_defaults_and_forms(cli):
+    code, out, _ = cli("list", "problems")
+
+    assert code == 0
+    assert (
+        out == "well  A parabola over a half line.  n=3 depth=1  primal | dual\n"
+    )  # one sentence of two
+
+
+def test_solvers_are_listed_one_line_each(cli):
+    _, out, _ = cli("list", "solvers")
+
+    assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
+    first = " ".join(out.splitlines()[0].split())
+    assert first == "exact Divides by a diagonal. factor=1.0 reason=None"
+    assert "Lost(" not in out  # no sentence, only what dataclass makes up
+
+
+def test_suites_are_listed_with_their_purpose(cli):
+    assert cli("list", "suites") == (0, "tiny  For tests.\n", "")
+
+
+@pytest.mark.parametrize(
+    ("what", "expected"),
+    [
+        ("problems", {"name": "well", "forms": ["primal", "dual"],
+                      "defaults": {"n": 3, "depth": 1},
+                      "description": "A parabola over a half line."}),
+        ("solvers", {"name": "exact", "options": {"factor": 1.0, "reason": None},
+                     "description": "Divides by a diagonal."}),
+    ],
+)  # fmt: skip
+def test_lists_are_one_json_array_for_machines(cli, what, expected):
+    _, out, _ = cli("list", what, "--json")
+
+    assert json.loads(out)[0] == expected
+
+
+def test_a_verified_solve_exits_with_0_and_shows_si_units(cli):
+    code, out, err = cli("solve", "well/n=2/primal", "--solver", "exact")
+
+    rows = dict(line.split("  ", 1) for line in out.splitlines())
+    assert (code, err) == (0, "")
+    assert rows["case"].strip() == "well/n=2/primal"
+    assert rows["status"].strip() == "verified (claimed solved)"
+    assert rows["energy"].strip() == "-2 J/m"
+    assert rows["tip"].strip() == "(1, 1) m"
+
+
+def test_solve_prints_one_json_object_with_canonical_name_and_quantities(cli):
+    code, out, _ = cli(
+        "solve", "well/depth=1/n=2/primal", "--solver", "exact", "--tol", "1e-6",
+        "--json",
+    )  # fmt: skip
+
+    record = json.loads(out)
+    assert code == 0
+    assert out.count("\n") == 1
+    assert record["case"] == "well/n=2/primal"
+    assert record["params"] == {"n": 2, "depth": 1}
+    assert record["options"] == {"factor": 1.0, "reason": None}
+    assert record["sizes"]["variables"] == 2
+    assert (record["tol"], record["status"]) == (1e-6, "verified")
+    assert record["objective"] == pytest.approx(-1)
+    assert record["quantities"] == {
+        "dofs": 2, "energy": pytest.approx(-2), "tip": [1.0, 1.0]
+    }  # fmt: skip
+    assert record["environment"]
+
+
+def test_a_refuted_claim_exits_with_1(cli):
+    code, out, _ = cli("solve", "well/primal", "--solver", "liar", "--json")
+
+    record = json.loads(out)
+    assert (code, record["claimed"], record["status"]) == (1, "solved", "wrong")
+
+
+def test_the_tolerance_asked_for_decides_the_verdict(cli):
+    command = ("solve", "well/primal", "--solver", "near", "--tol")
+
+    assert [cli(*command, tol)[0] for tol in ("1e-6", "1e-2")] == [1, 0]
+
+
+def test_a_solver_is_told_the_tolerance(cli):
+    _, out, _ = cli(
+        "solve", "well/n=1/primal", "--solver", "lax", "--tol", "0.1", "--json"
+    )
+
+    assert json.loads(out)["quantities"]["tip"] == [pytest.approx(1.1)]
+
+
+def test_a_solver_that_declines_exits_with_1_and_its_reason_on_stderr(cli):
+    assert cli("solve", "well/primal", "--solver", "picky") == (
+        1, "", "mortarbench: picky declines well/primal: never on a Monday\n"
+    )  # fmt: skip
+
+
+def test_a_picture_is_drawn_of_a_point_and_of_nothing_else(cli, tmp_path):
+    picture = tmp_path / "a.png"
+    drawn = cli("solve", "well/primal", "--solver", "exact", "--plot", picture)
+    lost = cli("solve", "well/primal", "--solver", "lost", "--plot", tmp_path / "b.png")
+
+    assert drawn[0] == 0
+    assert picture.read_bytes() == b"picture"
+    assert lost[0] == 1
+    assert "no picture: lost returned no point" in lost[2]
+    assert not (tmp_path / "b.png").exists()
+
+
+def test_an_exported_qp_is_the_emitted_one_and_says_whose_it_is(cli, tmp_path):
+    file = tmp_path / "well.npz"
+    code, out, _ = cli("export", "well/depth=4/n=2/dual", file)
+
+    qp, meta = load_qp(file)
+    assert (code, out) == (0, f"{file}\n")
+    assert qp.q.tolist() == [-4, -4]
+    assert meta["name"] == "well/n=2/depth=4/dual"
+    assert (meta["scale"], meta["constant"]) == (2.0, 0.0)
+
+
+def test_report_names_the_files_that_it_wrote(cli):
+    code, out, _ = cli("report", "folder", "--format", "md,tex")
+
+    assert (code, out.splitlines()) == (
+        0,
+        ["folder/index.md", "folder/index.tex"],
+    )
+    assert len(cli("report", "folder")[1].splitlines()) == 5
+
+
+def test_report_judges_at_the_factor_that_is_asked_for(cli):
+    assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
+        0, "folder/index-2.5.md\n", "",
+    )  # fmt: skip
+
+
+def compare(before, after, formats, *, factor):
+    said = [f"{before.name} and {after.name} at {factor:g}", "nothing changed"]
+    return said, [after / f"{form}.{form}" for form in formats]
+
+
+def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(registries, capsys):
+    bench = replace(registries, compare=compare)
+    argv = ["report", "one", "two", "--factor", "3"]
+
+    assert main(bench, [*argv, "--format", "csv,html,md"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "one and two at 3", "nothing changed", "two/html.html",
+    ]  # fmt: skip
+    assert main(bench, [*argv, "--format", "csv,md"]) == 0
+    assert capsys.readouterr().out.splitlines()[2:] == ["two/csv.csv", "two/md.md"]
+
+
+@pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
+def test_a_factor_that_is_not_positive_is_refused(cli, factor):
+    code, out, err = cli("report", "folder", "--factor", factor)
+
+    assert (code, out) == (2, "")
+    assert f"--factor = {float(factor)}; expected a positive number" in err
+
+
+def test_doctor_describes_the_machine(cli):
+    code, out, _ = cli("doctor")
+
+    assert code == 0
+    assert "numpy" in out
+    assert "→" not in out or "warn" in out
+
+
+def test_doctor_tells_machines_the_same(cli):
+    code, out, _ = cli("doctor", "--json")
+    told = json.loads(out)
+
+    assert code == 0
+    assert told["environment"]["versions"]["numpy"]
+    assert {check["level"] for check in told["checks"]} <= {"ok", "warn", "unknown"}
+    assert told["fit"] == all(c["level"] != "warn" for c in told["checks"])
+    assert told["noise"]["low"] <= told["noise"]["ratio"] <= told["noise"]["high"]
+
+
+def test_an_interrupt_exits_with_130_and_one_line(cli):
+    code, out, err = cli("solve", "well/depth=13/primal", "--solver", "exact")
+
+    assert (code, out, err) == (130, "", "mortarbench: interrupted\n")
+
+
+def test_an_interrupted_run_says_how_to_continue(cli, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Journal, "append", interrupt)
+    code, out, err = cli("run", "tiny")
+
+    assert (code, out) == (130, "")
+    assert err.endswith("\nmortarbench: interrupted; the same command continues\n")
+
+
+def test_a_solver_may_print_what_it_likes(cli):
+    code, out, _ = cli("solve", "well/primal", "--solver", "prints", "--json")
+
+    assert (code, json.loads(out)["status"]) == (0, "verified")
+    assert out.count("\n") == 1
+
+
+def test_a_solver_that_dies_is_a_record_like_any_other(cli):
+    code, out, _ = cli("solve", "well/primal", "--solver", "dies", "--json")
+
+    record = json.loads(out)
+    assert (code, record["status"]) == (1, "crashed")
+    assert record["message"] == "exit code 7: my last words"
+    assert record["sizes"]["variables"] == 3
+
+
+def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
+    started = tmp_path / "started"
+    with subprocess.Popen(
+        [sys.executable, "-m", "harness", "solve", "well/primal", "--solver", "hangs",
+         "--plugin", TOY_PROBLEM],
+        env=os.environ | {"STARTED": str(started)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # what a shell starts in the background ignores interrupts otherwise
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as command:  # fmt: skip
+        while command.poll() is None and not (started.exists() and started.read_text()):
+            time.sleep(0.05)
+        command.send_signal(signal.SIGINT)
+        try:
+            out, err = command.communicate(timeout=60)
+        finally:
+            command.kill()  # leaving the block waits for it
+
+    assert (command.returncode, out) == (130, "")
+    assert err == "mortarbench: interrupted\n"
+    assert not lives(int(started.read_text()))
+
+
+def test_what_a_plugin_prints_is_no_result(cli, pit):
+    code, out, err = cli(
+        "solve", "pit/primal", "--solver", "times", "--plugin", "plug.py", "--json"
+    )
+
+    assert (code, json.loads(out)["status"]) == (0, "verified")
+    assert out.count("\n") == 1
+    assert "a plug-in says hello" in err
+    assert "a family says hello" in err
+
+
+def test_numbers_that_there_are_not_and_units_of_no_body_are_not_shown(cli):
+    lost = cli("solve", "well/primal", "--solver", "lost")[1]
+    dual = cli("solve", "well/dual", "--solver", "exact")[1]
+
+    assert "nan" not in lost.lower()
+    assert "residual" not in lost
+    assert "energy                    -3\n" in dual
+    assert "J/m" not in dual
+
+
+def test_output_cut_off_by_its_reader_is_no_fault():
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", "list", "solvers"],
+        stdout=writing, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    os.close(writing)
+
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_terminal_of_few_characters_is_enough(tmp_path):
+    (tmp_path / "plug.py").write_text(
+        PLUGIN.replace("class Pit:\n", 'class Pit:\n    """λ ≥ 0."""\n'), "utf-8"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", "list", "problems", "--plugin", "plug.py"],
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    assert done.returncode == 0
+    assert "? ? 0." in done.stdout
+
+
+def test_a_file_that_cannot_be_written_is_named(registries, capsys):
+    def report(folder, formats, **_):
+        raise PermissionError(13, "Permission denied", str(folder / "index.html"))
+
+    assert main(replace(registries, report=report), ["report", "here"]) == 2
+    assert capsys.readouterr().err == (
+        "mortarbench: here/index.html: Permission denied\n"
+    )
+
+
+def test_a_fault_of_ours_exits_with_3_and_a_traceback(cli):
+    code, out, err = cli("solve", "well/depth=99/primal", "--solver", "exact")
+
+    assert (code, out) == (3, "")
+    assert "Traceback" in err
+    assert "ZeroDivisionError: a fault of ours" in err
+
+
+SOLVE = ("solve", "well/primal", "--solver", "exact")
+WRONG = {
+    "no command": ((), "the following arguments are required: COMMAND; usage: morta"),
+    "unknown command": (("rnu",), "'rnu' (choose from"),
+    "unknown list": (("list", "sovlers"), "'sovlers' (choose from"),
+    "unknown option": (("run", "tiny", "--repeat", "3"), "unknown argument '--repeat'"),
+    "no integer": (
+        ("run", "tiny", "--repeats", "x"),
+        "argument --repeats: invalid int",
+    ),
+    "no solver": (("solve", "well/primal"), "arguments are required: --solver"),
+    "unknown solver": (
+        ("solve", "well/primal", "--solver", "exat"),
+        "unknown solver 'exat'; did you mean 'exact'? known: dies, exact, hang",
+    ),
+    "unknown family": (
+        ("solve", "wel/primal", "--solver", "exact"),
+        "unknown family 'wel'; did you mean 'well'? known: well",
+    ),
+    "unknown key": (
+        ("solve", "well/dept=2/primal", "--solver", "exact"),
+        "well: unknown key 'dept'; did you mean 'depth'? known: depth, n",
+    ),
+    "bad value": (
+        ("export", "well/n=two/primal", "a.npz"),
+        "well: n='two'; expected an integer, such as 4",
+    ),
+    "value out of range": (
+        ("solve", "well/n=0/primal", "--solver", "exact"),
+        "well: n=0 must be at least 1",
+    ),
+    "malformed case": (
+        ("export", "well/n/primal", "a.npz"),
+        "well: malformed part 'n'; expected key=value",
+    ),
+    "no form": (("export", "well/n=2", "a.npz"), "expected one of primal, dual"),
+    "tolerance": ((*SOLVE, "--tol", "2"), "--tol = 2.0; expected a number between 0"),
+    "picture format": (
+        (*SOLVE, "--plot", "a.txt"),
+        "unknown format '.txt'; expected .",
+    ),
+    "picture nowhere": (
+        (*SOLVE, "--plot", "no/a.png"),
+        "no/a.png: no folder no; expec",
+    ),
+    "picture a folder": (
+        (*SOLVE, "--plot", "dir.png"),
+        "dir.png is a folder; expected",
+    ),
+    "grid a folder": ((*SOLVE, "--vtu", "dir.vtu"), "dir.vtu is a folder; expec"),
+    "out of range": (
+        ("solve", "well/depth=97/primal", "--solver", "exact"),
+        "well: depth=97 is out of range",
+    ),
+    "out of memory": (
+        ("export", "well/depth=98/primal", "a.npz"),
+        "well/depth=98/primal could not be built: it needs more memory than there is",
+    ),
+    "plug-in that cannot build": (
+        ("export", "deeper/depth=99/primal", "a.npz", "--plugin", "deeper.py"),
+        "deeper.py: deeper/depth=99/primal could not be built: ZeroDivisionError: a fa",
+    ),
+    "plug-in that builds nothing": (
+        ("export", "nothing/primal", "a.npz", "--plugin", "deeper.py"),
+        "deeper.py: nothing/primal could not be built: TypeError: build returned None",
+    ),
+    "absurd integer": (
+        ("solve", f"well/n={5000 * '9'}/primal", "--solver", "exact"),
+        "; expected an integer, such as 4",
+    ),
+    "nowhere to write": (("run", "tiny", "--out", ""), "--out is empty; expected a"),
+    "nothing to draw": (
+        ("solve", "well/dual", "--solver", "exact", "--plot", "a.png"),
+        "well/dual has no bodies to draw; leave out --plot",
+    ),
+    "export format": (
+        ("export", "well/dual", "a.csv"),
+        "'.csv'; expected .npz or .mat or .parquet",
+    ),
+    "report format": (
+        ("report", "folder", "--format", "md,htm"),
+        "--format: unknown format 'htm'; did you mean 'html'? known: csv, html",
+    ),
+    "missing plug-in": (
+        (*SOLVE, "--plugin", "gone.py"),
+        "gone.py: no such file; expect",
+    ),
+    "broken plug-in": (
+        (*SOLVE, "--plugin", "broken.py"),
+        "broken.py: failed to import: ModuleNotFoundError: No module named 'noth",
+    ),
+    "plug-in takes a name": (
+        (*SOLVE, "--plugin", "taken.py"),
+        "taken.py: solver 'exact' of the plug-in exists; rename the new one",
+    ),
+    "missing suite": (
+        ("run", "gone.toml"),
+        "gone.toml: no such file; expected a suite",
+    ),
+    "unknown suite": (
+        ("run", "tinny"),
+        "unknown suite 'tinny'; did you mean 'tiny'? known: tiny",
+    ),
+    "malformed suite": (
+        ("run", "bad.toml"),
+        "bad.toml: line 1, column 8: Invalid value",
+    ),
+    "wrong suite": (
+        ("run", "zero.toml"),
+        "zero.toml: repeats = 0; expected an integer of at least 1",
+    ),
+    "repeats": (
+        ("run", "tiny", "--repeats", "0"),
+        "--repeats = 0; expected an integer",
+    ),
+    "time limit": (
+        ("run", "tiny", "--time-limit", "0"),
+        "--time-limit = 0.0; expected ",
+    ),
+    "solver of run": (
+        ("run", "tiny", "--solver", "exat"),
+        "--solver: unknown solver 'ex",
+    ),
+    "folder of paper": (
+        ("paper", "--out", "bad.toml"),
+        "--out bad.toml: File exists; expected a folder",
+    ),
+    "pattern of run": (
+        ("run", "tiny", "--case", "*/duel"),
+        "the 2 cases of suite 'tiny'; there are well/primal, well/dual",
+    ),
+}
+
+
+@pytest.mark.parametrize(("argv", "message"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_input_is_one_line_with_the_remedy_and_exits_with_2(
+    cli, tmp_path, argv, message
+):
+    (tmp_path / "broken.py").write_text("import nothing_of_that_name")
+    (tmp_path / "dir.png").mkdir()
+    (tmp_path / "dir.vtu").mkdir()
+    (tmp_path / "deeper.py").write_text(DEEPER.format(str(TOY_PROBLEM)))
+    (tmp_path / "bad.toml").write_text("name = \n")
+    (tmp_path / "zero.toml").write_text("repeats = 0\nname = 'a'\n" + SUITE)
+    (tmp_path / "taken.py").write_text(
+        "from types import SimpleNamespace as S\n"
+        "SOLVERS = {'exact': S(declines=None, prepare=None)}"
+    )
+
+    code, out, err = cli(*argv)
+
+    assert (code, out) == (2, "")
+    assert err.startswith("mortarbench: ")
+    assert err.endswith("\n")
+    assert err.count("\n") == 1
+    assert message in err
+    assert not (tmp_path / "out").exists()
+
+
+SUITE = "solvers = ['exact']\n[[problems]]\nfamily = 'well'\n"
+DEEP = "params = {{ depth = [{}] }}\n"
+DEEPER = """
+from dataclasses import replace
+from pathlib import Path
+from harness.registry import load_plugin
+
+class Nothing:
+    name, defaults, forms = "nothing", {{}}, ("primal",)
+    def build(self, form, params, reference):
+        pass
+
+well = load_plugin(Path({!r})).problems["well"]
+PROBLEMS = {{"deeper": replace(well, name="deeper"), "nothing": Nothing()}}
+"""
+
+
+def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli):
+    assert cli("paper") == (
+        0,
+        "out/paper/index-False.html\n",
+        "mortarbench: Figure 1\n",
+    )
+    assert cli("paper", "--quick", "--out", "a")[1] == "a/index-True.html\n"
+
+
+def test_help_is_no_error(cli, capsys):
+    with pytest.raises(SystemExit) as e:
+        cli("run", "--help")
+
+    assert e.value.code == 0
+    assert "--memory-limit MIB" in capsys.readouterr().out
+
+
+PLUGIN = """
+from dataclasses import dataclass
+import numpy as np
+from harness import QP, Case, Solution, Status, no_rows
+
+print("a plug-in says hello")
+
+@dataclass(frozen=True)
+class Pit:
+    name: str = "pit"
+    defaults = {"n": 3}
+    forms = ("primal",)
+    def build(self, form, params, reference):
+        n = params["n"]
+        print("a family says hello")
+        if n == 99:
+            raise ZeroDivisionError("no\\nbottom")
+        qp = QP(P=np.eye(n), q=-np.ones(n), A=no_rows(n), b=np.zeros(0),
+                G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf))
+        return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {})
+
+@dataclass(frozen=True)
+class Times:
+    factor: float = 1.0
+    def declines(self, qp):
+        return None
+    def prepare(self, qp, tol):
+        zeros = dict(y=np.zeros(0), z=np.zeros(0), z_box=0 * qp.q)
+        return lambda: Solution(status=Status.SOLVED, x=-self.factor * qp.q, **zeros)
+
+SOLVERS = {"times": Times()}
+PROBLEMS = {"pit": Pit()}
+"""
+
+
+@pytest.fixture
+def pit(tmp_path):
+    (tmp_path / "plug.py").write_text(PLUGIN)
+    (tmp_path / "pit.toml").write_text(
+        "name = 'pit'\nrepeats = 2\n"
+        "[[solvers]]\nname = 'times'\nlabel = 'twice'\noptions = { factor = 2 }\n"
+        "[[solvers]]\nname = 'times'\n"
+        "[[solvers]]\nname = 'times'\nlabel = 'near'\noptions = { factor = 1.0001 }\n"
+        "[[problems]]\nfamily = 'pit'\nparams = { n = [2, 3] }\n"
+    )
+    return ("run", "pit.toml", "--plugin", "plug.py")
+
+
+def test_a_run_measures_in_workers_and_ends_in_a_summary_and_a_page(cli, pit):
+    code, out, err = cli(*pit)
+
+    header, *rows, page = out.splitlines()
+    assert code == 0
+    assert header.split()[:3] == ["solver", "measured", "claimed"]
+    assert [row.split() for row in rows] == [
+        ["twice", "4", "4", "0", "4", "0", "0"],
+        ["times", "4", "4", "4", "0", "0", "0"],
+        ["near", "4", "4", "0", "4", "0", "0"],
+    ]
+    assert page == "out/pit/index.html"
+    assert "12 measurements" in err.splitlines()
+    assert err.splitlines()[-1].startswith("12/12 ")
+    statuses = {(r.solver, r.status) for r in read_journal(Path("out/pit"))}
+    assert statuses == {
+        ("times", "verified"), ("twice", "wrong"), ("near", "inaccurate")
+    }  # fmt: skip
+
+
+def test_a_run_narrowed_is_a_part_of_the_whole_that_continues_it(cli, pit):
+    narrow = ("--solver", "twice", "--case", "pit/n=2/*", "--repeats", "1")
+    cli(*pit, "--out", "here", *narrow)
+    first = read_journal(Path("here"))
+    cli(*pit, "--out", "here")
+    both = read_journal(Path("here"))
+
+    assert [(r.solver, r.case) for r in first] == [("twice", "pit/n=2/primal")]
+    assert len(both) == 12
+    assert both[0] == first[0]
+
+
+def test_a_fresh_run_forgets_what_the_folder_held(cli, pit):
+    narrow = ("--case", "pit/n=2/*", "--repeats", "1", "--out", "here")
+    for solver in ("times", "twice"):
+        cli(*pit, *narrow, "--solver", solver, "--fresh")
+
+    assert [r.solver for r in read_journal(Path("here"))] == ["twice"]
+
+
+def test_what_cannot_be_built_is_said_not_measured_and_tried_again(cli, pit, tmp_path):
+    suite = tmp_path / "pit.toml"
+    suite.write_text(suite.read_text().replace("[2, 3]", "[99, 2]"))
+    line = "pit/n=99/primal could not be built: ZeroDivisionError: no bottom"
+
+    runs = [cli(*pit), cli(*pit)]
+
+    for code, out, err in runs:
+        assert code == 1
+        assert "1 case could not be built: pit/n=99/primal\n" in out
+        assert err.count(line) == 1
+        assert "Traceback" not in err
+    assert {r.case for r in read_journal(Path("out/pit"))} == {"pit/n=2/primal"}
+
+
+def test_a_plugin_that_changed_is_another_environment(cli, pit, tmp_path):
+    narrow = ("--solver", "times", "--case", "pit/n=2/*", "--repeats", "1")
+    first = cli(*pit, *narrow)[0]
+    (tmp_path / "plug.py").write_text(PLUGIN + "# slower now\n")
+
+    code, _, err = cli(*pit, *narrow)
+
+    assert (first, code) == (0, 2)
+    assert "another environment" in err
+    assert ": plugins.plug.py changed); choose another --out or use --fresh" in err
+
+
+@pytest.mark.parametrize(("load", "lines"), [(0.4, 0), (0.6, 1)])
+def test_a_run_on_a_busy_machine_says_what_that_means(
+    cli, pit, monkeypatch, load, lines
+):
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, 0.0, 0.0))
+
+    err = cli(*pit, "--solver", "times", "--repeats", "1")[2]
+
+    assert err.count("mortarbench: other programs keep 0.6 cores busy") == lines
+
+
+def test_a_run_that_nobody_listens_to_goes_on():
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w", buffering=1) as stream, shown_on(stream) as progress:
+        progress.start(7)
+        progress.warn("who is there?")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), writing)  # let it be closed
+
+
+def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+
+    with shown_on(terminal) as progress:
+        progress.start(7)
+        progress.say("osqp on [red]/primal")
+        progress.advance(None)
+
+    assert "1/7" in terminal.getvalue()
+    assert "osqp on [red]/primal" in terminal.getvalue()
+
+
+def test_the_module_is_the_same_command_from_any_folder(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "harness", "list", "suites"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [
+        "accuracy", "crossval", "demo", "fleet", "large", "paper", "paper-accuracy",
+        "paper-fleet", "path", "scaling", "smoke",
+    ]  # fmt: skip
+
+
+def test_the_workbench_is_not_changed_by_plugins(registries, tmp_path):
+    (tmp_path / "plug.py").write_text(PLUGIN)
+    before = replace(registries)
+
+    extended = registries.with_files([tmp_path / "plug.py"])
+
+    assert set(extended.solvers) == {*SOLVERS, "times"}
+    assert set(extended.families) == {"well", "pit"}
+    assert registries == before

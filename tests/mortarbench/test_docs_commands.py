@@ -1,0 +1,211 @@
+"""Every command that the documents show works, in the order of its page.
+
+A page's commands stand in blocks ```sh, or, in the README, in indented lines. Files
+that they need are the blocks after ``<!-- file: NAME -->``. What would take too long is
+run in a shorter form, and what cannot be run here is named with the reason.
+"""
+
+import re
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from mortarbench import __main__ as root
+from tests.support import ROOT
+
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+
+_SMALL = "--case '*Nr=4/Nh=3/step=1/*'"
+
+#: what is run instead, the same but smaller
+SHORTER = {
+    "mortarbench run demo": f"mortarbench run demo {_SMALL} --repeats 2",
+    "mortarbench run demo --out out/demo-again": (
+        f"mortarbench run demo {_SMALL} --repeats 2 --out out/demo-again"
+    ),
+    "mortarbench run scaling": (
+        "mortarbench run scaling --case '*Nr=[468]/*/dual' --repeats 1 --solver smalbe"
+    ),
+    "mortarbench run crossval": (
+        "mortarbench run crossval --case 'contact-patch/*' --solver smalbe "
+        "--solver clarabel"
+    ),
+    "mortarbench run suites/crossval.toml --out out/crossval": (
+        "mortarbench run suites/crossval.toml --out out/crossval "
+        "--case 'contact-patch/*' --solver smalbe --solver clarabel"
+    ),
+    "mortarbench run suites/accuracy.toml": (
+        "mortarbench run suites/accuracy.toml --repeats 1 --case 'obstacle/*'"
+    ),
+    "mortarbench validate out/make-demo": "mortarbench validate out/demo",
+    "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
+    "mortarbench run mine.toml --out out/again": (
+        "mortarbench run mine.toml --repeats 2 --out out/again"
+    ),
+    "mortarbench run suites/demo.toml --solver smalbe --solver osqp "
+    "--case '*Nr=4*/dual' --repeats 10 --out out/part": (
+        "mortarbench run suites/demo.toml --solver smalbe --solver osqp "
+        "--case '*Nr=4*step=1/dual' --repeats 2 --out out/part"
+    ),
+    "mortarbench run suites/demo.toml --solver smalbe --case '*/dual' --repeats 10": (
+        "mortarbench run suites/demo.toml --solver smalbe --case '*Nr=4*step=1/dual' "
+        "--repeats 2"
+    ),
+    "mortarbench run suites/scaling.toml": (
+        "mortarbench run suites/scaling.toml --case '*Nr=[468]/*/dual' --repeats 1 "
+        "--solver smalbe"
+    ),
+    "mortarbench run suites/fleet.toml": (
+        "mortarbench run suites/fleet.toml --case '*Nr=4/Nh=3/dual' --solver pdas"
+    ),
+    "mortarbench solve beam-ring/Nr=30/Nh=15/dual --solver smalbe --tol 1e-9 "
+    "--plot beam.png --vtu beam.vtu": (
+        "mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver smalbe --tol 1e-9 "
+        "--plot beam.png --vtu beam.vtu"
+    ),
+    "mortarbench export beam-ring/Nr=12/Nh=6/step=5/dual qp.npz": (
+        "mortarbench export beam-ring/Nr=4/Nh=3/step=5/dual qp.npz"
+    ),
+    "mortarbench report out/make-demo --format md,tex": (
+        "mortarbench report out/demo --format md,tex"
+    ),
+    "mortarbench report out/make-demo --factor 1": (
+        "mortarbench report out/demo --format md --factor 1"
+    ),
+    "mortarbench report out/make-demo out/demo": (
+        "mortarbench report out/demo out/demo"
+    ),
+}
+
+#: what is not run, and why
+ELSEWHERE = {
+    "make setup": "the environment is there",
+    "make demo": "the environment is there; `mortarbench run` of the demo is run",
+    "make test": "it would run itself",
+    ". .venv/bin/activate": "the environment is active",
+    "mortarbench paper --quick": "test_paper.py, with fewer samples",
+    "mortarbench replay out/make-demo RUN_ID": "test_replay.py; it needs a run_id",
+    "mortarbench run suites/demo.toml --dask tcp://HOST:8786": "test_cluster.py",
+    "mortarbench run fleet --dask tcp://login1:8786": "test_cluster.py",
+    "mortarbench run demo --dask local": "test_cluster.py",
+    "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
+    "python cluster.py": "it submits jobs to a batch system",
+    "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
+    ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
+        "the environment is there"
+    ),
+}
+#: what a page promises of the files that its commands leave
+PROMISED = {
+    "tutorial": {
+        "beam.png": "",
+        "out/mine/report/report.md": r"osqp-polish",
+        "out/mine/report/records.parquet": "",
+        "out/again/report/against-mine/index.html": r"what changed from mine to again",
+    },
+    "howto": {
+        "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
+        "out/scaling/report/figures/scaling-1.pdf": "",
+        "out/crossval/validation.json": "",
+        "out/crossval/report/validation.html": r"No disagreement",
+        "out/demo/report/report.md": r"1 × tolerance",
+        "out/demo-again/report/against-demo/report.md": r"Verdicts: 0 worse",
+        "out/own/report/report.md": r"claimed solved but inaccurate",
+    },
+}
+_BEGIN = ("mortarbench ", "make ", "python ", ". .venv", ".venv/bin/")
+_LAST = re.compile(r"\s+#\s+exit code (\d)$")
+
+
+def parts(text):
+    """Yield what a page says to do: ("file", name, content), ("run", command, code)."""
+    fence, name, lines = None, None, []
+    for line in text.splitlines():
+        if fence is None and (found := re.fullmatch(r"<!-- file: (\S+) -->", line)):
+            name = found[1]
+        elif line.startswith("```") and fence is None:
+            fence, lines = line[3:], []
+        elif line.startswith("```"):
+            if name is not None:
+                yield "file", name, "\n".join(lines) + "\n"
+            elif fence == "sh":
+                yield from (("run", *command(each)) for each in lines if each)
+            fence = name = None
+        elif fence is not None:
+            lines.append(line)
+        elif line.startswith("    ") and line.strip().startswith(_BEGIN):
+            yield "run", *command(line)
+
+
+def command(line):
+    """Split a line into a command and the exit code that is expected of it."""
+    found = _LAST.search(line)
+    bare = " ".join(shlex.quote(w) for w in shlex.split(line, comments=True))
+    return bare, int(found[1]) if found else 0
+
+
+def normal(commands):
+    return {command(text)[0]: value for text, value in commands.items()}
+
+
+def shown(page):
+    return list(parts(page.read_text("utf-8")))
+
+
+def test_nothing_is_shortened_or_left_out_that_no_page_shows():
+    commands = {what for p in PAGES for kind, what, _ in shown(p) if kind == "run"}
+
+    assert set(normal(SHORTER)) | set(normal(ELSEWHERE)) <= commands
+    assert not set(normal(SHORTER)) & set(normal(ELSEWHERE))
+
+
+def test_a_block_that_shows_a_command_is_one_that_is_run():
+    """Whatever the fence: none of ours may hide in a block of another kind."""
+    for page in PAGES:
+        blocks = re.findall(
+            r"^```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S
+        )
+        for kind, text in blocks:
+            assert kind == "sh" or not re.search(r"^mortarbench ", text, re.M), page
+
+
+@pytest.fixture
+def execute(tmp_path, monkeypatch, capsys):
+    """Run one command as a reader would, in a folder that has the suites."""
+    (tmp_path / "suites").symlink_to(ROOT / "suites")
+    monkeypatch.chdir(tmp_path)
+
+    def run(text):
+        first, *arguments = shlex.split(text)
+        if first == "python":
+            return subprocess.run([sys.executable, *arguments], check=False).returncode
+        assert first == "mortarbench", f"{text}: neither run nor named in ELSEWHERE"
+        monkeypatch.setattr(sys, "argv", [first, *arguments])
+        with pytest.raises(SystemExit) as ended:
+            root.main()
+        output = capsys.readouterr()
+        assert "Traceback" not in output.err
+        return ended.value.code
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_command_of_a_page_works(page, execute, tmp_path):
+    """In its order; what one command writes, the next may read."""
+    instead, elsewhere = normal(SHORTER), normal(ELSEWHERE)
+    for kind, what, more in shown(page):
+        if kind == "file":
+            (tmp_path / what).write_text(more, "utf-8")
+        elif what not in elsewhere:
+            assert execute(instead.get(what, what)) == more, what
+    for file, pattern in PROMISED.get(page.stem, {}).items():
+        written = (tmp_path / file).read_bytes().decode("utf-8", "replace")
+        assert re.search(pattern, written), file

@@ -1,0 +1,260 @@
+"""Histories: from a solver's memory to files, JSON and a terminal; malformed ones too.
+
+Projected descent on min ½|x|² − Σx over x ≥ 0 with n = 3 goes from x = 0, where all
+bounds are active and g = −(1, 1, 1), to the minimiser x = (1, 1, 1) in one step.
+"""
+
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from harness import InputError, Solution, Status
+from harness.files.store import load_history, load_solution, save, save_solution
+from harness.registry import load_plugin
+from harness.results.journal import read_journal
+from harness.verify.measure import measure
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+from mortarbench.cli.text import convergence
+from tests.support import HISTORIES, TOY_PROBLEM
+
+PLUGIN = load_plugin(HISTORIES)
+TOLD = {
+    "step": ["e", "e"], "products": [1, 2], "free_gradient": [0, 0],
+    "chopped_gradient": [pytest.approx(3**0.5), 0], "active": [3, 0],
+    "cost": [0, pytest.approx(-1.5)],
+}  # fmt: skip
+
+
+def unsolved(qp):
+    """There is no reference solve here: residuals decide."""
+    raise ArithmeticError("no reference solve")
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Run a command line that knows both plug-ins; its code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+    toy = load_plugin(TOY_PROBLEM)
+    nothing = dict.fromkeys(("plot", "vtu", "series", "paper"))
+    registries = Registries(
+        families=toy.problems, solvers=toy.solvers,
+        report=lambda folder, formats: [],
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+        reference=unsolved, **nothing,
+    )  # fmt: skip
+
+    def cli(command, *argv):
+        words = [command, *argv, "--plugin", str(HISTORIES)]
+        code = main(registries, words)
+        streams = capsys.readouterr()
+        return code, streams.out, streams.err
+
+    return cli
+
+
+@pytest.fixture
+def point():
+    def make(**history):
+        two = np.array([1.0, 2.0])
+        return Solution(
+            status=Status.SOLVED, x=two, y=two[:0], z=two[:1], z_box=-two,
+            history=history,
+        )  # fmt: skip
+
+    return make
+
+
+def strict(text):
+    def refuse(constant):
+        raise ValueError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_a_kept_history_tells_what_the_solver_did(planted):
+    qp, solution = planted("box")
+    s = measure(PLUGIN.solvers["descent"].__class__(history=True), qp, 1e-8).solution
+
+    assert s.status is Status.SOLVED
+    h = s.history
+    assert h["products"].tolist() == list(range(1, s.iterations + 1))
+    assert h["active"][-1] == np.count_nonzero(solution.z_box)
+    assert h["cost"][-1] == pytest.approx(qp.objective(solution.x))
+    assert (np.diff(h["cost"]) <= 1e-12).all()
+    assert np.hypot(h["free_gradient"], h["chopped_gradient"])[-1] <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("solver", "word"),
+    [
+        ("ragged", "columns have different lengths: cost 3, active 2"),
+        ("square", "cost has shape (2, 2)"),
+        ("scalar", "cost has shape ()"),
+        ("objects", "cost has dtype object"),
+        ("complex", "cost has dtype complex128"),
+        ("long", "step has dtype <U17"),
+        ("path", "'../cost' names a column"),
+        ("number", "7 names a column"),
+        ("none", "it is of type NoneType"),
+        ("list", "it is of type list"),
+        ("angry", "no history for you"),
+    ],
+)
+def test_a_malformed_history_is_dropped_and_the_answer_kept(planted, solver, word):
+    qp, _ = planted("box")
+    kept = measure(PLUGIN.solvers["descent"], qp, 1e-8).solution
+    s = measure(PLUGIN.solvers[solver], qp, 1e-8).solution
+
+    assert (s.status, s.iterations) == (Status.SOLVED, kept.iterations)
+    np.testing.assert_array_equal(s.x, kept.x)
+    assert s.history == {}
+    assert s.message.startswith("history dropped: ")
+    assert word in s.message
+    assert kept.message == ""
+
+
+def test_columns_become_whole_numbers_floats_and_texts(planted):
+    h = measure(PLUGIN.solvers["notes"], planted("box")[0], 1e-8).solution.history
+
+    assert h["step"].tolist() == ["a", "bc"]
+    assert (h["big"].dtype, h["big"].tolist()) == (np.int64, [1, 2])
+    assert (h["flag"].dtype, h["flag"].tolist()) == (np.int64, [1, 0])
+    assert h["cost"].dtype == np.float64
+
+
+def test_a_history_is_stored_with_its_point_bit_for_bit(tmp_path, point):
+    history = {
+        "step": np.array(["c", "p"]), "outer": np.array([1, 2]),
+        "infeasibility": np.array([np.nan, -0.0]),
+    }  # fmt: skip
+    digest = save_solution(tmp_path, point(**history))
+    loaded = load_solution(tmp_path, digest, Status.SOLVED)
+
+    assert loaded.x.tolist() == [1, 2]
+    for found in (loaded.history, load_history(tmp_path, digest)):
+        assert found.keys() == history.keys()
+        for name, column in history.items():
+            assert found[name].dtype == column.dtype
+            assert found[name].tobytes() == column.tobytes()
+
+
+def test_a_history_is_part_of_the_digest_but_its_absence_is_not(tmp_path, point):
+    digests = {
+        save_solution(tmp_path, point()),
+        save_solution(tmp_path, point(cost=np.ones(2))),
+        save_solution(tmp_path, point(seconds=np.ones(2))),
+        save_solution(tmp_path, point(cost=np.zeros(2))),
+    }
+    assert len(digests) == 4
+    assert "97b50261ac02503f" in digests  # as before there were histories
+
+
+def test_points_stored_before_there_were_histories_have_none(tmp_path):
+    two = np.ones(2)
+    old = save(tmp_path, dict(x=two, y=two, z=two, z_box=two))
+
+    assert load_solution(tmp_path, old, Status.SOLVED).history == {}
+    assert load_history(tmp_path, old) == {}
+
+
+def test_a_damaged_stored_history_is_named(tmp_path, point):
+    digest = save_solution(tmp_path, point(cost=np.ones(2), active=np.ones(3)))
+
+    with pytest.raises(InputError, match=rf"{digest}.*different lengths"):
+        load_history(tmp_path, digest)
+
+
+def test_solve_turns_the_history_on_and_prints_its_columns_as_lists(cli):
+    code, out, _ = cli("solve", "well/dual", "--solver", "descent", "--json")
+
+    record = strict(out)
+    assert code == 0
+    assert record["options"]["history"] is True
+    seconds = record["history"].pop("seconds")
+    assert record["history"] == TOLD
+    assert 0 < seconds[0] < seconds[1]
+
+
+def test_what_is_no_number_is_null_in_json(cli):
+    _, out, _ = cli("solve", "well/dual", "--solver", "notes", "--json")
+
+    assert strict(out)["history"] == {
+        "step": ["a", "bc"], "big": [1, 2], "flag": [1, 0], "cost": [None, None]
+    }  # fmt: skip
+
+
+def test_solvers_without_a_history_have_an_empty_one_in_json_and_no_table(cli):
+    _, out, _ = cli("solve", "well/dual", "--solver", "exact", "--json")
+    _, text, _ = cli("solve", "well/dual", "--solver", "exact")
+
+    assert strict(out)["history"] == {}
+    assert "iteration " not in text
+
+
+def test_solve_shows_people_counters_and_a_table_of_convergence(cli):
+    _, out, _ = cli("solve", "well/dual", "--solver", "descent")
+
+    facts, table, legend = out.split("\n\n")
+    assert "counts P_products 2 prepare" in " ".join(facts.split())
+    head, *rows = (line.split() for line in table.splitlines())
+    assert " ".join(head) == "iteration step products ‖φ‖ ‖β‖ at bound own cost"
+    assert rows == [
+        ["1", "e1", "1", "0", "1.73e+00", "3", "0"],
+        ["2", "e1", "2", "0", "0", "0", "-1.5"],
+    ]
+    (line,) = legend.splitlines()
+    for word in ("e expansion", "‖φ‖: free", "‖β‖: chopped", "at bound:", "own cost:"):
+        assert word in line
+
+
+def test_a_row_of_the_table_ends_each_outer_iteration():
+    history = {
+        "step": np.array(list("ccpecc")), "outer": np.array([1, 1, 1, 2, 2, 3]),
+        "infeasibility": np.array([8, 4, 2, 1, 0.5, np.nan]),
+    }  # fmt: skip
+    rows = [line.split() for line in convergence(history).splitlines()]
+
+    assert rows == [
+        ["iteration", "step", "outer", "‖Ax−b‖"],
+        ["3", "c2", "p1", "1", "2.00e+00"],
+        ["5", "c1", "e1", "2", "5.00e-01"],
+        ["6", "c1", "3", "nan"],
+    ]
+
+
+def test_long_tables_keep_their_first_and_last_row_and_count_every_step():
+    history = {"step": np.array(["c"] * 1000), "active": np.arange(1000)}
+    rows = [line.split() for line in convergence(history).splitlines()[1:]]
+
+    assert len(rows) <= 20
+    assert rows[0] == ["1", "c1", "0"]
+    assert rows[-1][0] == "1000"
+    assert sum(int(steps[1:]) for _, steps, _ in rows) == 1000
+
+
+def test_an_empty_history_is_no_table():
+    assert convergence({}) == ""
+    assert convergence({"active": np.zeros(0)}) == ""
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_run_keeps_histories_where_the_suite_says_so(cli, tmp_path, kept):
+    option = str(kept).lower()
+    (tmp_path / "s.toml").write_text(
+        "name = 's'\nrepeats = 2\n[[problems]]\nfamily = 'well'\nforms = ['dual']\n"
+        f"[[solvers]]\nname = 'descent'\noptions = {{ history = {option} }}\n"
+    )
+    code, _, _ = cli("run", "s.toml", "--out", "out")
+
+    records = read_journal(tmp_path / "out")
+    assert (code, len(records)) == (0, 2)
+    for record in records:
+        history = dict(load_history(tmp_path / "out", record.vectors))
+        history.pop("seconds", None)
+        found = {name: column.tolist() for name, column in history.items()}
+        assert found == (TOLD if kept else {})

@@ -1,0 +1,462 @@
+"""Bodies from gmsh files: the paper's benchmark, described by a user, is the same."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness import InputError
+from harness.names import canonical, parse
+from problems import PROBLEMS
+from problems.families.beam_ring import model
+from problems.families.description import described_bodies
+from problems.fem.gmsh_mesh import read_msh
+from problems.fem.mesh import nodal_lengths
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support import ROOT
+
+NR, NH = 2, 1
+RING = model(NR, NH, 2, "strain")
+CORNER = int(
+    np.intersect1d(RING.mesh.boundaries["top"], RING.mesh.boundaries["right"])[0]
+)
+
+TOML = """\
+mesh = "two.msh"
+steps = 2
+units = { length = 2.0, force = 1e8 }
+[[bodies]]
+name = "ring"
+E = 20e9
+nu = 0.3
+[[bodies]]
+name = "beam"
+E = 200e9
+nu = 0.3
+[[supports]]
+boundary = "left"
+fix = ["x", "y"]
+[[supports]]
+boundary = "feet"
+fix = ["x", "y"]
+[[loads]]
+point = "corner"
+force = [0, -1e8]
+[[contacts]]
+slave = "outer"
+master = "bottom"
+"""
+
+
+def edges(chain):
+    return np.column_stack([chain[:-1], chain[1:]])
+
+
+def parts(flip=False):
+    """Cells under their names as gmsh has them: unordered, of any orientation."""
+    sides, rng = RING.mesh.boundaries, np.random.default_rng(577215)
+    curves = {name: edges(sides[name]) for name in ("left", "outer", "bottom", "top")}
+    curves["feet"] = np.vstack([edges(sides["left_foot"]), edges(sides["right_foot"])])
+    if flip:
+        for name, e in curves.items():
+            swap = rng.random(len(e)) < 0.5
+            e[swap] = e[swap][:, ::-1]
+            curves[name] = rng.permutation(e)
+    cells = RING.mesh.cells.copy()
+    if flip:
+        cells[::3] = cells[::3, ::-1]
+    quads = {name: cells[RING.body == i] for i, name in enumerate(RING.names)}
+    return quads, curves, {"corner": np.array([[CORNER]])}
+
+
+def msh22(points, quads, curves, spots, quad_type=3):
+    """Write ASCII 2.2: gmsh's element types are 15 (point), 1 (line), 3 (quad)."""
+    groups, rows, tag = [], [], 0
+    for dimension, kind, named in (
+        (0, 15, spots),
+        (1, 1, curves),
+        (2, quad_type, quads),
+    ):
+        for name, cells in named.items():
+            tag += 1
+            groups += [f'{dimension} {tag} "{name}"'] if name else []
+            for cell in cells:
+                nodes = " ".join(str(n + 1) for n in cell)
+                rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
+    nodes = [f"{i} {x!r} {y!r} {z!r}" for i, (x, y, z) in enumerate(points.tolist(), 1)]
+    blocks = {"PhysicalNames": groups, "Nodes": nodes, "Elements": rows}
+    text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+    for name, lines in blocks.items():
+        text += "\n".join([f"${name}", str(len(lines)), *lines, f"$End{name}", ""])
+    return text
+
+
+def msh41(points, quads, curves, spots):
+    """Write ASCII 4.1, one entity for each physical group."""
+    groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
+    for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
+        counts.append(len(named))
+        for name, cells in named.items():
+            tag += 1
+            groups.append(f'{dimension} {tag} "{name}"')
+            box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
+            entities.append(f"{tag} {box} 1 {tag}" + (" 0" if dimension else ""))
+            blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
+            for cell in cells:
+                cell_number += 1
+                nodes = " ".join(str(n + 1) for n in cell)
+                blocks.append(f"{cell_number} {nodes}")
+    n = len(points)
+    nodes = [str(i) for i in range(1, n + 1)]
+    nodes += [f"{x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+    return "\n".join([
+        "$MeshFormat", "4.1 0 8", "$EndMeshFormat",
+        "$PhysicalNames", str(len(groups)), *groups, "$EndPhysicalNames",
+        "$Entities", " ".join(map(str, [*counts, 0])), *entities, "$EndEntities",
+        "$Nodes", f"1 {n} 1 {n}", f"2 {tag} 0 {n}", *nodes, "$EndNodes",
+        "$Elements", f"{tag} {cell_number} 1 {cell_number}", *blocks, "$EndElements",
+        "",
+    ])  # fmt: skip
+
+
+POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
+
+
+@pytest.fixture
+def described(tmp_path, monkeypatch):
+    """Write mesh and TOML into the working directory; the name of the family's case."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(mesh=None, toml=TOML):
+        (tmp_path / "two.msh").write_text(mesh or msh22(POINTS, *parts()))
+        (tmp_path / "a.toml").write_text(toml)
+        return "bodies:a.toml"
+
+    return write
+
+
+def build(text):
+    name = parse(text, PROBLEMS)
+    return PROBLEMS[name.family].build(name.form, name.params, reference_solution)
+
+
+@pytest.mark.parametrize("writer", [msh22, msh41])
+@pytest.mark.parametrize("flip", [False, True])
+def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, flip):
+    described(writer(POINTS, *parts(flip)))
+    ours = described_bodies(Path("a.toml"), "strain")
+
+    assert ours.names == ("beam", "ring")
+    np.testing.assert_array_equal(ours.mesh.points, RING.mesh.points)
+    np.testing.assert_allclose(
+        ours.K.toarray(), RING.K.toarray(), rtol=0, atol=1e-13 * abs(RING.K).max()
+    )
+    np.testing.assert_array_equal(ours.f, RING.f)
+    fixed = np.sort(RING.B_D.indices)
+    np.testing.assert_array_equal(ours.B_D.indices, fixed)
+    (pair,), (expected,) = ours.pairs, RING.pairs
+    np.testing.assert_array_equal(pair.slave, expected.slave)
+    np.testing.assert_array_equal(pair.master, expected.master)
+
+
+@pytest.mark.parametrize(
+    "keys", ["", "/step=1", "/contact=mortar", "/relin=2/plane=stress"]
+)
+@pytest.mark.parametrize("form", ["primal", "dual-bounds"])
+def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
+    if "mortar" in keys and "basis" not in PROBLEMS["beam-ring"].defaults:
+        pytest.skip("beam-ring has no mortar here")
+    theirs = build(f"beam-ring/Nr={NR}/Nh={NH}/steps=2{keys}/{form}")
+    ours = build(f"{described()}{keys}/{form}")
+
+    for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
+        one, two = getattr(ours.qp, name), getattr(theirs.qp, name)
+        one, two = (M.toarray() if hasattr(M, "toarray") else M for M in (one, two))
+        if name == "A" and len(one):  # the order of the supports is our own
+            one, two = (M[np.argsort(M.argmax(axis=1))] for M in (one, two))
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
+    if form == "dual-bounds":
+        s = reference_solution(ours.qp)
+        np.testing.assert_allclose(
+            ours.recover(s)[[2 * CORNER, 2 * CORNER + 1]],
+            theirs.quantities(s)["tip"],
+            rtol=1e-9,
+        )
+        energies = (ours.quantities(s)["energy"], theirs.quantities(s)["energy"])
+        assert energies[0] == pytest.approx(energies[1], rel=1e-9)
+
+
+def test_settings_come_from_the_file_unless_the_name_has_them(described):
+    family = PROBLEMS["bodies"]
+    text = described()
+    plain, other = (parse(text + keys + "/dual", PROBLEMS)
+                    for keys in ("", "/steps=4/plane=stress"))  # fmt: skip
+
+    assert (plain.params["steps"], plain.params["step"]) == (2, 2)
+    assert (other.params["steps"], other.params["step"]) == (4, 4)
+    assert canonical(plain, family) == "bodies:a.toml/dual"
+    assert canonical(other, family) == "bodies:a.toml/plane=stress/steps=4/dual"
+    again = parse(canonical(other, family), PROBLEMS)
+    assert again == other
+
+
+@pytest.mark.parametrize("which", ["two.msh", "a.toml"])
+def test_a_change_of_either_file_changes_the_case(described, tmp_path, which):
+    before = parse(described() + "/dual", PROBLEMS)
+    path = tmp_path / which
+    path.write_text(
+        path.read_text().replace("0.3", "0.25").replace("$Nodes", "$Nodes ")
+    )
+    after = parse("bodies:a.toml/dual", PROBLEMS)
+
+    assert before.params["sha256"] != after.params["sha256"]
+    with pytest.raises(InputError, match=r"a\.toml: its content has the digest"):
+        PROBLEMS["bodies"].build("dual", before.params, reference_solution)
+
+
+def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
+    point = 'point = "corner"\nforce = [0, -1e8]'
+    top = RING.mesh.boundaries["top"]
+    lengths = nodal_lengths(RING.mesh.points[top])
+    for load, total in (("traction = [3e6, -5e6]", 2.0), ("force = [6e6, -1e7]", 2.0)):
+        described(toml=TOML.replace(point, f'boundary = "top"\n{load}'))
+        bodies = described_bodies(Path("a.toml"), "strain")
+        f = bodies.f.reshape(-1, 2) * 1e8
+
+        assert lengths.sum() == pytest.approx(total)
+        np.testing.assert_allclose(f[top], np.outer(lengths, [3e6, -5e6]))
+        assert np.count_nonzero(f) == 2 * len(top)
+
+
+def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
+    described(toml=TOML.replace("units = { length = 2.0, force = 1e8 }\n", ""))
+    bodies = described_bodies(Path("a.toml"), "strain")
+
+    assert bodies.length == pytest.approx(2.0)
+    assert bodies.force == 1e8
+
+
+def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(described):
+    floating = TOML.replace('[[supports]]\nboundary = "left"\nfix = ["x", "y"]\n', "")
+    text = described(toml=floating)
+
+    dual = build(f"{text}/steps=1/dual")
+    assert dual.qp.b.size == 6
+    assert build(f"{text}/steps=1/primal").qp.b.size == 2 * 2 * 3
+    with pytest.raises(InputError, match=r"expected steps=1 and relin=1"):
+        build(f"{text}/dual")
+    with pytest.raises(InputError, match=r"dual-bounds does not exist"):
+        build(f"{text}/steps=1/dual-bounds")
+
+
+def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
+    """Its top is on rollers; the factor of the singular K exists all the same."""
+    there = ROOT / "suites" / "crossval"
+    shutil.copy(there / "punch.msh", tmp_path)
+    toml = (there / "punch.toml").read_text()
+    rollers = toml.replace('boundary = "side"', 'boundary = "top"')
+    rollers = rollers.replace(
+        'fix = ["x", "y"]\n\n[[loads]]', 'fix = ["x"]\n\n[[loads]]'
+    )
+    (tmp_path / "punch.toml").write_text(rollers.replace("steps = 2", "steps = 1"))
+
+    build(f"bodies:{tmp_path}/punch.toml/dual")
+    with pytest.raises(InputError, match="dual-bounds does not exist"):
+        build(f"bodies:{tmp_path}/punch.toml/dual-bounds")
+
+
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+def test_the_order_of_the_nodes_in_the_file_does_not_matter(described, form):
+    """Gmsh numbers points first, then curves, then surfaces, across the bodies."""
+    to = np.random.default_rng(662607).permutation(len(POINTS))
+    quads, curves, spots = ({k: to[v] for k, v in named.items()} for named in parts())
+    shuffled = POINTS[np.argsort(to)]
+    text = described(msh22(shuffled, quads, curves, spots))
+    ours, theirs = (
+        build(f"{name}/step=1/{form}")
+        for name in (text, f"beam-ring/Nr={NR}/Nh={NH}/steps=2")
+    )
+    clarabel = SOLVERS["clarabel"]
+    results = [
+        case.quantities(clarabel.prepare(case.qp, 1e-10)()) for case in (ours, theirs)
+    ]
+
+    for name in ("energy", "contact_force", "active", "multiplier_sum"):
+        assert results[0][name] == pytest.approx(results[1][name], rel=1e-6)
+
+
+def test_nodes_of_no_cell_are_left_out(described):
+    quads, curves, _ = parts()
+    shift = {k: v + 1 for k, v in quads.items()}, {k: v + 1 for k, v in curves.items()}
+    more = np.vstack([[[1.0, 0.0, 0.0]], POINTS])  # the centre of the ring
+    described(msh22(more, *shift, {"corner": np.array([[CORNER + 1]])}))
+    bodies = described_bodies(Path("a.toml"), "strain")
+
+    np.testing.assert_array_equal(bodies.mesh.points, RING.mesh.points)
+    np.testing.assert_array_equal(bodies.f, RING.f)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('mesh = "two.msh"', 'mesh = "too.msh"', "too.msh: No such file"),
+        ('mesh = "two.msh"\n', "", "a.toml: mesh is missing"),
+        ("steps", "stops", "a.toml: unknown key 'stops'; did you mean 'steps'?"),
+        ("steps = 2", "steps = 2.5", "a.toml: steps = 2.5; expected an integer"),
+        ("steps = 2", 'plane = "bent"', "a.toml: unknown value of plane 'bent'"),
+        ("steps = 2", "steps 2", "a.toml: line "),
+        ('name = "ring"', 'name = "rink"',
+         "a.toml: bodies[0]: name: unknown physical surface 'rink'; did you mean 'r"),
+        ('name = "ring"', 'name = "beam"',
+         "a.toml: bodies[1]: body 'beam' is described twice"),
+        ("E = 20e9\n", "", "a.toml: bodies[0]: E is missing"),
+        ("E = 20e9", "E = -1", "a.toml: bodies[0]: E = -1; expected a positive number"),
+        ("nu = 0.3", "nu = 0.5", "a.toml: bodies[0]: nu = 0.5; expected a number betw"),
+        ('boundary = "feet"', 'boundary = "feat"',
+         "a.toml: supports[1]: boundary: unknown physical curve 'feat'; did you mean"),
+        ('boundary = "feet"\n', "", "a.toml: supports[1]: expected either boundary or"),
+        ('fix = ["x", "y"]', 'fix = ["z"]', "a.toml: supports[0]: unknown component"),
+        ('fix = ["x", "y"]', 'fix = "x"', "a.toml: supports[0]: fix = 'x'; expected"),
+        ('point = "corner"', 'point = "tip"',
+         "a.toml: loads[0]: point: unknown physical point 'tip'; known: corner"),
+        ("force = [0, -1e8]", "force = [0]", "a.toml: loads[0]: force = [0]; expected"),
+        ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
+        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: the loads sum up to"),
+        ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
+        ("force = [0, -1e8]", "traction = [0, -1e8]", "a.toml: loads[0]: a point"),
+        ('slave = "outer"', 'slave = "outre"',
+         "a.toml: contacts[0]: slave: unknown physical curve 'outre'; did you mean 'o"),
+        ('slave = "outer"', 'slave = "feet"',
+         "a.toml: contacts[0]: slave 'feet' is in pieces or branches; expected"),
+        ('slave = "outer"', 'slave = "left"',
+         "a.toml: contacts[0]: slave and master share nodes"),
+        ("length = 2.0", "length = 0", "a.toml: units: length = 0; expected a pos"),
+        ("length", "lenght", "a.toml: units: unknown key 'lenght'; did you mean 'leng"),
+    ],
+)  # fmt: skip
+def test_a_bad_description_is_refused_with_file_entry_and_remedy(
+    described, old, new, message
+):
+    assert old in TOML
+    text = described(toml=TOML.replace(old, new, 1))
+    with pytest.raises(InputError) as e:
+        build(f"{text}/dual")
+
+    assert str(e.value).startswith(message)
+    assert "\n" not in str(e.value)
+
+
+def test_a_missing_body_is_named(described):
+    text = described(toml=re.sub(r'\[\[bodies\]\]\nname = "ring"\n.*\n.*\n', "", TOML))
+    with pytest.raises(
+        InputError, match="bodies: physical surface 'ring' has no entry"
+    ):
+        build(f"{text}/dual")
+
+
+def square(n=2, at=(0.0, 0.0)):
+    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0))
+    points = np.column_stack([x.ravel() + at[0], y.ravel() + at[1], 0 * x.ravel()])
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
+    return points, cells.reshape(-1, 4)
+
+
+def read(tmp_path, *contents, **kinds):
+    (tmp_path / "m.msh").write_text(msh22(*contents, **kinds))
+    return read_msh(tmp_path / "m.msh")
+
+
+def bent(points):
+    """Move the middle node beyond a corner."""
+    return np.where(np.arange(9)[:, None] == 4, [-0.5, -0.5, 0.0], points)
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        (lambda p, c: (p, {"a": c[:, :3]}, {}, {}, 2), "cells of type triangle; expec"),
+        (lambda p, c: (p, {"": c}, {}, {}), "4 quadrilaterals without a name"),
+        (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
+        (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
+        (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
+        (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
+        (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "not pl"),
+        (lambda p, c: (bent(p), {"a": c}, {}, {}), "the cell around ("),
+    ],
+)  # fmt: skip
+def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
+    made = contents(*square())
+    kinds = {"quad_type": made[4]} if len(made) > 4 else {}
+    with pytest.raises(InputError, match=r"m\.msh: ") as e:
+        read(tmp_path, *made[:4], **kinds)
+
+    assert message in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_a_body_of_two_parts_is_refused(tmp_path):
+    one, cells = square()
+    both = np.vstack([one, square(at=(5.0, 0.0))[0]])
+    with pytest.raises(InputError, match="body 'a' falls into 2 parts"):
+        read(tmp_path, both, {"a": np.vstack([cells, cells + 9])}, {}, {})
+
+
+def test_a_closed_contact_side_is_refused(described):
+    points, cells = square()
+    shell = np.array([[0, 1], [1, 2], [2, 5], [5, 8], [8, 7], [7, 6], [6, 3], [3, 0]])
+    more, shift = np.vstack([POINTS, points + np.array([5, 0, 0])]), len(POINTS)
+    quads, curves, spots = parts()
+    toml = TOML.replace('slave = "outer"', 'slave = "shell"')
+    toml += '[[bodies]]\nname = "box"\nE = 1e9\nnu = 0.3\n'
+    text = described(
+        msh22(
+            more,
+            quads | {"box": cells + shift},
+            curves | {"shell": shell + shift},
+            spots,
+        ),
+        toml,
+    )
+    with pytest.raises(InputError, match="slave 'shell' closes on itself"):
+        build(f"{text}/dual")
+
+
+def test_other_files_are_refused(tmp_path, capsys):
+    bad = tmp_path / "bad.msh"
+    for text in ("hello\n", "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n3\n1 0 0\n"):
+        bad.write_text(text)
+        with pytest.raises(InputError, match=r"bad\.msh: not a \.msh file"):
+            read_msh(bad)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("bodies", "bodies: no file; expected bodies:PATH.toml"),
+        (
+            "bodies:a.msh/dual",
+            "bodies:a.msh/dual: no file; expected bodies:PATH.toml/…/",
+        ),
+        (
+            "bodies:no/a.toml/dual",
+            "no/a.toml: No such file or directory; expected a TOML",
+        ),
+        ("bodies:a.toml", "bodies:a.toml: no form at the end; expected one of primal"),
+        ("bodies:a.toml/step=3/dual", "bodies: step=3 must be in 1..steps=2"),
+        ("bodies:a.toml/step=0/dual", "bodies: step=0 must be at least 1"),
+        ("bodies:a.toml/contact=glue/dual", "bodies: contact='glue' is unknown"),
+        ("bodies:a.toml/contact=b.toml/dual", "bodies: contact='b.toml' is unknown"),
+        ("bodies:a.toml/path=b/dual", "bodies: key 'path' is set twice"),
+    ],
+)
+def test_a_bad_name_is_refused(described, text, message):
+    described()
+    with pytest.raises(InputError) as e:
+        parse(text, PROBLEMS)
+
+    assert str(e.value).startswith(message)

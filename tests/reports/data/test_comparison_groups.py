@@ -1,0 +1,477 @@
+"""From records to the sections on means, ranks, profiles, ratios, growth and claims."""
+
+import re
+
+import numpy as np
+import pytest
+
+from harness import Record, Verdict
+from harness.results.journal import Journal
+from reports import write_report
+from reports.data.aggregation import ranking_of
+from reports.data.comparison_groups import comparison_groups
+from reports.data.evidence import Evidence, arrange
+from reports.export.csv_tables import comparison_tables, csv_tables
+from reports.figures.profiles import ROW, pairwise_figure, profile_figure, rows_of
+from reports.figures.style import look
+from reports.folder import compose
+from reports.render.markdown import markdown
+
+LIMIT = 20.0
+
+
+@pytest.fixture
+def record():
+    def make(solver, case, seconds=0.01, repeat=0, **changes):
+        form, tol = changes.get("form", "dual"), changes.get("tol", 1e-6)
+        name = f"box/n={case}/{form}"
+        defaults = dict(
+            run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
+            params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
+            repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
+            iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
+            complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
+        )  # fmt: skip
+        return Record(**(defaults | changes))
+
+    return make
+
+
+@pytest.fixture
+def evidence(tmp_path):
+    def make(records, **suite):
+        given = {"time_limit": LIMIT} | suite
+        return Evidence(directory=tmp_path, records=arrange(records), suite=given)
+
+    return make
+
+
+def section(page, name):
+    return next((s for s in page.sections if s.name == name), None)
+
+
+def rows(table):
+    return {
+        row[0].text: dict(zip(table.columns, row, strict=True)) for row in table.rows
+    }
+
+
+def some_records(record, solvers, cases=6):
+    """Solver k takes k + 1 times as long as the first, on every case."""
+    return [
+        record(f"s{k:02d}", case, (k + 1) * 0.01 * (case + 1))
+        for k in range(solvers)
+        for case in range(cases)
+    ]
+
+
+# ---- what is compared
+
+
+def test_fewer_than_six_cases_or_one_solver_make_no_statement(record, evidence):
+    for few in (some_records(record, 3, cases=5), some_records(record, 1)):
+        page = compose(evidence(few))
+        assert not {"means", "ranking", "profiles"} & {s.name for s in page.sections}
+
+
+def test_forms_tolerances_and_modes_are_compared_apart(record, evidence):
+    records = [
+        record(s, case, form=form, tol=tol)
+        for s in "ab"
+        for case in range(6)
+        for form in ("primal", "dual")
+        for tol in (1e-3, 1e-6)
+    ]
+    records += [record(f"{s} (sequence)", 9 + case, mode="sequence")
+                for s in "ab" for case in range(6)]  # fmt: skip
+    titles = {c.title for c in comparison_groups(evidence(records))}
+    assert titles == {
+        "primal, tol 1e-3", "primal, tol 1e-6", "dual, tol 1e-3", "dual, tol 1e-6",
+        "dual, sequence, tol 1e-6",
+    }  # fmt: skip
+
+
+def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidence):
+    records = [
+        record("a", case, seconds, repeat)
+        for case in range(6)
+        for repeat, seconds in enumerate((0.3, 0.1, 0.2))
+    ]
+    records += [
+        record("b", case, 0.1, repeat,
+               status=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
+               claimed="failed" if (case, repeat) == (5, 2) else "solved")
+        for case in range(6)
+        for repeat in range(3)
+    ]  # fmt: skip
+    (found,) = comparison_groups(evidence(records))
+    assert found.times[:, 0] == pytest.approx(0.2)
+    assert np.isinf(found.times[:, 1]).tolist() == [False] * 3 + [True] + [False] * 2
+    assert np.isinf(found.claimed[:, 1]).tolist() == [False] * 5 + [True]
+
+
+def test_null_arms_do_not_take_part(record, evidence):
+    null = [record("a (A/A)", case, 1e-4, arm="null") for case in range(6)]
+    (found,) = comparison_groups(evidence([*some_records(record, 2), *null]))
+    assert found.solvers == ("s00", "s01")
+
+
+def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
+    record, evidence
+):
+    def declined(solver, case):
+        return record(solver, case, None, status=Verdict.DECLINED, claimed=None)
+
+    records = some_records(record, 2)
+    records += [declined("never", case) for case in range(6)]
+    records += [declined("some", case) for case in range(2)]
+    records += [record("some", case) for case in range(2, 6)]
+    (found,) = comparison_groups(evidence(records))
+    assert found.solvers == ("s00", "s01", "some")
+    assert np.isinf(found.times[:2, 2]).all()
+    assert found.notes == ("Declined all of them: never.",)
+
+
+def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
+    records = some_records(record, 2, cases=8) + [
+        record("late", case) for case in range(6)
+    ]
+    records += [record("rare", case) for case in range(2)]
+    (found,) = comparison_groups(evidence(records))
+    assert len(found.cases) == 6
+    assert found.solvers == ("late", "s00", "s01")
+    assert found.notes == (
+        "Measured on fewer than half of them: rare.",
+        "Not measured by all, left out: 2 cases.",
+    )
+
+
+def test_of_a_sweep_the_cheapest_verified_answer_counts(record, evidence):
+    records = [
+        record(s, case, seconds * (2 if s == "b" else 1), tol=tol, accuracy=1e-6,
+               status=status)
+        for s in "ab"
+        for case in range(6)
+        for tol, seconds, status in (
+            (1e-3, 0.01, Verdict.WRONG),
+            (1e-5, 0.02, Verdict.VERIFIED),
+            (1e-7, 0.03, Verdict.VERIFIED),
+        )
+    ]  # fmt: skip
+    (found,) = comparison_groups(evidence(records))
+    assert found.title == "dual, accuracy 1e-6"
+    assert found.times == pytest.approx(np.full((6, 2), 0.02) * [1, 2])
+
+
+def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
+    ends = {
+        0: dict(seconds=None, status=Verdict.TIME_LIMIT, claimed=None),
+        1: dict(seconds=7.0, status=Verdict.TIME_LIMIT, claimed="time_limit"),
+        2: dict(seconds=0.1, status=Verdict.WRONG),
+        3: dict(seconds=0.1, status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+    }
+    records = some_records(record, 1)
+    records += [record("b", case, **ends.get(case, {})) for case in range(6)]
+    (found,) = comparison_groups(evidence(records))
+    np.testing.assert_array_equal(
+        found.stopped[:, 0], [LIMIT, 7.0, np.nan, np.nan, np.nan, np.nan]
+    )
+    assert np.isnan(found.stopped[:, 1]).all()
+    cell = rows(section(compose(evidence(records)), "means").tables[0])["b"]
+    assert cell["mean up to the limit"].after == "2 out of time, 2 never"
+
+
+def test_a_cell_that_was_late_once_is_late(record, evidence):
+    late = dict(status=Verdict.TIME_LIMIT, claimed=None, seconds=None)
+    records = some_records(record, 2)
+    records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
+    records += [record("z", 2, repeat=2, **late)]
+    (found,) = comparison_groups(evidence(records))
+    assert np.isinf(found.times[2, 2])
+    assert not np.isnan(found.stopped[2, 2])
+
+
+# ---- what is said
+
+
+def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
+    found = rows(section(compose(evidence(some_records(record, 3))), "means").tables[0])
+    assert found["s00"]["mean"].kind == "best"
+    assert found["s02"]["both solved, to the leader"].text == "3.00 [3.00, 3.00]"
+    assert found["s02"]["both solved, to the leader"].after == "n = 6"
+    assert [found[s]["tier"].value for s in found] == [1, 2, 3]
+    assert found["s01"]["P(best)"].text == "0"
+
+
+def test_few_cases_that_both_solved_make_no_ratio(record, evidence):
+    some = [
+        record(
+            "some", case, 1.0, status=Verdict.WRONG if case > 4 else Verdict.VERIFIED
+        )
+        for case in range(8)
+    ]
+    page = compose(evidence([*some_records(record, 2, cases=8), *some]))
+    cells = rows(section(page, "means").tables[0])
+    assert cells["s01"]["both solved, to the leader"].after == "n = 8"
+    assert cells["some"]["both solved, to the leader"].value is None
+
+
+def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
+    bad = [record("bad", case, status=Verdict.WRONG) for case in range(6)]
+    page = compose(evidence([*some_records(record, 2), *bad]))
+    cells = rows(section(page, "means").tables[0])["bad"]
+    assert cells["mean"].text == cells["mean up to the limit"].text == "none solved"
+    shares = rows(section(page, "profiles").tables[0])["bad"]
+    assert shares["at all"].value == 0
+
+
+def test_a_liar_is_named_as_depending_on_the_convention(record, evidence):
+    liar = [record("liar", case, 1e-4, status=Verdict.WRONG) for case in range(6)]
+    found = section(compose(evidence([*some_records(record, 2), *liar])), "ranking")
+    cells = rows(found.tables[0])
+    assert cells["liar"]["rank"].value == 3
+    assert cells["liar"]["claimed"].text == "1"
+    assert cells["liar"]["claimed"].kind == "over"
+    assert cells["liar"]["all"].text == "1–3"
+    assert cells["liar"]["reading"].text == "depends on the convention"
+    assert "turn the order of 2, among them 2 that are told apart" in found.points[0]
+
+
+def test_equal_solvers_are_ties(record, evidence):
+    rng = np.random.default_rng(31)
+    records = [
+        record(s, case, 0.01 * (case + 1) * rng.lognormal(0, 0.1))
+        for s in "abcd"
+        for case in range(12)
+    ]
+    found = section(compose(evidence(records)), "ranking")
+    assert "4 solvers in 1 tier; of 6 pairs 0 told apart" in found.points[0]
+    cells = rows(found.tables[0]).values()
+    assert {row["inside the noise"].text for row in cells} == {"1–4"}
+    assert all("inside the noise" in row["reading"].text for row in cells)
+
+
+def test_ranks_that_nothing_changes_are_said_to_be_so(record, evidence):
+    found = section(compose(evidence(some_records(record, 2))), "ranking")
+    assert found.points[0].endswith("1 told apart; no convention turns an order.")
+    assert {row["reading"].text for row in rows(found.tables[0]).values()} == {
+        "the same under all"
+    }
+
+
+def test_no_mean_is_printed_without_its_interval(record, evidence):
+    table = section(compose(evidence(some_records(record, 4))), "means").tables[0]
+    for name in ("mean", "mean up to the limit"):
+        assert all("[" in row[name].text for row in rows(table).values())
+
+
+def test_the_sections_render(record, evidence):
+    text = markdown(compose(evidence(some_records(record, 7))))
+    for title in ("Means over cases", "What ranks depend on", "Profiles"):
+        assert f"## {title}" in text
+
+
+# ---- pictures
+
+
+@pytest.mark.parametrize("count", [2, 7, 20, 50])
+def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
+    records = [
+        record(f"s{k:02d}", case, (1 + (k % 6) + k / 100) * 0.01 * (case + 1))
+        for k in range(count)  # solvers of one colour are next to each other
+        for case in range(6)
+    ]
+    found = evidence(records)
+    (one,) = map(ranking_of, comparison_groups(found))
+    groups = rows_of(one, found.solvers)
+    shown = [i for row in groups for i in row]
+    assert sorted(shown) == sorted(int(i) for i in one.order[:16])
+    for row in groups:
+        colours = {look(i)["color"] for i in row}
+        assert len(colours) == len(row) <= ROW
+    figure = profile_figure(one, found.solvers)
+    named = [
+        text.get_text()
+        for part in figure.subfigs
+        for legend in part.legends
+        for text in legend.get_texts()
+    ]
+    assert sorted(named) == sorted(one.group.solvers[i] for i in shown)
+
+
+def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
+    found = evidence(some_records(record, 5))
+    (one,) = map(ranking_of, comparison_groups(found))
+    figure = pairwise_figure(one, found.solvers)
+    drawn = [axes for axes in figure.axes if axes.axison]
+    assert len(drawn) == 4
+    for axes in drawn:
+        ends = [float(line.get_ydata()[-1]) for line in axes.lines]
+        starts = [float(line.get_ydata()[0]) for line in axes.lines]
+        assert ends == [1, 1]
+        assert starts == [0, 1]  # the rival is never the better one, the leader always
+
+
+@pytest.mark.parametrize(
+    ("solvers", "cases", "bands"), [(2, 6, 2), (3, 6, 0), (3, 20, 3)]
+)
+def test_bands_are_drawn_where_they_do_not_hide_each_other(
+    record, evidence, solvers, cases, bands
+):
+    found = evidence(some_records(record, solvers, cases=cases))
+    (one,) = map(ranking_of, comparison_groups(found))
+    for axes in profile_figure(one, found.solvers).subfigs[0].axes:
+        assert len(axes.collections) == bands
+    if solvers > 2:
+        assert len(pairwise_figure(one, found.solvers).axes[0].collections) == 2
+
+
+def test_two_solvers_need_no_pictures_of_pairs(record, evidence):
+    found = section(compose(evidence(some_records(record, 2))), "profiles")
+    assert [p.name for p in found.pictures] == ["profiles-1"]
+
+
+# ---- ratios within blocks
+
+
+def test_what_slows_a_block_down_cancels_in_its_ratios(record, evidence):
+    slow = [1.0, 10.0, 3.0, 1.5]
+    records = [
+        record(s, 0, factor * load, repeat)
+        for s, factor in (("a", 0.01), ("b", 0.02))
+        for repeat, load in enumerate(slow)
+    ]
+    (row,) = section(compose(evidence(records)), "ratios").tables[0].rows
+    assert [cell.text for cell in row[2:]] == ["1", "2.00 [2.00, 2.00]"]
+
+
+def test_ratios_that_hold_one_are_ties(record, evidence):
+    noise = [1.1, 0.9, 1.05, 0.97]
+    records = [record("a", 0, 0.01, i) for i in range(4)]
+    records += [record("b", 0, 0.0101 * e, i) for i, e in enumerate(noise)]
+    records += [record("c", 0, 0.001, i, status=Verdict.WRONG) for i in range(4)]
+    (row,) = section(compose(evidence(records)), "ratios").tables[0].rows
+    assert [cell.kind for cell in row[2:]] == ["best", "tied", ""]
+    assert row[-1].value is None
+
+
+def test_single_runs_have_no_ratios(record, evidence):
+    assert section(compose(evidence(some_records(record, 2))), "ratios") is None
+
+
+# ---- growth
+
+
+def test_growth_is_told_from_none_and_predictions_end_with_the_sizes(record, evidence):
+    def sized(solver, power, cases):
+        return [
+            record(solver, c, 1e-6 * (c + 1) ** 1.5,
+                   iterations=round(100 * (c + 1) ** power))
+            for c in cases
+        ]  # fmt: skip
+
+    records = sized("flat", 0.0, range(6)) + sized("grows", 0.5, range(6))
+    records += sized("short", 0.5, range(4)) + sized("few", 0.5, range(3))
+    found = rows(section(compose(evidence(records)), "growth").tables[0])
+    at = "time at n = 600"
+    assert found["flat"]["iterations"].text == "no growth detected"
+    assert found["grows"]["iterations"].text == "grow"
+    assert found["short"]["iterations"].text == "grow"
+    assert found["few"]["iterations"].text == "too few sizes"
+    assert found["flat"][at].value == pytest.approx(1e-6 * 6**1.5)
+    assert found["short"][at].text == "refused"
+    assert found["few"][at].value is None
+
+
+def test_three_sizes_have_no_section_on_growth(record, evidence):
+    page = compose(evidence(some_records(record, 2, cases=3)))
+    assert section(page, "scaling") is not None
+    assert section(page, "growth") is None
+
+
+# ---- claims
+
+
+def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
+    ends = [
+        dict(),
+        dict(status=Verdict.WRONG),
+        dict(status=Verdict.VERIFIED, claimed="failed"),
+        dict(status=Verdict.TIME_LIMIT, claimed=None),
+        dict(status=Verdict.DECLINED, claimed=None),
+    ]
+    records = [record("a", case, **end) for case, end in enumerate(ends)]
+    (table,) = section(compose(evidence(records)), "tally").tables
+    row = rows(table)["a"]
+    assert [cell.value for cell in row.values()] == [None, 1, 1, 1, 1, 0.5]
+    assert row["claimed, refuted"].kind == "over"
+
+
+def test_one_refuted_repeat_refutes_the_claim(record, evidence):
+    records = [record("a", 0, repeat=i) for i in range(3)]
+    records[1] = records[1].but(status=Verdict.INACCURATE)
+    (table,) = section(compose(evidence(records)), "tally").tables
+    assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
+
+
+# ---- the whole way
+
+
+def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
+    names = (
+        "<script>x</script>",
+        r"\input{a}$^_#&%",
+        "| a |\n## b",
+        "_$x^2",
+        "ü漢",
+    )
+    written = []
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        with Journal(folder, "test") as journal:
+            for k, name in enumerate(names):
+                for case in range(6):
+                    journal.append(record(name, case, 0.01 * (k + 1), form=names[0]))
+        (folder / "suite.toml").write_text('name = "hostile"')
+        written.append(write_report(folder, ["html", "md", "tex", "csv"]))
+    one, two = ({p.name: p.read_bytes() for p in paths} for paths in written)
+    assert one == two
+    assert {"means.tex", "ranking.tex", "contests.csv", "profiles-1.svg",
+            "pairwise-1.pdf"} <= set(one)  # fmt: skip
+    assert b"<script>x" not in one["index.html"] + one["report.md"]
+    for name in ("means.tex", "ranking.tex", "profiles.tex", "tally.tex"):
+        for line in one[name].decode().splitlines()[1:]:
+            bare = re.sub(r"\\[\\{}$&#%_]", "", line)
+            assert bare.count("{") == bare.count("}"), line
+            assert not re.search(r"[#%]|\\input|U\+03", bare), line
+
+
+def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
+    records = [record(s, case) for s in ("a\ud800", "b") for case in range(6)]
+    (found,) = comparison_groups(evidence(records))
+    assert set(found.solvers) == {"a\ud800", "b"}
+    assert ranking_of(found).draws.shape[1] == 2
+    assert set(comparison_tables(evidence(records))["contests"]["solver"]) == {
+        r"a\ud800", "b",
+    }  # fmt: skip
+
+
+def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
+    records = some_records(record, 2)
+    records[0] = records[0].but(status=Verdict.WRONG)
+    sheet = csv_tables(evidence(records))["contests"]
+    by_cell = sheet.set_index(["case", "solver"])
+    assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}
+    wrong = by_cell.loc["box/n=0/dual", "s00"]
+    assert (wrong["seconds"], wrong["ratio"]) == (np.inf, np.inf)
+    assert by_cell.loc["box/n=0/dual", "s01"]["ratio"] == 1
+    assert set(sheet["contest"]) == {"dual, tol 1e-6"}
+
+
+def test_the_sheet_of_means_holds_every_convention(record, evidence):
+    sheet = csv_tables(evidence(some_records(record, 3)))["means"]
+    assert len(sheet) == 3 * 19  # 18 combinations and the common cases
+    usual = sheet[(sheet["shift"] == 1) & (sheet["penalty"] == 3)
+                  & (sheet["gate"] == "verified") & ~sheet["common"]]  # fmt: skip
+    assert usual["rank"].tolist() == [1, 2, 3]
+    assert usual["tier"].tolist() == [1, 2, 3]
+    assert (usual["ratio_low"] <= usual["ratio"]).all()

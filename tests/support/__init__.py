@@ -1,0 +1,12 @@
+"""Plug-ins and data of the tests, and where they lie."""
+
+from pathlib import Path
+
+SUPPORT = Path(__file__).parent
+ROOT = SUPPORT.parents[1]  #: of the checkout
+
+ADVERSARIES = SUPPORT / "adversaries.py"
+ATTACKERS = SUPPORT / "attackers.py"
+FALSE_CLAIMS = SUPPORT / "false_claims.py"
+HISTORIES = SUPPORT / "histories.py"
+TOY_PROBLEM = SUPPORT / "toy_problem.py"

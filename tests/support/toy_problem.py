@@ -1,0 +1,177 @@
+"""A plug-in: parabolas over half lines, and solvers for them, some of which misbehave.
+
+Run as a program it is the worker of a registries that holds nothing else.
+"""
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from mortarbench.cli.main import main
+from mortarbench.cli.registries import Registries
+
+FAULTS = {
+    13: KeyboardInterrupt(),
+    97: InputError("well: depth=97 is out of range"),
+    98: MemoryError("Unable to allocate 1 PiB"),
+    99: ZeroDivisionError("a fault of ours"),
+}
+
+
+@dataclass(frozen=True)
+class Well:
+    """A parabola over a half line. Nothing more."""
+
+    name: str = "well"
+    defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})
+    forms: tuple = ("primal", "dual")
+
+    def check(self, params):
+        if params["n"] < 1:
+            raise InputError(f"well: n={params['n']} must be at least 1")
+
+    def build(self, form, params, reference):
+        """min ½|x|² - depth·Σx over x ≥ 0: x = depth, objective -n·depth²/2."""
+        n, depth = params["n"], params["depth"]
+        if depth in FAULTS:
+            raise FAULTS[depth]
+        qp = QP(
+            P=np.eye(n), q=np.full(n, -float(depth)),
+            A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
+            lb=np.zeros(n), ub=np.full(n, np.inf),
+        )  # fmt: skip
+        return Case(
+            qp=qp,
+            recover=lambda s: s.x,
+            quantities=lambda s: {
+                **({"dofs": n} if form == "primal" else {}),
+                "energy": 2 * qp.objective(s.x),
+                "tip": s.x[:2],
+            },
+            fields=self.fields if form == "primal" else None,
+            scale=2.0,
+        )
+
+    def fields(self, s):
+        return Fields(
+            points=np.zeros((4, 2)),
+            cells=np.array([[0, 1, 2, 3]]),
+            bodies=np.zeros(1),
+            displacement=np.zeros((4, 2)),
+        )
+
+
+@dataclass(frozen=True)
+class Exact:
+    """Divides by a diagonal. Only for toy_problem."""
+
+    factor: float = 1.0
+    reason: str | None = None
+
+    def declines(self, qp):
+        return self.reason
+
+    def prepare(self, qp, tol):
+        zeros = dict(y=np.zeros(0), z=np.zeros(0), z_box=0 * qp.q)
+        return lambda: Solution(status=Status.SOLVED, x=-self.factor * qp.q, **zeros)
+
+
+@dataclass(frozen=True)
+class Lost(Exact):
+    def prepare(self, qp, tol):
+        return lambda: Solution.without_point(qp, Status.FAILED, "nowhere to go")
+
+
+@dataclass(frozen=True)
+class Prints(Exact):
+    def prepare(self, qp, tol):
+        print("from Python")
+        os.write(1, b"from C\n")
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Dies(Exact):
+    def prepare(self, qp, tol):
+        print("my last words", flush=True)
+        os._exit(7)
+
+
+@dataclass(frozen=True)
+class Hangs(Exact):
+    """Deaf to Ctrl-C, but in the warm-up; touches $STARTED."""
+
+    def prepare(self, qp, tol):
+        if qp.q.size != 2:
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+            Path(os.environ["STARTED"]).write_text(str(os.getpid()))
+            time.sleep(3600)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Slow(Exact):
+    """Takes a while. Adds a line to $STARTS at every start but those to warm up."""
+
+    seconds: float = 0.4
+
+    def prepare(self, qp, tol):
+        if qp.q.size != 2:
+            with Path(os.environ["STARTS"]).open("a") as starts:
+                starts.write(f"{os.getpid()} {os.sched_getaffinity(0)}\n")
+            time.sleep(self.seconds)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Murders(Exact):
+    """Kills whoever measures it, at depth 4."""
+
+    def prepare(self, qp, tol):
+        if qp.q[0] == -4:
+            reaper = Path(f"/proc/{os.getppid()}/stat").read_text()
+            os.kill(int(reaper.rpartition(")")[2].split()[1]), signal.SIGKILL)
+        return super().prepare(qp, tol)
+
+
+@dataclass(frozen=True)
+class Lax(Exact):
+    """As good as asked for. Not better."""
+
+    def prepare(self, qp, tol):
+        return Exact(factor=1 + tol).prepare(qp, tol)
+
+
+SOLVERS = {
+    "exact": Exact(),
+    "lax": Lax(),
+    "near": Exact(factor=1.001),
+    "liar": Exact(factor=1.5),
+    "picky": Exact(reason="never on a Monday"),
+    "lost": Lost(),
+    "prints": Prints(),
+    "dies": Dies(),
+    "hangs": Hangs(),
+    "slow": Slow(),
+    "murders": Murders(),
+}
+PROBLEMS = {"well": Well()}
+
+
+def unsolved(qp):
+    """There is no reference solve here: residuals decide."""
+    raise ArithmeticError("toy problems have no reference solve")
+
+
+if __name__ == "__main__":
+    nothing = dict.fromkeys(("report", "plot", "vtu", "series", "paper"))
+    registries = Registries(
+        families=PROBLEMS, solvers=SOLVERS, reference=unsolved, **nothing
+    )
+    sys.exit(main(registries, sys.argv[1:]))
