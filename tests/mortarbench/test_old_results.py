@@ -3,12 +3,12 @@
 import shutil
 
 import pytest
-from tests.support import ROOT
 
 from harness import Verdict
 from harness.results.journal import read_journal
 from mortarbench.__main__ import _workbench
 from mortarbench.cli.main import main
+from tests.support import ROOT
 
 FOLDER = ROOT / "tests/data/results-2026-11"
 
