@@ -19,7 +19,7 @@ from problems.contact.bodies import clamped, floating
 from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dual_bounds, dualise
 from problems.duality.stepping import primal_qp
-from problems.families.beam_ring import model
+from problems.models.beam_ring import model
 from solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}

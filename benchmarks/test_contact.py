@@ -9,7 +9,7 @@ from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import node_to_segment
 from problems.contact.polyline import polyline
 from problems.contact.segment_search import nearest
-from problems.families.beam_ring import model
+from problems.models.beam_ring import model
 
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])

@@ -5,7 +5,8 @@ import pytest
 
 from problems.contact.bodies import floating
 from problems.duality.dualisation import dualise
-from problems.families.beam_ring import BeamRing, model
+from problems.families.beam_ring import BeamRing
+from problems.models.beam_ring import model
 from solvers.reference.solve import reference_solution
 
 

@@ -6,8 +6,9 @@ import pytest
 from problems.contact.bodies import clamped, floating
 from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dualise
-from problems.families.beam_ring import BEAM, BeamRing, model
+from problems.families.beam_ring import BeamRing
 from problems.fem.elasticity import elasticity_matrix, stiffness
+from problems.models.beam_ring import BEAM, model
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 

@@ -1,15 +1,62 @@
-"""The contract between problems, solvers and reports, and the clock."""
+"""The contract between problems, solvers and reports, and the clock.
 
-from harness.about import About
-from harness.errors import InputError
-from harness.limits import memory_limit_mib, too_large
-from harness.mechanics import Grid, Mechanics
-from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
-from harness.qp import QP, Matrix, Structure, Vector, no_rows
-from harness.record import Record, Verdict
-from harness.solution import Solution, Status
-from harness.verify.certificate import Certificate, UncertifiableError, certify
-from harness.verify.kkt import Residuals, kkt_residuals, verdict
+A name is imported when it is asked for: what only reads names of cases and solvers
+needs neither numpy nor scipy, and a refusal should not wait for them.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from harness.about import About
+    from harness.errors import InputError
+    from harness.limits import memory_limit_mib, too_large
+    from harness.mechanics import Grid, Mechanics
+    from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
+    from harness.qp import QP, Matrix, Structure, Vector, no_rows
+    from harness.record import Record, Verdict
+    from harness.solution import Solution, Status
+    from harness.verify.certificate import Certificate, UncertifiableError, certify
+    from harness.verify.kkt import Residuals, kkt_residuals, verdict
+
+_MODULES = {
+    "About": "harness.about",
+    "Case": "harness.plugin",
+    "Certificate": "harness.verify.certificate",
+    "Chained": "harness.plugin",
+    "Family": "harness.plugin",
+    "Fields": "harness.plugin",
+    "Grid": "harness.mechanics",
+    "InputError": "harness.errors",
+    "Matrix": "harness.qp",
+    "Mechanics": "harness.mechanics",
+    "QP": "harness.qp",
+    "Record": "harness.record",
+    "Reference": "harness.plugin",
+    "Residuals": "harness.verify.kkt",
+    "Solution": "harness.solution",
+    "Solver": "harness.plugin",
+    "Status": "harness.solution",
+    "Structure": "harness.qp",
+    "UncertifiableError": "harness.verify.certificate",
+    "Value": "harness.plugin",
+    "Vector": "harness.qp",
+    "Verdict": "harness.record",
+    "certify": "harness.verify.certificate",
+    "kkt_residuals": "harness.verify.kkt",
+    "memory_limit_mib": "harness.limits",
+    "no_rows": "harness.qp",
+    "too_large": "harness.limits",
+    "verdict": "harness.verify.kkt",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return value
+
 
 __all__ = [
     "QP",

@@ -1,4 +1,4 @@
-"""How much memory a solver may use that would make dense matrices, and a case."""
+"""How many threads and how much memory a solver may use, and a case."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import os
 
 from harness.errors import InputError, shown
 
+#: environment variables that keep libraries to one thread, read when they load
+ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1"
+    for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
+}
 CASE_VARIABLE = "MORTARBENCH_CASE_MIB"  #: what building a case may take, see `fits`
 VARIABLE = "MORTARBENCH_MEMORY_MIB"  #: set for a worker to the limit of its suite
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-from harness.mechanics import Mechanics
-from harness.qp import QP, Vector
-from harness.solution import Solution
+    from harness.mechanics import Mechanics
+    from harness.qp import QP, Vector
+    from harness.solution import Solution
 
 Value = int | float | str  #: of one key of a case name
-Reference = Callable[[QP], Solution]  #: the injected high-accuracy solve
+#: the injected high-accuracy solve
+Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
 class Solver(Protocol):

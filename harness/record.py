@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 #: version of the journal line; raised whenever a field changes its meaning.
 #: 2: the four residuals have other scales (docs/mathematics.md)
 SCHEMA = 2
+VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
 READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
 LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
 MOST_LEVELS = 20  #: of what is nested in a field

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from hashlib import blake2s
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver
-from harness.recipe import Maker
+
+if TYPE_CHECKING:
+    from harness.recipe import Maker
 
 T = TypeVar("T")
 
@@ -50,6 +53,48 @@ class Plugin:
     origin: str = ""  #: its file, or "entry points"
 
 
+@dataclass(frozen=True)
+class Entry:
+    """One line of a registry: where a thing is, and how it is configured."""
+
+    module: str
+    attribute: str  #: a class, or an instance
+    options: Mapping[str, Any] = field(default_factory=dict)  #: of the class
+
+    def load(self) -> Any:
+        """Import the module, and make the instance."""
+        found = getattr(import_module(self.module), self.attribute)
+        return found(**self.options) if isinstance(found, type) else found
+
+
+def entry(module: str, attribute: str, **options: Any) -> Entry:
+    """Write one line of a registry."""
+    return Entry(module, attribute, options)
+
+
+class Registry(Mapping[str, T]):
+    """Things by name, each imported when it is asked for, and once."""
+
+    def __init__(self, entries: Mapping[str, Entry | T]) -> None:
+        self.entries = dict(entries)  #: a thing, or where it is
+        self._loaded: dict[str, T] = {}
+
+    def __getitem__(self, name: str) -> T:
+        if name not in self._loaded:
+            found = self.entries[name]
+            self._loaded[name] = found.load() if isinstance(found, Entry) else found
+        return self._loaded[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
 def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     """Configure the solver that `spec` asks for.
 
@@ -65,9 +110,22 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     if colon and wildcard in solvers and (backend == "*" or spec.name not in solvers):
         solver = _with_options(spec, solvers[wildcard], reserved={"backend"})
         return _with_backend(prefix, backend, solver)
-    if spec.name not in solvers:
-        raise unknown("solver", spec.name, solvers, more=PLUGINS)
+    check_name(spec.name, solvers)
     return _with_options(spec, solvers[spec.name])
+
+
+def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
+    """Refuse a name that no solver has, without loading any.
+
+    Raises
+    ------
+    InputError
+        For an unknown solver. The backends of an adapter are not looked up.
+
+    """
+    prefix, colon, _ = name.partition(":")
+    if name not in solvers and not (colon and f"{prefix}:*" in solvers):
+        raise unknown("solver", name, solvers, more=PLUGINS)
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
@@ -124,7 +182,7 @@ def entry_point_plugins() -> Plugin:
     return _checked("entry points", found["solvers"], found["problems"])
 
 
-def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> dict[str, T]:
+def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[str, T]:
     """Join two registries.
 
     Raises
@@ -137,6 +195,8 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> dict[str,
         raise InputError(
             f"{what} {both[0]!r} of the plug-in exists; rename the new one"
         )
+    if isinstance(known, Registry):
+        return Registry({**known.entries, **new}) if new else known
     return {**known, **new}
 
 

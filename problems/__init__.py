@@ -1,21 +1,16 @@
 """Families of problems: each emits the same contact problem as several QPs."""
 
-from harness import Family
-from problems.families.beam_ring import BeamRing
-from problems.families.gmsh_bodies import GmshBodies
-from problems.families.hertz import HertzCylinder, HertzPlane
-from problems.families.obstacle import Obstacle
-from problems.families.patch import ContactPatch
-from problems.files.from_file import FromFile
+from harness.plugin import Family
+from harness.registry import Registry, entry
 
-FAMILIES: tuple[Family, ...] = (
-    BeamRing(),
-    ContactPatch(),
-    HertzPlane(),
-    HertzCylinder(),
-    Obstacle(),
-    GmshBodies(),
-    FromFile(),
+PROBLEMS: Registry[Family] = Registry(
+    {
+        "beam-ring": entry("problems.families.beam_ring", "BeamRing"),
+        "contact-patch": entry("problems.families.patch", "ContactPatch"),
+        "hertz-plane": entry("problems.families.hertz", "HertzPlane"),
+        "hertz-cylinder": entry("problems.families.hertz", "HertzCylinder"),
+        "obstacle": entry("problems.families.obstacle", "Obstacle"),
+        "bodies": entry("problems.families.gmsh_bodies", "GmshBodies"),
+        "file": entry("problems.families.from_file", "FromFile"),
+    }
 )
-
-PROBLEMS: dict[str, Family] = {family.name: family for family in FAMILIES}

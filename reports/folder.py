@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from harness.errors import unknown
-from harness.verify.kkt import VERIFIED_FACTOR
+from harness.record import VERIFIED_FACTOR
 from reports.data.aggregation import ranking_of
 from reports.data.comparison_groups import comparison_groups
 from reports.data.evidence import Evidence, read_evidence

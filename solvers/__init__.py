@@ -1,53 +1,40 @@
 """Every solver of the comparison, one line each."""
 
-from harness import Solver
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.adapters.cvxopt_ import CVXOPT
-from solvers.adapters.cvxpy_ import CVXPY
-from solvers.adapters.daqp_ import DAQP
-from solvers.adapters.highs_ import HiGHS
-from solvers.adapters.osqp_ import OSQP
-from solvers.adapters.piqp_ import PIQP
-from solvers.adapters.proxqp_ import ProxQP
-from solvers.adapters.qoco_ import QOCO
-from solvers.adapters.qpalm_ import QPALM
-from solvers.adapters.qpsolvers_ import QPSolvers
-from solvers.adapters.qtqp_ import QTQP
-from solvers.adapters.quadprog_ import Quadprog
-from solvers.adapters.scs_ import SCS
-from solvers.baselines.bvls import BVLS
-from solvers.baselines.pdas import PDAS
-from solvers.baselines.projected_gradient import ProjectedGradient
-from solvers.smalbe.solver import CONDENSED, ESPRESO, PAPER, PERMON, SMALBE
+from harness.plugin import Solver
+from harness.registry import Registry, entry
 
-SOLVERS: dict[str, Solver] = {
-    "smalbe": SMALBE(),
-    "smalbe-condensed": CONDENSED,
-    "smalbe-permon": PERMON,
-    "smalbe-espreso": ESPRESO,
-    "smalbe-paper": PAPER,
-    "pdas": PDAS(),
-    "projected-gradient": ProjectedGradient(),
-    "bvls": BVLS(),
-    "osqp": OSQP(),
-    "osqp-polish": OSQP(polishing=True),
-    "clarabel": Clarabel(),
-    "proxqp": ProxQP(),
-    "proxqp-dense": ProxQP(backend="dense"),
-    "proxqp-sparse": ProxQP(backend="sparse"),
-    "piqp": PIQP(),
-    "piqp-dense": PIQP(backend="dense"),
-    "piqp-sparse": PIQP(backend="sparse"),
-    "highs": HiGHS(),
-    "highs-hipo": HiGHS(method="hipo"),
-    "scs": SCS(),
-    "scs-qdldl": SCS(linear_solver="qdldl"),
-    "daqp": DAQP(),
-    "qpalm": QPALM(),
-    "qoco": QOCO(),
-    "qtqp": QTQP(),
-    "quadprog": Quadprog(),
-    "cvxopt": CVXOPT(),
-    "qpsolvers:*": QPSolvers(),
-    "cvxpy:*": CVXPY(),
-}
+SOLVERS: Registry[Solver] = Registry(
+    {
+        "smalbe": entry("solvers.smalbe.solver", "SMALBE"),
+        "smalbe-condensed": entry("solvers.smalbe.solver", "CONDENSED"),
+        "smalbe-permon": entry("solvers.smalbe.solver", "PERMON"),
+        "smalbe-espreso": entry("solvers.smalbe.solver", "ESPRESO"),
+        "smalbe-paper": entry("solvers.smalbe.solver", "PAPER"),
+        "pdas": entry("solvers.baselines.pdas", "PDAS"),
+        "projected-gradient": entry(
+            "solvers.baselines.projected_gradient", "ProjectedGradient"
+        ),
+        "bvls": entry("solvers.baselines.bvls", "BVLS"),
+        "osqp": entry("solvers.adapters.osqp_", "OSQP"),
+        "osqp-polish": entry("solvers.adapters.osqp_", "OSQP", polishing=True),
+        "clarabel": entry("solvers.adapters.clarabel_", "Clarabel"),
+        "proxqp": entry("solvers.adapters.proxqp_", "ProxQP"),
+        "proxqp-dense": entry("solvers.adapters.proxqp_", "ProxQP", backend="dense"),
+        "proxqp-sparse": entry("solvers.adapters.proxqp_", "ProxQP", backend="sparse"),
+        "piqp": entry("solvers.adapters.piqp_", "PIQP"),
+        "piqp-dense": entry("solvers.adapters.piqp_", "PIQP", backend="dense"),
+        "piqp-sparse": entry("solvers.adapters.piqp_", "PIQP", backend="sparse"),
+        "highs": entry("solvers.adapters.highs_", "HiGHS"),
+        "highs-hipo": entry("solvers.adapters.highs_", "HiGHS", method="hipo"),
+        "scs": entry("solvers.adapters.scs_", "SCS"),
+        "scs-qdldl": entry("solvers.adapters.scs_", "SCS", linear_solver="qdldl"),
+        "daqp": entry("solvers.adapters.daqp_", "DAQP"),
+        "qpalm": entry("solvers.adapters.qpalm_", "QPALM"),
+        "qoco": entry("solvers.adapters.qoco_", "QOCO"),
+        "qtqp": entry("solvers.adapters.qtqp_", "QTQP"),
+        "quadprog": entry("solvers.adapters.quadprog_", "Quadprog"),
+        "cvxopt": entry("solvers.adapters.cvxopt_", "CVXOPT"),
+        "qpsolvers:*": entry("solvers.adapters.qpsolvers_", "QPSolvers"),
+        "cvxpy:*": entry("solvers.adapters.cvxpy_", "CVXPY"),
+    }
+)

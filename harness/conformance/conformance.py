@@ -35,8 +35,9 @@ from harness.conformance.manufactured import (
 )
 from harness.plugin import Solver
 from harness.qp import QP, Vector
+from harness.record import VERIFIED_FACTOR
 from harness.solution import Solution, Status
-from harness.verify.kkt import VERIFIED_FACTOR, kkt_residuals
+from harness.verify.kkt import kkt_residuals
 from harness.verify.measure import measure
 
 FINDS = "finds the planted solution"  #: how the checks begin that need an answer

@@ -28,9 +28,9 @@ from harness.conformance.metamorphic import (
 )
 from harness.plugin import Solver
 from harness.qp import QP, Vector
-from harness.record import Verdict
+from harness.record import VERIFIED_FACTOR, Verdict
 from harness.solution import Solution, Status
-from harness.verify.kkt import VERIFIED_FACTOR, kkt_residuals, verdict
+from harness.verify.kkt import kkt_residuals, verdict
 from harness.verify.measure import measure
 
 TOL = 1e-8

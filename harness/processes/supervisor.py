@@ -31,6 +31,7 @@ from typing import Any, ClassVar
 from weakref import WeakSet
 
 from harness import limits
+from harness.limits import ONE_THREAD
 from harness.processes import reaper
 from harness.processes.footprint import Footprint
 from harness.processes.protocol import (
@@ -56,8 +57,6 @@ LOG_BYTES = 2**20  #: what a solver may print before we drop it
 LAST_WORDS = 300  #: characters of its last line that a message holds
 NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
 
-_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
-ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}
 REPLACED = "the worker was busy while idle, and was replaced"
 
 _CPUCLOCK_SCHED = 2  #: with a process number, names its clock; see clock_getcpuclockid

@@ -24,7 +24,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 
 from harness.environment.environment import capture_in, digest
 from harness.errors import InputError
-from harness.processes.supervisor import ONE_THREAD
+from harness.limits import ONE_THREAD
 from harness.recipe import Maker
 from harness.registry import load_plugin, merged
 from harness.results.work_unit import Commands, Outcome, WorkUnit
@@ -170,7 +170,7 @@ class Node(WorkerPlugin):
             cpu = own_cpu(stack)
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
-            operators = self._operators
+            operators: Mapping[str, Maker] = self._operators
             for path in self._plugins:
                 operators = merged("operator", operators, load_plugin(path).operators)
             commands = self._here(self._commands)

@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness.qp import QP, Matrix, Vector
-from harness.record import Record, Verdict
+from harness.record import VERIFIED_FACTOR, Record, Verdict
 from harness.solution import Solution, Status
-
-VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance asked for
 
 ROUNDING = 8 * float(np.finfo(float).eps)  #: of a sum of terms, relative to their sizes
 EXCUSED = 2e-4  #: of its scale: more of a residual is never called rounding

@@ -12,15 +12,15 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
 from harness.files.durable import FULL
-from harness.registry import entry_point_plugins
-from harness.verify.kkt import VERIFIED_FACTOR
-from mortarbench.cli import processes
-from mortarbench.cli.registries import FORMATS, Registries
+from harness.record import VERIFIED_FACTOR
+from mortarbench.registries import Registries, installed
+from mortarbench.reporting import FORMATS
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 
@@ -62,15 +62,17 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
-    registries = registries.extended(entry_point_plugins())
-    if argv[:1] == ["worker"]:  # how runs start their processes; not for users
-        return processes.worker(registries, argv[1:])
-    if argv[:1] == ["generator"]:
-        return processes.generator(registries, argv[1:])
+    registries = installed(registries)
+    if argv[:1] in (["worker"], ["generator"]):  # how runs start their processes
+        from mortarbench.cli import processes
+
+        start = processes.worker if argv[0] == "worker" else processes.generator
+        return start(registries, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
-    code: int = options.run(registries, options)
+    run: _Run = import_module(options.module).run
+    code = run(registries, options)
     print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
 
@@ -103,11 +105,6 @@ def _print_no_more() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    # late: the processes that runs start parse no commands, and start sooner so
-    from mortarbench.cli import commands, validate
-    from mortarbench.cli import solve as one
-    from mortarbench.cli import test_solver as examine
-
     parser = _Parser(
         prog="mortarbench",
         description="Compare QP solvers on elastic contact problems.",
@@ -117,25 +114,25 @@ def _parser() -> argparse.ArgumentParser:
         metavar="COMMAND", required=True, parser_class=_Parser
     )
 
-    def add(name: str, what: str, run: _Run) -> _Parser:
+    def add(name: str, what: str, module: str) -> _Parser:
         command: _Parser = found.add_parser(name, help=what, allow_abbrev=False)
-        command.set_defaults(run=run, parser=command)
+        command.set_defaults(module=f"mortarbench.cli.{module}", parser=command)
         return command
 
-    _add_list_options(add("list", "what there is", commands.list_))
-    _add_run_options(add("run", "measure a suite; continues a run", commands.run))
-    _add_solve_options(add("solve", "one solver on one case, once", one.solve))
-    _add_export_options(add("export", "one QP as a file", one.export))
+    _add_list_options(add("list", "what there is", "list_"))
+    _add_run_options(add("run", "measure a suite; continues a run", "run"))
+    _add_solve_options(add("solve", "one solver on one case, once", "solve"))
+    _add_export_options(add("export", "one QP as a file", "export"))
     _add_validate_options(
-        add("validate", "do all answers of a folder agree", validate.validate)
+        add("validate", "do all answers of a folder agree", "validate")
     )
-    _add_report_options(add("report", "report on a result folder", commands.report))
-    _add_replay_options(add("replay", "one measurement again", commands.replay))
+    _add_report_options(add("report", "report on a result folder", "report"))
+    _add_replay_options(add("replay", "one measurement again", "replay"))
     _add_test_options(
-        add("test-solver", "the conformance suite, on solvers", examine.test_solver)
+        add("test-solver", "the conformance suite, on solvers", "test_solver")
     )
-    _add_paper_options(add("paper", "every figure of the paper", commands.paper))
-    _add_json(add("doctor", "is this machine fit to measure", commands.doctor))
+    _add_paper_options(add("paper", "every figure of the paper", "paper"))
+    _add_json(add("doctor", "is this machine fit to measure", "doctor"))
     return parser
 
 

@@ -10,7 +10,7 @@ from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
 from harness.processes.worker import serve
 from harness.registry import SolverSpec, resolve
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:

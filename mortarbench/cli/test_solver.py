@@ -14,14 +14,14 @@ from harness.conformance.weaknesses import weaknesses_page
 from harness.processes.measurement import scratch_folder
 from harness.processes.supervisor import WorkerProcess
 from harness.registry import SolverSpec, resolve
-from mortarbench.cli import text as show
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
+from mortarbench.text import aligned
 
 TIME_LIMIT = 60.0  #: s per check
 MEMORY_LIMIT = 4096.0  #: MiB per check
 
 
-def test_solver(registries: Registries, options: Namespace) -> int:
+def run(registries: Registries, options: Namespace) -> int:
     """Run every check; 1 if one fails, or if a solver solved nothing at all."""
     registries = registries.with_files(options.plugin)
     specs = [
@@ -34,7 +34,7 @@ def test_solver(registries: Registries, options: Namespace) -> int:
     checks = [c for c in CHECKS if c.startswith(KEEPS) or not options.markdown]
     results = {}
     for spec in specs:
-        command = registries.worker_command(spec, options.plugin)
+        command = registries.worker_command(spec)
         results[spec.name] = dict(examined(command, checks))
         if not options.json and not options.markdown:
             _show(spec.name, results[spec.name])
@@ -60,7 +60,7 @@ def _named(pattern: str, solvers: Collection[str]) -> list[str]:
 
 
 def _show(solver: str, results: Mapping[str, Result]) -> None:
-    print(show.aligned([r.grade, name, r.message] for name, r in results.items()))
+    print(aligned([r.grade, name, r.message] for name, r in results.items()))
     grades = Counter(r.grade for r in results.values())
     print(f"{solver}: {', '.join(f'{grades[g]} {g}' for g in Grade)}")
 

@@ -14,9 +14,6 @@ from problems.contact.bodies import Bodies
 from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import ContactRows, node_to_segment
 
-#: values of the keys that choose the method; node-to-segment takes no notice of basis
-METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
-
 
 def linearisation(
     bodies: Bodies, contact: str, basis: Any

@@ -12,7 +12,7 @@ from problems.experiments.analysis import scaling, states
 from problems.experiments.parts import Rows, assembly, contact, counts, inverse
 from problems.experiments.physics import pressures, stepping, verification
 from problems.experiments.plan import PAPER, QUICK, Plan
-from problems.families.beam_ring import BEAM, LOAD, RING
+from problems.models.beam_ring import BEAM, LOAD, RING
 
 __all__ = ["PAPER", "QUICK", "Plan", "paper_experiment"]
 

@@ -21,7 +21,7 @@ from problems.duality.stepping import LoadPath
 from problems.experiments.clock import Laps, Stopwatch, race
 from problems.experiments.parts import Rows
 from problems.experiments.plan import Plan
-from problems.families.beam_ring import model
+from problems.models.beam_ring import model
 
 WAYS = {"per-row": False, "condensed": True}  #: condense?
 

@@ -14,12 +14,12 @@ from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import node_to_segment
 from problems.experiments.clock import Laps, Stopwatch, race, whole
 from problems.experiments.plan import Plan
-from problems.families.beam_ring import BEAM, LENGTH, LOAD, model
 from problems.fem.elasticity import elasticity_matrix, rigid_modes, sparsity, stiffness
 from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
 from problems.fem.inverse import floating_inverse
 from problems.fem.mesh import Mesh, Nodes, rectangle
 from problems.fem.triplets import stiffness_by_triplets
+from problems.models.beam_ring import BEAM, LENGTH, LOAD, model
 
 Rows = Iterator[dict[str, Value]]
 

@@ -14,10 +14,10 @@ from problems.contact.results import quantities
 from problems.duality.stepping import LoadPath
 from problems.experiments.parts import Rows
 from problems.experiments.plan import Plan
-from problems.families.beam_ring import LENGTH, model
 from problems.families.hertz import HertzCylinder
 from problems.families.patch import ContactPatch
 from problems.fem.mesh import dofs_of, nodal_lengths
+from problems.models.beam_ring import LENGTH, model
 
 SETTLED = (2, 8)  #: steps, linearisations of each: further ones change nothing
 

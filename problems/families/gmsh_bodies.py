@@ -1,34 +1,28 @@
-"""A user's own bodies: ``bodies:PATH.toml/key=value/…/FORM``.
-
-The TOML file is described in `problems.families.description`.
-"""
+"""The family of bodies from gmsh; see `problems.models.gmsh_bodies`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from harness import QP, Case, InputError, Reference, Value
-from problems.contact.bodies import Bodies, clamped, floating, supported
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import FORMS, contact_case
-from problems.duality.stepping import LoadPath, primal_qp
-from problems.families.description import (
-    CHOICES,
+from harness import InputError
+from problems.families.ranges import (
+    CONTACT_FORMS,
+    METHODS,
+    MOST_STEPS,
+    PLANES,
     SETTINGS,
-    described_bodies,
-    read_description,
+    at_least,
+    at_most,
+    one_of,
 )
-from problems.families.ranges import MOST_STEPS, at_least, at_most, one_of
-from problems.fem.inverse import GeneralisedInverse
 from problems.files.file_digest import check_digest, digest
+
+if TYPE_CHECKING:
+    from harness import Case, Reference, Value
 
 
 @dataclass(frozen=True)
@@ -47,12 +41,14 @@ class GmshBodies:
         ),
         hash=False,
     )
-    forms: tuple[str, ...] = FORMS
+    forms: tuple[str, ...] = CONTACT_FORMS
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in what the file says, its digest, and step, by default steps."""
         params: dict[str, Value] = {**self.defaults, **given}
         if params["path"]:
+            from problems.models.description import read_description
+
             path = Path(str(params["path"]))
             table = read_description(path)
             params = {
@@ -66,6 +62,8 @@ class GmshBodies:
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range and the files are there."""
+        from problems.models.description import read_description
+
         p: Any = params
         if not p["path"]:
             raise InputError(f"{self.name}: path is missing; expected bodies:PATH.toml")
@@ -75,7 +73,7 @@ class GmshBodies:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
-        one_of(self.name, params, CHOICES)
+        one_of(self.name, params, METHODS | PLANES)
         path = Path(p["path"])
         mesh = path.parent / read_description(path)["mesh"]
         check_digest(p["path"], p["sha256"], digest(path, mesh))
@@ -84,64 +82,7 @@ class GmshBodies:
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP of one load step in one form."""
+        from problems.models.gmsh_bodies import load_step
+
         self.check(params)
-        p: Any = params
-        source = (p["path"], p["sha256"], p["plane"])
-        bodies = model(*source)
-        primal = _primal(source, p, reference)
-        return contact_case(
-            bodies, primal, form,
-            floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
-            supported=lambda: _supported(*source),
-            quantities=lambda s: quantities(bodies, primal, s),
-        )  # fmt: skip
-
-
-def _primal(source: tuple[str, str, Any], p: Any, reference: Reference) -> QP:
-    """Linearise the contact where the load path is; at first, that is u = 0."""
-    bodies = model(*source)
-    if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
-        linearise = linearisation(bodies, p["contact"], p["basis"])
-        rows = linearise(np.zeros(bodies.mesh.dofs))
-        return primal_qp(bodies, rows, 1 / p["steps"])
-    path = _path(source, p["contact"], p["basis"], p["steps"], p["relin"], reference)
-    return path.primal(p["step"])
-
-
-@lru_cache(maxsize=4)
-def model(path: str, sha256: str, plane: Any) -> Bodies:
-    """Assemble the bodies of a description; the digest tells contents apart."""
-    del sha256
-    return described_bodies(Path(path), plane)
-
-
-@lru_cache(maxsize=4)
-def _floating(*source: Any) -> GeneralisedInverse:
-    return floating(model(*source))
-
-
-@lru_cache(maxsize=4)
-def _clamped(*source: Any) -> GeneralisedInverse:
-    return clamped(model(*source))
-
-
-@lru_cache(maxsize=4)
-def _supported(*source: Any) -> GeneralisedInverse:
-    return supported(model(*source))
-
-
-@lru_cache(maxsize=4)
-def _path(
-    source: tuple[str, str, Any], contact: str, basis: str, steps: int, relin: int,
-    reference: Reference,
-) -> LoadPath:  # fmt: skip
-    bodies = model(*source)
-    try:
-        inverse = _clamped(*source)
-    except InputError:
-        raise InputError(
-            f"{source[0]}: the supports leave a rigid motion of some body, which load "
-            "steps and re-linearisations do not allow; expected steps=1 and relin=1"
-        ) from None
-    linearise = linearisation(bodies, contact, basis)
-    return LoadPath(bodies, linearise, inverse, reference, steps, relin)
+        return load_step(form, params, reference)

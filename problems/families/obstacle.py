@@ -1,51 +1,16 @@
-"""A string or membrane pressed onto a flat obstacle: exact solutions in closed form.
-
-Under unit tension, pulled down by the load q = 2 over Ω = (−3/2, 3/2)^dim and held at
-the boundary at the height of the solution, it minimises ∫ ½|∇u|² + q u over u ≥ 0. With
-r the distance from the origin, contact is where r ≤ 1, and beyond
-
-    string (dim = 1):    u = (r − 1)²               u″ = 2
-    membrane (dim = 2):  u = r²/2 − ln r − ½        Δu = u″ + u′/r = 2
-
-both with u = u′ = 0 at r = 1; the obstacle pushes back with the pressure q inside, in
-all 2q and πq. (The membrane is a standard test of the obstacle problem, for instance in
-Bartels and Carstensen 2004.) Linear or bilinear elements on a uniform grid: the nodal
-error and that of the energy are of second order.
-
-Lengths are in m, forces per tension.
-"""
+"""The family of obstacle problems; see `problems.models.obstacle`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from time import perf_counter
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.polynomial.legendre import leggauss
-from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
-
-from harness import (
-    QP,
-    Case,
-    Grid,
-    Mechanics,
-    Reference,
-    Solution,
-    Value,
-    Vector,
-    no_rows,
-)
-from problems.contact.results import ACTIVE
-from problems.duality.dualisation import Transformed, dual_bounds
 from problems.families.ranges import at_least, doubled, fits, one_of
-from problems.fem.inverse import GeneralisedInverse, regular_inverse
 
-HALF = 1.5  #: half the width of Ω, m
-LOAD = 2.0  #: q, 1/m
+if TYPE_CHECKING:
+    from harness import Case, Reference, Value
 
 
 @dataclass(frozen=True)
@@ -71,165 +36,9 @@ class Obstacle:
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Emit the QP in one form: bounds on u (primal), or its dual."""
+        """Emit the QP in one form."""
+        from problems.models.obstacle import over_obstacle
+
         del reference
         self.check(params)
-        p: Any = params
-        problem = obstacle_problem(p["dim"], p["n"])
-        rows, start = problem.qp, perf_counter()
-        if form == "primal":
-            new = with_bounds(rows)
-        else:
-            new = dual_bounds(rows, problem.factorise())
-        seconds = None if form == "primal" else perf_counter() - start
-        datum = problem.energy(np.zeros(rows.q.size))
-        return Case(
-            qp=new.qp,
-            recover=lambda s: problem.lift + new.recover(s).x,
-            quantities=lambda s: obstacle_quantities(problem, new.recover(s)),
-            scale=new.sign,
-            constant=new.constant + datum,
-            dualise_seconds=seconds,
-            mechanics=Mechanics(
-                primal=rows, back=new.recover, factorise=problem.factorise,
-                mesh_size=2 * HALF / p["n"], rigid=np.zeros((rows.q.size, 0)),
-                constant=datum, grid=Grid(
-                    problem.x, cells(p["dim"], p["n"]),
-                    np.zeros(problem.cells, dtype=np.int64), problem.lift,
-                ),
-            ),
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """The obstacle problem of v = u − w, with w = u at the boundary and 0 elsewhere.
-
-    ::
-
-        min ½vᵀKv + (q + Kw)ᵀv,   v = 0 at the boundary,   −v ≤ 0 at the other nodes
-    """
-
-    x: Vector  #: (N, dim) nodes, m
-    cells: int
-    lift: Vector  #: w (N,), m
-    qp: QP
-
-    def factorise(self) -> GeneralisedInverse:
-        """Factorise K without the prescribed components."""
-        return regular_inverse(self.qp.P, self.qp.G.indices)
-
-    def energy(self, v: Vector) -> float:
-        """Return ∫ ½|∇u|² + q u, per tension."""
-        w, qp = self.lift, self.qp
-        constant = qp.q @ w - 0.5 * w @ (qp.P @ w)
-        return qp.objective(v) + float(constant)
-
-
-def obstacle_problem(dim: int, n: int) -> Problem:
-    """Assemble the problem on a uniform grid of n cells per side."""
-    h = 2 * HALF / n
-    ends = np.array([1.0] + [2.0] * (n - 1) + [1.0])
-    side = np.ones(n)
-    K = csc_array(diags_array([-side, ends, -side], offsets=[-1, 0, 1]) / h)
-    share: Vector = h / 2 * ends  # ∫N
-    if dim == 2:
-        M = diags_array([side, 2 * ends, side], offsets=[-1, 0, 1]) * (h / 6)
-        K = csc_array(kron(K, M) + kron(M, K))
-        share = np.outer(share, share).ravel()
-    x = nodes(dim, n)
-    at_boundary = np.abs(x).max(axis=1) > HALF - h / 2
-    w = np.where(at_boundary, exact_height(x), 0.0)
-    one, N = csr_array(eye_array(len(x))), len(x)
-    qp = QP(
-        P=K, q=LOAD * share + K @ w,
-        A=one[at_boundary], b=np.zeros(at_boundary.sum()),
-        G=-one[~at_boundary], h=np.zeros((~at_boundary).sum()),
-        lb=np.full(N, -np.inf), ub=np.full(N, np.inf),
-    )  # fmt: skip
-    return Problem(x, n**dim, w, qp)
-
-
-def with_bounds(rows: QP) -> Transformed:
-    """Take out the prescribed components, and write −v ≤ 0 as bounds v ≥ 0."""
-    free = rows.G.indices
-    n, m = rows.q.size, free.size
-    K = csc_array(rows.P)
-    qp = QP(
-        P=K[free][:, free], q=rows.q[free],
-        A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=np.zeros(m), ub=np.full(m, np.inf),
-    )  # fmt: skip
-
-    def recover(s: Solution) -> Solution:
-        v = np.zeros(n)
-        v[free] = s.x
-        z = -s.z_box
-        reactions = -rows.A @ (rows.P @ v + rows.q + rows.G.T @ z)
-        return replace(s, x=v, y=reactions, z=z, z_box=np.zeros(n))
-
-    return Transformed(qp, recover, 1.0, 0.0)
-
-
-def nodes(dim: int, n: int) -> Vector:
-    """Return the positions (N, dim) of the grid with n cells per side, m."""
-    x = np.linspace(-HALF, HALF, n + 1)
-    grid = np.meshgrid(*[x] * dim, indexing="ij")
-    return np.stack([axis.ravel() for axis in grid], axis=-1)
-
-
-def cells(dim: int, n: int) -> NDArray[np.int64]:
-    """Return the corners of each cell in turn, (n, 2) or (n², 4)."""
-    i = np.arange(n)
-    if dim == 1:
-        return np.stack([i, i + 1], axis=-1)
-    first = (i[:, None] * (n + 1) + i).ravel()
-    return np.asarray(first[:, None] + np.array([0, n + 1, n + 2, 1]))
-
-
-def exact_height(x: Vector) -> Vector:
-    """Return the exact u at positions (N, dim), m."""
-    r = np.maximum(np.linalg.norm(x, axis=1), 1.0)
-    if x.shape[1] == 1:
-        return np.asarray((r - 1) ** 2)
-    return np.asarray(r**2 / 2 - np.log(r) - 0.5)
-
-
-def exact_energy(dim: int) -> float:
-    """Return ∫ ½u′² + q u of the exact solution: ⅓ for the string.
-
-    For the membrane the integral over r is elementary; with ρ the distance of the
-    boundary in the direction φ,
-
-        8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
-    """
-    if dim == 1:
-        return 1 / 3
-    at, weights = leggauss(20)  # enough for all digits of what is so smooth
-    rho = HALF / np.cos(np.pi / 8 * (1 + at))
-    along_ray = 3 / 8 * (rho**4 - 1) - (rho**2 - 1) / 2 + (0.5 - rho**2) * np.log(rho)
-    return float(np.pi * weights @ along_ray)
-
-
-def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
-    """Report counts, energy and force of the obstacle, with their errors.
-
-    energy and obstacle_force, Σλ: per tension. energy_error and force_error: relative.
-    max_error: largest error of u at a node, m.
-    """
-    N, dim = problem.x.shape
-    energy, force = problem.energy(s.x), float(s.z.sum())
-    error = problem.lift + s.x - exact_height(problem.x)
-    return {
-        "nodes": N,
-        "elements": problem.cells,
-        "dofs": N,
-        "equality_rows": problem.qp.b.size,
-        "contact_rows": problem.qp.h.size,
-        "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
-        "energy": energy,
-        "energy_error": energy / exact_energy(dim) - 1,
-        "obstacle_force": force,
-        "force_error": force / (LOAD * (2.0 if dim == 1 else np.pi)) - 1,
-        "max_error": float(np.abs(error).max()),
-    }
+        return over_obstacle(form, params)

@@ -1,47 +1,24 @@
-"""The contact patch test: a uniform pressure must pass through a non-matching joint.
-
-Two blocks of 1 m × ½ m lie on each other, without friction and without a gap, each on
-rollers at its left side, the lower one on rollers at its bottom; the pressure p acts on
-the top. The exact solution is linear in each block, so bilinear elements contain it:
-
-    σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
-
-A contact discretisation that reproduces it transfers constant pressures exactly (Taylor
-and Papadopoulos 1991). Mortar methods do, node-to-segment contact in one pass does not:
-its error in σ_y is of order one and does not vanish with the mesh size. Contact alone
-holds the upper block up, so that ``dual-bounds`` does not exist.
-"""
+"""The family of the contact patch test; see `problems.models.patch`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from harness import Case, Reference, Solution, Value
-from problems.contact.bodies import (
-    Bodies,
-    ContactPair,
-    assemble,
-    clamped,
-    floating,
-    supported,
+from problems.families.ranges import (
+    METHODS,
+    PLANES,
+    at_least,
+    doubled,
+    fits,
+    one_of,
+    positive,
 )
-from problems.contact.linearise import METHODS, linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.stepping import primal_qp
-from problems.families.ranges import at_least, doubled, fits, one_of, positive
-from problems.fem.elasticity import Material
-from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.fem.stress import gauss_stress
 
-LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
-PRESSURE = 1e6  #: p, Pa
-E_UPPER, NU = 10e6, 0.3  #: Pa
+if TYPE_CHECKING:
+    from harness import Case, Reference, Value
 
 
 @dataclass(frozen=True)
@@ -64,7 +41,7 @@ class ContactPatch:
         fits(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
         positive(self.name, params, ("ratio",))
         one_of(self.name, params, {
-            "slave": ("lower", "upper"), **METHODS, "plane": ("strain", "stress"),
+            "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
@@ -75,49 +52,8 @@ class ContactPatch:
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP in one form."""
+        from problems.models.patch import two_blocks
+
         del reference  # the gap is linear in u, there is nothing to linearise at
         self.check(params)
-        p: Any = params
-        bodies = model(params)
-        linearise = linearisation(bodies, p["contact"], p["basis"])
-        primal = primal_qp(bodies, linearise(np.zeros(bodies.mesh.dofs)))
-        return contact_case(
-            bodies, primal, form,
-            floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-            supported=lambda: supported(bodies),
-            quantities=lambda s: quantities(bodies, primal, s)
-            | {"stress_error": stress_error(bodies, s)},
-        )  # fmt: skip
-
-
-def model(params: Mapping[str, Value]) -> Bodies:
-    """Mesh and assemble the blocks, with `lower` and `upper` elements along x."""
-    p: Any = params
-    mesh, body = join((
-        prefixed(_block(0.0, p["lower"]), "lower_"),
-        prefixed(_block(HEIGHT, p["upper"]), "upper_"),
-    ))  # fmt: skip
-    sides = mesh.boundaries
-    load = np.zeros(mesh.dofs)
-    top = sides["upper_top"]
-    load[2 * top + 1] = -PRESSURE * nodal_lengths(mesh.points[top])
-    rollers = (2 * sides["lower_left"], 2 * sides["upper_left"])
-    lower, upper = sides["lower_top"], sides["upper_bottom"]
-    return assemble(
-        mesh, body, names=("lower", "upper"),
-        materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
-        plane=p["plane"], units=(LENGTH, PRESSURE * LENGTH),
-        fixed=np.concatenate([*rollers, 2 * sides["lower_bottom"] + 1]), load=load,
-        pairs=(ContactPair(lower, upper) if p["slave"] == "lower"
-               else ContactPair(upper, lower),),
-    )  # fmt: skip
-
-
-def _block(bottom: float, n: int) -> Mesh:
-    return rectangle((0.0, bottom), (LENGTH, HEIGHT), (n, -(-n // 2)))
-
-
-def stress_error(bodies: Bodies, s: Solution) -> float:
-    """Return the largest |σ_y + p|/p over all Gauss points."""
-    stress = gauss_stress(bodies.mesh, bodies.D, s.x * bodies.length)
-    return float(np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE)
+        return two_blocks(form, params)

@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
-from harness import InputError, Value
+from harness import InputError
 from harness.checked import LEAST, MOST
 from harness.limits import CASE_VARIABLE, case_limit_mib
 
+if TYPE_CHECKING:
+    from harness import Value
+
+CONTACT_FORMS = ("primal", "dual", "dual-bounds")
+#: values of the keys that choose the method; node-to-segment takes no notice of basis
+METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
+PLANES = {"plane": ("strain", "stress")}
+#: what the name of a case of bodies may set, with the value where its file says nothing
+SETTINGS: Mapping[str, Value] = {
+    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
+}  # fmt: skip
 MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
 COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from harness.record import VERIFIED_FACTOR
 from harness.running.pairs import Ratio
-from harness.verify.kkt import VERIFIED_FACTOR
 from reports.compare.changes import (
     ALIKE,
     Comparison,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from harness.verify.kkt import VERIFIED_FACTOR
+from harness.record import VERIFIED_FACTOR
 from reports.compare.changes import Comparison, Pair, compare
 from reports.compare.conclusions import verdict_lines
 from reports.compare.page import compose

@@ -11,9 +11,10 @@ from typing import Any
 from harness import InputError, Record, Verdict
 from harness.errors import say
 from harness.files.reading import read_json, read_toml
+from harness.record import VERIFIED_FACTOR
 from harness.results.faults import Fault, left, read_faults
 from harness.results.journal import read_journal
-from harness.verify.kkt import VERIFIED_FACTOR, allowed, rejudged
+from harness.verify.kkt import allowed, rejudged
 from reports.statistics.intervals import Interval, median_interval
 
 RESIDUALS = ("primal", "dual", "complementarity", "gap")

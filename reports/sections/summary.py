@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from harness import Verdict
-from harness.record import SCHEMA
+from harness.record import SCHEMA, VERIFIED_FACTOR
 from harness.results.faults import in_words
-from harness.verify.kkt import VERIFIED_FACTOR
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import (
     VERDICTS,

@@ -13,8 +13,8 @@ from harness.names import canonical, parse
 from harness.record import Record, Verdict
 from harness.results.journal import read_journal
 from harness.suite.suite import load_suite
-from mortarbench.__main__ import _workbench
 from mortarbench.cli.main import main
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from solvers import SOLVERS
 
@@ -52,7 +52,7 @@ def journal(tmp_path):
 def refused(capsys, monkeypatch, tmp_path):
     """Run a command that must end with exit code 2; returns its one line."""
     monkeypatch.chdir(tmp_path)
-    registries = _workbench()
+    registries = Registries()
 
     def refused(*argv):
         assert main(registries, [str(word) for word in argv]) == 2
@@ -141,7 +141,7 @@ def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
     journal, refused, capsys
 ):
     folder = journal(record("a"), record("a"))
-    assert main(_workbench(), ["report", str(folder), "--format", "csv"]) == 0
+    assert main(Registries(), ["report", str(folder), "--format", "csv"]) == 0
     assert "1 journal line is there before" in capsys.readouterr().err
 
     folder = journal(record("a"), record("a", tol=1e-3))

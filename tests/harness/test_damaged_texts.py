@@ -11,10 +11,10 @@ from harness.names import canonical, parse
 from harness.results.folder import environment_of
 from harness.results.journal import read_journal
 from harness.suite.suite import load_suite
-from mortarbench.__main__ import _workbench
 from mortarbench.cli.main import main
+from mortarbench.registries import Registries
 from problems import PROBLEMS
-from problems.families.description import described_bodies
+from problems.models.description import described_bodies
 from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
 from solvers import SOLVERS
@@ -234,7 +234,7 @@ def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
         ["solve", "beam-ring/Nr=4/dual", "--solver", "osqp", "--tol", "2"],
         ["export", "beam-ring/dual", "a.txt"], ["run", "nowhere", "--case", "*"],
     ]  # fmt: skip
-    chance, registries = random.Random(count), _workbench()
+    chance, registries = random.Random(count), Registries()
     for _ in range(count // 3):
         argv = [*chance.choice(commands)]
         at = chance.randrange(1, len(argv))

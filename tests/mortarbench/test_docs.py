@@ -4,7 +4,8 @@ import re
 
 from harness import kkt_residuals
 from harness.registry import load_plugin
-from mortarbench.cli.list_ import about, solvers_page
+from mortarbench.cli.solvers_page import solvers_page
+from mortarbench.listing import about
 from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution

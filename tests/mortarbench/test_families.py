@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -22,7 +22,7 @@ CASES = [
 def test_the_default_case_is_solved_and_verified_in_every_form(name, form, capsys):
     registries = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=None, plot=None, vtu=None, series=None, paper=None,
+        report=None,
     )  # fmt: skip
     declined = SOLVERS["smalbe"].declines(
         PROBLEMS[name].build(form, _defaults(name), reference_solution).qp

@@ -17,8 +17,8 @@ from harness.registry import load_plugin
 from harness.results.journal import read_journal
 from harness.verify.measure import measure
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
-from mortarbench.cli.text import convergence
+from mortarbench.registries import Registries
+from mortarbench.text import convergence
 from tests.support import HISTORIES, TOY_PROBLEM
 
 PLUGIN = load_plugin(HISTORIES)
@@ -40,7 +40,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     toy = load_plugin(TOY_PROBLEM)
-    nothing = dict.fromkeys(("plot", "vtu", "series", "paper"))
+    nothing = {}
     registries = Registries(
         families=toy.problems, solvers=toy.solvers,
         report=lambda folder, formats: [],

@@ -6,8 +6,8 @@ import pytest
 
 from harness import Verdict
 from harness.results.journal import read_journal
-from mortarbench.__main__ import _workbench
 from mortarbench.cli.main import main
+from mortarbench.registries import Registries
 from tests.support import ROOT
 
 FOLDER = ROOT / "tests/data/results-2026-11"
@@ -19,7 +19,7 @@ def old(tmp_path):
 
 
 def command(*argv):
-    return main(_workbench(), list(map(str, argv)))
+    return main(Registries(), list(map(str, argv)))
 
 
 def test_its_records_are_those_that_were_written(old):

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness import Record, Status, Verdict
+from harness.record import VERIFIED_FACTOR
 from harness.results.journal import Journal, read_journal
-from harness.verify.kkt import VERIFIED_FACTOR, Residuals, rejudged, verdict
+from harness.verify.kkt import Residuals, rejudged, verdict
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
@@ -150,7 +151,7 @@ def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda out, formats: [], plot=None, vtu=None, series=None, paper=None,
+        report=lambda out, formats: [],
     )  # fmt: skip
     (tmp_path / "s.toml").write_text(
         'name = "s"\ntolerances = [1e-3, 1e-8]\nrepeats = 1\ntime_limit = 60\n'

@@ -14,7 +14,7 @@ import numpy as np
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 
 FAULTS = {
     13: KeyboardInterrupt(),
@@ -170,7 +170,7 @@ def unsolved(qp):
 
 
 if __name__ == "__main__":
-    nothing = dict.fromkeys(("report", "plot", "vtu", "series", "paper"))
+    nothing = {"report": None}
     registries = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=unsolved, **nothing
     )

@@ -24,8 +24,8 @@ from harness.crossval.mesh_refinement import prolongation
 from harness.names import completed, parse
 from harness.verify.references import reference_point
 from problems import PROBLEMS
-from problems.families.hertz import halved
-from problems.families.obstacle import exact_energy, exact_height, obstacle_problem
+from problems.models.hertz import halved
+from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
 from solvers.reference.solve import reference_solution
 
 

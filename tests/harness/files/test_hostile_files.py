@@ -23,7 +23,7 @@ from harness.files.parquetfile import save_parquet
 from harness.files.qpfile import load_qp, save_qp
 from harness.recipe import Recipe
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
 from solvers import SOLVERS
@@ -55,8 +55,8 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda out, formats, factor=10: [], plot=None, vtu=None, series=None,
-        paper=None,
+        report=lambda out, formats, factor=10: [],
+
     )  # fmt: skip
 
     def run(*arguments):

@@ -10,7 +10,7 @@ from harness.files.store import load_fields, load_history, load_solution, save
 from harness.results.folder import environment_of
 from harness.results.journal import Journal
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from reports import write_report
 from solvers import SOLVERS
@@ -59,7 +59,7 @@ def command(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=write_report, plot=None, vtu=None, series=None, paper=None,
+        report=write_report,
     )  # fmt: skip
 
     def run(*arguments):

@@ -19,7 +19,7 @@ from harness.registry import load_plugin
 from harness.results.folder import environment_of
 from harness.results.journal import read_journal
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
 pytest.importorskip("distributed")
@@ -99,7 +99,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     (tmp_path / "toy.toml").write_text(SUITE.format(repeats=1))
-    nothing = dict.fromkeys(("reference", "plot", "vtu", "series", "paper"))
+    nothing = {"reference": None}
     registries = Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
@@ -304,8 +304,8 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
-        "from mortarbench.cli.registries import Registries; "
-        "nothing = dict.fromkeys(('reference', 'plot', 'vtu', 'series', 'paper')); "
+        "from mortarbench.registries import Registries; "
+        "nothing = {'reference': None}; "
         "main(Registries(families=toy_problem.PROBLEMS, solvers=toy_problem.SOLVERS, "
         "report=lambda *_: [], start=(sys.executable, '-P', toy_problem.__file__), "
         "**nothing), sys.argv[2:])"

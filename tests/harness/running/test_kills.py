@@ -36,7 +36,7 @@ import sys
 from pathlib import Path
 from harness import InputError
 from harness.results.work_unit import Commands
-from harness.running.progress import shown_on
+from mortarbench.progress import shown_on
 from harness.registry import load_plugin, resolve
 from harness.running.run import run
 from harness.suite.suite import load_suite

@@ -13,7 +13,7 @@ from harness.names import canonical
 from harness.registry import SolverSpec
 from harness.suite.overrides import with_overrides
 from harness.suite.suite import load_suite
-from mortarbench.__main__ import BEYOND
+from mortarbench.paper import BEYOND
 from tests.support import ROOT
 
 

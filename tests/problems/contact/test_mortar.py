@@ -8,7 +8,7 @@ from problems.contact import mortar as module
 from problems.contact.mortar import cast_rays, integrate, mortar, overlaps, project
 from problems.contact.polyline import polyline
 from problems.contact.segment_search import Reach
-from problems.families.beam_ring import model
+from problems.models.beam_ring import model
 
 BASES = ["dual", "standard"]
 ANY_ANGLE = Reach(cosine=1.0)

@@ -9,11 +9,11 @@ from scipy.sparse import csc_array, csr_array
 from harness import QP, Solution, Status, kkt_residuals, no_rows
 from problems import PROBLEMS
 from problems.duality.dualisation import dual_bounds, dualise
-from problems.families.beam_ring import _clamped, _floating
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
 from problems.fem.inverse import floating_inverse, regular_inverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
+from problems.models.beam_ring import _clamped, _floating
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 

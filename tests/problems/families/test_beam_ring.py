@@ -7,12 +7,13 @@ import pytest
 
 from harness import InputError, kkt_residuals
 from harness.suite.suite import load_suite
-from mortarbench.cli.registries import SUITES
+from mortarbench.registries import SUITES
 from problems.contact.bodies import clamped, floating
 from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dual_bounds, dualise
 from problems.duality.stepping import primal_qp
-from problems.families.beam_ring import BeamRing, _path, model
+from problems.families.beam_ring import BeamRing
+from problems.models.beam_ring import _path, model
 from solvers import SOLVERS
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP

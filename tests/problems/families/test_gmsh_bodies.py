@@ -10,10 +10,10 @@ import pytest
 from harness import InputError
 from harness.names import canonical, parse
 from problems import PROBLEMS
-from problems.families.beam_ring import model
-from problems.families.description import described_bodies
 from problems.fem.gmsh_mesh import read_msh
 from problems.fem.mesh import nodal_lengths
+from problems.models.beam_ring import model
+from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT

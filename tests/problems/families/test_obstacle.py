@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 
 from harness import InputError, kkt_residuals
-from problems.families.obstacle import (
-    Obstacle,
-    exact_energy,
-    exact_height,
-    obstacle_problem,
-)
+from problems.families.obstacle import Obstacle
+from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from harness import InputError, kkt_residuals
-from problems.families.patch import ContactPatch, model
+from problems.families.patch import ContactPatch
 from problems.fem.mesh import as_vectors
+from problems.models.patch import model
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE

@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from problems.families.beam_ring import model
 from problems.fem.mesh import (
     half_disc,
     half_ring,
@@ -12,6 +11,7 @@ from problems.fem.mesh import (
     prefixed,
     rectangle,
 )
+from problems.models.beam_ring import model
 
 
 def signed_areas(mesh):

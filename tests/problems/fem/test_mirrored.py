@@ -9,7 +9,7 @@ from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
 from problems.duality.stepping import LoadPath
-from problems.families.beam_ring import model
+from problems.models.beam_ring import model
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 

@@ -7,8 +7,8 @@ from harness import Solution, Status
 from problems.contact.node_to_segment import node_to_segment
 from problems.contact.results import fields, nodal_stresses
 from problems.duality.stepping import primal_qp
-from problems.families.beam_ring import model
 from problems.fem.elasticity import elasticity_matrix
+from problems.models.beam_ring import model
 
 STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
 

@@ -14,7 +14,7 @@ from harness.files.qpfile import load_qp, save_qp
 from harness.names import assemble, canonical, parse
 from harness.registry import SolverSpec, resolve
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from problems.files.qps import parse_qps
 from problems.files.two_sided import one_sided
@@ -357,8 +357,7 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda out, formats: [], plot=lambda fields, path: None,
-        vtu=lambda fields, path: None, series=None, paper=None,
+        report=lambda out, formats: [],
     )  # fmt: skip
 
     def run(*arguments):

@@ -9,7 +9,7 @@ import pytest
 from harness import Fields, InputError
 from harness.files.qpfile import save_qp
 from mortarbench.cli.main import main
-from mortarbench.cli.registries import Registries
+from mortarbench.registries import Registries
 from problems import PROBLEMS
 from reports.export.vtu import write_series, write_vtu
 from solvers import SOLVERS
@@ -93,9 +93,8 @@ def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda out, formats: [], plot=lambda fields, path: None, vtu=write_vtu,
-        series=write_series,
-        paper=None,
+        report=lambda out, formats: [],
+
     )  # fmt: skip
 
     def solve(case, name="a.vtu"):

@@ -19,11 +19,11 @@ from problems.experiments import QUICK, paper_experiment
 from problems.experiments.analysis import WAYS, analyse
 from problems.experiments.clock import Rounds, Stopwatch, race, whole
 from problems.experiments.physics import stepping
-from problems.families.beam_ring import BEAM
 from problems.fem.elasticity import elasticity_matrix, stiffness
 from problems.fem.inverse import Factorised
 from problems.fem.mesh import half_ring
 from problems.fem.triplets import stiffness_by_triplets
+from problems.models.beam_ring import BEAM
 from reports.data.evidence import Evidence, arrange, read_evidence
 from reports.figures.saving import save_all
 from reports.paper.contact import active

@@ -6,14 +6,15 @@ import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from harness.history import History
 from harness.record import Record, Verdict
-from harness.solution import Status
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from harness.history import History
 
 #: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {
@@ -38,6 +39,7 @@ _LEGEND = {
     "cost": "own cost: what it minimises inside",
 }
 _UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
+CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED`, in a record
 _ROWS = 15  #: of a table of convergence
 
 
@@ -79,7 +81,16 @@ def listing(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
-    """Count what each of `solvers` claimed and what of it is so; others come last."""
+    """Lay out `summary_rows`."""
+    rows = summary_rows(records, solvers)
+    return aligned(rows, right=range(1, len(rows[0])))
+
+
+def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
+    """Count what each of `solvers` claimed and what of it is so; others come last.
+
+    The first row has the heads of the columns.
+    """
     latest = {r.run_id: r for r in records}.values()
     header = [
         "solver", "measured", "claimed solved", "verified", "refuted", "declined",
@@ -91,17 +102,22 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
         every = [r for r in latest if r.solver == solver]
         declined = [r for r in every if r.status is Verdict.DECLINED]
         own = [r for r in every if r.status is not Verdict.DECLINED]
-        claimed = [r for r in own if r.claimed == Status.SOLVED]
+        claimed = [r for r in own if r.claimed == CLAIMED_SOLVED]
         verified = [r for r in own if r.status is Verdict.VERIFIED]
         refuted = [r for r in claimed if r.status is not Verdict.VERIFIED]
         other = len(own) - len(verified) - len(refuted)
         counts = map(len, (own, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
-    return aligned(rows, right=range(1, len(header)))
+    return rows
 
 
 def outcome(r: Record) -> str:
     """Lay out one measurement, in SI units."""
+    return aligned(outcome_rows(r))
+
+
+def outcome_rows(r: Record) -> list[tuple[str, str]]:
+    """Name and value of what there is to say of one measurement, in SI units."""
     options = ", ".join(f"{key}={value}" for key, value in r.options.items())
     units = UNITS if "dofs" in r.quantities else {}
     rows = [
@@ -129,7 +145,7 @@ def outcome(r: Record) -> str:
             for name, value in r.quantities.items()
         ),
     ]
-    return aligned([name, value] for name, value in rows if value)
+    return [(name, value) for name, value in rows if value]
 
 
 def _bound(r: Record) -> str:
@@ -170,6 +186,8 @@ def legend(history: History) -> str:
 
 def _milestones(history: History) -> list[int]:
     """Choose the rows to show: the last of each outer iteration, or of equal parts."""
+    import numpy as np
+
     length = next(iter(history.values())).size
     outer = history.get("outer", np.zeros(length))
     ends = [*np.flatnonzero(outer[1:] != outer[:-1]).tolist(), length - 1]
@@ -181,6 +199,8 @@ def _milestones(history: History) -> list[int]:
 
 
 def _tally(letters: NDArray[np.str_]) -> str:
+    import numpy as np
+
     kinds, numbers = np.unique(letters, return_counts=True)
     return " ".join(f"{k}{n}" for k, n in zip(kinds, numbers, strict=True))
 

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from scipy.sparse import eye_array
 
-from harness import QP, Case, InputError, Reference, Solution, Value
+from harness import QP, InputError
 from harness.checked import is_number, located
-from harness.errors import unknown
 from harness.files.datafile import check_size, opened
 from harness.files.matfile import matrix, read_mat, to_qp, vector
 from harness.files.parquetfile import load_parquet
 from harness.files.qpfile import load_qp
-from problems.files.file_digest import check_digest, digest
 from problems.files.qps import parse_qps
 from problems.files.two_sided import TwoSided, one_sided
 
@@ -30,52 +26,18 @@ Loaded = tuple[QP, float, float]
 _COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
 
 
-@dataclass(frozen=True)
-class FromFile:
-    """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
+def read(path: Path) -> Loaded:
+    """Read a QP in the format that the suffix of its path names.
 
-    The digest of the file's content is a parameter of the case, so that records say
-    what was measured and a changed file is not taken for it.
+    Raises
+    ------
+    InputError
+        When the file is damaged, or holds no convex QP.
+    KeyError
+        For another suffix.
+
     """
-
-    name: str = "file"
-    path_suffix: str = ""  #: all after ``file:`` is the path
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"path": "", "sha256": ""}), hash=False
-    )
-    forms: tuple[str, ...] = ("qp",)
-
-    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the digest of the file's content."""
-        params = {**self.defaults, **given}
-        if params["path"] and "sha256" not in given:
-            params["sha256"] = digest(Path(str(params["path"])))
-        return params
-
-    def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there is such a file of a known format."""
-        path = Path(str(params["path"]))
-        if not params["path"]:
-            raise InputError("file: path is missing; expected file:PATH")
-        if path.suffix.lower() not in _LOADERS:
-            raise unknown("format", path.suffix, _LOADERS, where=str(path))
-        check_digest(params["path"], params["sha256"], digest(path))
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Read the QP; its objective in the units of the file is the quantity value."""
-        self.check(params)
-        path = Path(str(params["path"]))
-        qp, scale, constant = _LOADERS[path.suffix.lower()](path)
-
-        def quantities(s: Solution) -> dict[str, float]:
-            return {"value": scale * qp.objective(s.x) + constant}
-
-        return Case(
-            qp=qp, recover=lambda s: s.x, quantities=quantities,
-            scale=scale, constant=constant,
-        )  # fmt: skip
+    return _READERS[path.suffix.lower()](path)
 
 
 def _npz(path: Path) -> Loaded:
@@ -113,7 +75,7 @@ def _qps(path: Path) -> Loaded:
         return one_sided(given), sign, sign * given.r
 
 
-_LOADERS: dict[str, Callable[[Path], Loaded]] = {
+_READERS: dict[str, Callable[[Path], Loaded]] = {
     ".npz": _npz, ".mat": _mat, ".parquet": _parquet,
     ".qps": _qps, ".mps": _qps, ".sif": _qps,
 }  # fmt: skip

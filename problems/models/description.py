@@ -42,22 +42,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import InputError, Value, checked
+from harness import InputError, checked
 from harness.checked import located
 from harness.errors import shown, unknown
 from harness.files.reading import read_toml
 from problems.contact.bodies import Bodies, ContactPair, assemble
-from problems.contact.linearise import METHODS
-from problems.families.ranges import MOST_STEPS
+from problems.families.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
 
-#: what a case name may set, too, with the value where the file says nothing
-SETTINGS: Mapping[str, Value] = {
-    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
-}  # fmt: skip
-CHOICES = {**METHODS, "plane": ("strain", "stress")}
 _KEYS = ("mesh", *SETTINGS, "units", "bodies", "supports", "loads", "contacts")
 
 
@@ -79,7 +73,7 @@ def read_description(path: Path) -> dict[str, Any]:
         checked.text("mesh", table["mesh"])
         for key in ("steps", "relin"):
             checked.at_least_one(key, table.get(key, SETTINGS[key]), MOST_STEPS)
-        for key, known in CHOICES.items():
+        for key, known in (METHODS | PLANES).items():
             value = checked.text(key, table.get(key, SETTINGS[key]))
             if value not in known:
                 raise unknown(f"value of {key}", value, known)

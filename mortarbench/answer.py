@@ -1,0 +1,211 @@
+"""One solver on one case, once: its answer, measured in a process and judged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+from sys import stderr
+from typing import TYPE_CHECKING, Any
+
+from harness import Fields, Record, Residuals, Solution, Verdict
+from harness.environment.environment import digest
+from harness.errors import InputError
+from harness.history import History
+from harness.processes.measurement import measured_once
+from harness.record import finite
+from harness.registry import SolverSpec, options_of, resolve
+from harness.verify.verdicts import has_point, new_record, plain
+from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.case import Case, build, built_case
+from mortarbench.registries import Plugins
+from mortarbench.text import outcome, outcome_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Answer:
+    """What a solver answered, and what we make of it."""
+
+    case: Case
+    record: Record  #: the measurement, as a line of a journal
+    solution: Solution | None  #: point and claim; None where the process ended
+    spec: SolverSpec
+
+    @property
+    def verdict(self) -> Verdict:
+        """Our judgement, whatever the solver claimed."""
+        return self.record.status
+
+    @property
+    def residuals(self) -> Residuals | None:
+        """Relative KKT residuals, evaluated by us; None where there is no point."""
+        r = self.record
+        if r.primal is None or r.dual is None:
+            return None
+        if r.complementarity is None or r.gap is None:
+            return None
+        return Residuals(r.primal, r.dual, r.complementarity, r.gap)
+
+    @property
+    def energy_bound(self) -> float | None:
+        """Certified bound of the error, relative, in the energy norm; None: unknown."""
+        return self.record.energy_bound
+
+    @property
+    def quantities(self) -> Mapping[str, Any]:
+        """Physical results, SI."""
+        return self.record.quantities
+
+    @property
+    def history(self) -> History:
+        """What the solver told of its iterations: columns, a row per iteration."""
+        return {} if self.solution is None else self.solution.history
+
+    @property
+    def has_point(self) -> bool:
+        """Whether there is a point to look at."""
+        return self.solution is not None and has_point(self.solution)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: the record, and the history of the iterations."""
+        history = finite(plain(self.history))
+        return {**json.loads(self.record.to_json()), "history": history}
+
+    def fields(self) -> Fields:
+        """Give the deformed bodies.
+
+        Raises
+        ------
+        InputError
+            When the case has no bodies, or the answer no point.
+
+        """
+        if self.solution is None or not self.has_point:
+            raise InputError(f"no picture: {self.record.solver} returned no point")
+        return self.case.fields(self.solution)
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw the deformed bodies with their stresses; into a file, too, if given.
+
+        Raises
+        ------
+        InputError
+            As `fields`; when the file cannot be written.
+
+        """
+        from reports.figures.deformed import deformed_figure
+        from reports.figures.saving import save
+
+        figure = deformed_figure(self.fields())
+        if path is not None:
+            save(figure, writable(Path(path), PICTURES))
+        return figure
+
+    def save_vtu(self, path: str | Path) -> Path:
+        """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
+
+        Raises
+        ------
+        InputError
+            As `fields`; when the file cannot be written, or an earlier load step has
+            no point.
+
+        """
+        from reports.export.vtu import write_series, write_vtu
+
+        path, fields = writable(Path(path), GRIDS), self.fields()
+        if path.suffix == ".vtu":
+            write_vtu(fields, path)
+            return path
+        states, last = [], int(self.case.params.get("step", 1))
+        for step in range(1, last):
+            parsed = replace(
+                self.case.parsed, params={**self.case.params, "step": step}
+            )
+            earlier = solve(
+                built_case(parsed, self.case.registries),
+                self.spec.name,
+                tol=self.record.tol,
+                options=self.spec.options,
+            )
+            if not earlier.has_point:
+                raise InputError(f"{path}: no point at step {step}; write a .vtu")
+            states.append((float(step), earlier.fields()))
+        write_series([*states, (float(last), fields)], path)
+        return path
+
+    def __repr__(self) -> str:
+        return outcome(self.record)
+
+    def _repr_html_(self) -> str:
+        rows = (
+            f"<tr><th style='text-align:left'>{escape(name)}</th>"
+            f"<td style='text-align:left'>{escape(value)}</td></tr>"
+            for name, value in outcome_rows(self.record)
+        )
+        return f"<table>{''.join(rows)}</table>"
+
+
+def solve(
+    case: Case | str,
+    solver: str,
+    *,
+    tol: float = 1e-8,
+    options: Mapping[str, Any] | None = None,
+    plugins: Plugins = (),
+) -> Answer:
+    """Run one solver on one case, once, in a process of its own, and judge its answer.
+
+    Parameters
+    ----------
+    case : what `build` returned, or a name
+    solver : a name of `solvers`
+    tol : relative KKT accuracy asked for
+    options : of the solver, that differ from its defaults. A solver that can tell of
+        its iterations does, unless they say ``history = False``
+    plugins : Python files with more solvers or families
+
+    Raises
+    ------
+    InputError
+        When there is no such case, solver or option, or the case cannot be built.
+
+    """
+    tolerance(tol)
+    if isinstance(case, str):
+        case = build(case, plugins=plugins)
+        registries = case.registries
+    else:
+        registries = case.registries
+        held = {file.resolve() for file in registries.files}
+        registries = registries.with_files(
+            [file for file in plugins if Path(file).resolve() not in held]
+        )
+    given = dict(options or {})
+    spec = SolverSpec(name=solver, label=solver, options=given)
+    configured = resolve(spec, registries.solvers)
+    if options_of(configured).get("history") is False and "history" not in given:
+        # what telling costs is not at stake where nothing is compared
+        spec = replace(spec, options={**given, "history": True})
+        configured = resolve(spec, registries.solvers)
+    record = new_record(
+        case.parsed,
+        case.name,
+        spec,
+        options=options_of(configured),
+        tol=tol,
+        repeat=0,
+        environment=digest(registries.environment()),
+    )
+    command = registries.worker_command(spec)
+    with redirect_stdout(stderr):  # whatever the family prints
+        record, solution = measured_once(
+            command, case.made, record, registries.reference
+        )
+    return Answer(case=case, record=record, solution=solution, spec=spec)

@@ -1,0 +1,74 @@
+"""Checks of what a user asks for, before any work is done or any library loads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from harness.errors import InputError
+
+EXPORTS = (".npz", ".mat", ".parquet")  #: files that a QP is written to
+PICTURES = (".png", ".pdf", ".svg")
+GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
+
+
+def writable(path: Path, suffixes: tuple[str, ...]) -> Path:
+    """Refuse a file that could not be written.
+
+    Raises
+    ------
+    InputError
+        When its ending is none of `suffixes`, it is a folder, or its folder is missing.
+
+    """
+    if path.suffix not in suffixes:
+        raise InputError(
+            f"{path}: unknown format {path.suffix!r}; expected {' or '.join(suffixes)}"
+        )
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a file")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
+    return path
+
+
+def existing(folder: Path) -> Path:
+    """Refuse what is no folder.
+
+    Raises
+    ------
+    InputError
+        With what it is instead.
+
+    """
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {what}; expected a result folder of `run`")
+    return folder
+
+
+def tolerance(tol: float, where: str = "tol") -> float:
+    """Take a relative accuracy, between 0 and 1.
+
+    Raises
+    ------
+    InputError
+        For any other number.
+
+    """
+    if not 0 < tol < 1:
+        raise InputError(f"{where} = {tol}; expected a number between 0 and 1")
+    return tol
+
+
+def budget(seconds: float, where: str = "budget") -> float:
+    """Take a number of seconds, 0 or more.
+
+    Raises
+    ------
+    InputError
+        For any other number.
+
+    """
+    if not seconds >= 0:  # a NaN, too
+        raise InputError(f"{where} {seconds:g}; expected a number of seconds ≥ 0")
+    return seconds

@@ -1,0 +1,138 @@
+"""One case: its QP, and the way back from a point to the physical problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from harness import QP, Fields, Solution, plugin
+from harness.build import build as built
+from harness.build import unbuilt
+from harness.errors import InputError
+from harness.names import CaseName, canonical, parse
+from harness.verify.verdicts import plain
+from mortarbench.arguments import EXPORTS, writable
+from mortarbench.registries import Plugins, Registries, known
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Case:
+    """One QP of one problem, under its canonical name."""
+
+    name: str  #: FAMILY/key=value/…/FORM, without keys that others imply
+    parsed: CaseName  #: the same, in parts
+    made: plugin.Case  #: what the family made
+    registries: Registries  #: those that it was built with
+
+    @property
+    def qp(self) -> QP:
+        """The QP, non-dimensional: energy in SI = scale·objective + constant."""
+        return self.made.qp
+
+    @property
+    def params(self) -> Mapping[str, plugin.Value]:
+        """Every key of the name with its value, defaults included."""
+        return self.parsed.params
+
+    @property
+    def form(self) -> str:
+        """Which of the equivalent QPs of the problem this is: primal, dual, …."""
+        return self.parsed.form
+
+    def quantities(self, solution: Solution) -> dict[str, Any]:
+        """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
+        return dict(plain(self.made.quantities(solution)))
+
+    def fields(self, solution: Solution) -> Fields:
+        """Give the deformed bodies of a point, with stresses and contact forces, SI.
+
+        Raises
+        ------
+        InputError
+            When the case has no bodies.
+
+        """
+        if self.made.fields is None:
+            raise InputError(f"{self.name} has no bodies to draw")
+        return self.made.fields(solution)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the QP for other people's solvers: .npz, .mat or .parquet.
+
+        Raises
+        ------
+        InputError
+            When the ending is none of these, or the file cannot be written.
+
+        """
+        path = writable(Path(path), EXPORTS)
+        meta = plain(
+            {
+                "name": self.name,
+                "family": self.parsed.family,
+                "params": self.params,
+                "form": self.form,
+                "units": "non-dimensional; energy in SI = scale * objective + constant",
+                "scale": self.made.scale,
+                "constant": self.made.constant,
+            }
+        )
+        match path.suffix:
+            case ".mat":
+                from harness.files.matfile import save_mat
+
+                save_mat(path, self.qp, meta, self.made.matrices)
+            case ".parquet":
+                from harness.files.parquetfile import save_parquet
+
+                save_parquet(path, self.qp, meta)
+            case _:
+                from harness.files.qpfile import save_qp
+
+                save_qp(path, self.qp, meta)
+        return path
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{n} {what}" for what, n in self.qp.sizes.items())
+        return f"<Case {self.name}: {sizes}>"
+
+
+def build(name: str, *, plugins: Plugins = ()) -> Case:
+    """Build the case of a name, such as ``beam-ring/Nr=4/Nh=3/steps=1/dual``.
+
+    plugins : Python files with more families
+
+    Raises
+    ------
+    InputError
+        When there is no such case, or it cannot be built.
+
+    """
+    registries = known(plugins)
+    return built_case(parse(name, registries.families), registries)
+
+
+def built_case(parsed: CaseName, registries: Registries) -> Case:
+    """Build a case; what a plug-in or too little memory prevents is no fault of ours.
+
+    Raises
+    ------
+    InputError
+        For both, and what the family itself refuses.
+
+    """
+    family = registries.families[parsed.family]
+    name = canonical(parsed, family)
+    origin = registries.origins.get(parsed.family)
+    try:
+        made = built(parsed, family, registries.reference)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as e:
+        if origin is None and not isinstance(e, MemoryError):
+            raise
+        text = unbuilt(name, e)
+        raise InputError(f"{origin}: {text}" if origin else text) from e
+    return Case(name=name, parsed=parsed, made=made, registries=registries)

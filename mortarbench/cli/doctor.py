@@ -1,0 +1,26 @@
+"""The command `doctor`: is this machine fit to measure."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+
+from mortarbench.registries import Registries
+
+
+def run(registries: Registries, options: Namespace) -> int:
+    """Describe this machine and say what to change before measuring."""
+    from rich.console import Console
+
+    from harness.environment.doctor import as_json, examine, render
+    from harness.environment.environment import digest
+    from harness.environment.noise import noise_floor
+
+    environment, noise = registries.environment(), noise_floor()
+    checks = examine(environment, noise)
+    if options.json:
+        print(json.dumps(as_json(environment, noise, checks)))
+    else:
+        text = render(checks, digest(environment))
+        Console(highlight=False, soft_wrap=True).print(text)
+    return 0

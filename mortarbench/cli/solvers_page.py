@@ -1,0 +1,123 @@
+"""docs/solvers.md: every solver of a registry, in the words of its own file."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from collections.abc import Iterator, Mapping
+from functools import cache
+from textwrap import dedent
+
+from harness.plugin import Solver
+from harness.registry import options_of
+from mortarbench.listing import about
+
+HEAD = """\
+# Solvers
+
+Written by `make docs` from the adapters in `solvers/`; change those, not this file.
+
+Every solver is asked for the same thing: `tol`, the relative KKT accuracy of the
+non-dimensional QP. How each one maps that to its own stopping test is said below. What
+it then claims is recorded beside our own verdict and never believed.
+
+`mortarbench test-solver NAME` runs the conformance suite on any of them, and on one of
+your own with `--plugin FILE.py`. A solver whose library is missing declines, and names
+the command that installs it; `make setup` installs all of them (the extra `fleet`).
+
+Whether units, order, scaled or repeated rows, an offset or a mirror change what each
+answers is measured in [weaknesses.md](weaknesses.md).
+"""
+
+
+def solvers_page(solvers: Mapping[str, Solver]) -> str:
+    """Describe the solvers of a registry in Markdown, one section per class."""
+    groups: dict[type, list[str]] = {}
+    for name, solver in solvers.items():
+        groups.setdefault(type(solver), []).append(name)
+    parts = [HEAD, *_overview(solvers)]
+    for kind, names in groups.items():
+        parts.append(_section(kind, names, solvers))
+    return "\n".join(parts)
+
+
+def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
+    yield "| name | library | method | licence | sequences |"
+    yield "| --- | --- | --- | --- | --- |"
+    for name, solver in solvers.items():
+        facts = about(solver)
+        cells = (
+            [facts.title, facts.method, facts.licence] if facts else ["ours", "", ""]
+        )
+        chains = "yes" if hasattr(solver, "chain") else "no"
+        yield f"| `{name}` | {' | '.join(cells)} | {chains} |"
+    yield ""
+
+
+def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str:
+    facts = about(solvers[names[0]])
+    title = facts.title if facts else kind.__name__
+    lines = [f"## {title}", "", *_docstring(kind)]
+    if facts:
+        rows = {
+            "Install": f"`pip install {facts.package}`" if facts.package else "",
+            "Method": facts.method,
+            "Licence": facts.licence,
+            "Linear solver": facts.linear_solver,
+            "Phases": facts.phases,
+            "Sequences": facts.sequence,
+        }
+        lines += [f"- {key}: {value}." for key, value in rows.items() if value]
+        if facts.limits:
+            lines += ["", "Known limits:", "", *(f"- {x}" for x in facts.limits)]
+        lines.append("")
+    lines += _options(kind, names, solvers)
+    return "\n".join(lines)
+
+
+def _docstring(kind: type) -> list[str]:
+    """Give the paragraphs of a class's docstring, indented blocks as code."""
+    return [dedent(inspect.getdoc(kind) or ""), ""]
+
+
+def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
+    """Tabulate the options: a column of values per name in the registry."""
+    columns = {name: options_of(solvers[name]) for name in names}
+    options = list(columns[names[0]])
+    if not options:
+        return []
+    meanings = _meanings(kind)
+    heads = [f"`{name}`" for name in names]
+    lines = [
+        f"| option | {' | '.join(heads)} | |",
+        f"| --- |{' --- |' * (len(names) + 1)}",
+    ]
+    for option in options:
+        values = " | ".join(f"{columns[name][option]!r}" for name in names)
+        lines.append(f"| `{option}` | {values} | {meanings.get(option, '')} |")
+    return [*lines, ""]
+
+
+def _meanings(kind: type) -> dict[str, str]:
+    """Read the `#:` comments behind the fields of a dataclass and of its bases."""
+    known: dict[str, str] = {}
+    for base in kind.__mro__:
+        known = {**_own_meanings(base), **known}
+    return known
+
+
+@cache
+def _own_meanings(kind: type) -> dict[str, str]:
+    try:
+        source = dedent(inspect.getsource(kind))
+    except (OSError, TypeError):  # not from a file
+        return {}
+    lines = source.splitlines()
+    (body,) = ast.parse(source).body
+    return {
+        node.target.id: lines[node.end_lineno - 1].partition("#:")[2].strip()
+        for node in getattr(body, "body", ())
+        if isinstance(node, ast.AnnAssign)
+        and isinstance(node.target, ast.Name)
+        and node.end_lineno is not None
+    }

@@ -1,0 +1,220 @@
+"""What can be measured: families, solvers and suites, with those of plug-ins."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+from harness.errors import InputError, unknown
+from harness.limits import ONE_THREAD
+from harness.plugin import Family, Reference, Solver
+from harness.registry import (
+    Plugin,
+    SolverSpec,
+    entry_point_plugins,
+    load_plugin,
+    merged,
+)
+from problems import PROBLEMS
+from solvers import SOLVERS
+
+if TYPE_CHECKING:
+    from harness.crossval.discretisation import Discretisation
+    from harness.qp import QP
+    from harness.recipe import Maker
+    from harness.results.work_unit import Commands
+    from harness.solution import Solution
+
+Plugins = Sequence[str | Path]  #: Python files that define SOLVERS or PROBLEMS
+
+
+class Reporter(Protocol):
+    """Writes the report on a result folder, and returns the files."""
+
+    def __call__(
+        self, folder: Path, formats: Sequence[str], *, factor: float = ...
+    ) -> list[Path]:
+        """Report; verdicts are those at factor·tol."""
+
+
+def suites_folder() -> Path:
+    """Say where the suites lie: in the package, or beside it in a checkout."""
+    inside = Path(__file__).parent / "suites"
+    return inside if inside.is_dir() else Path(__file__).parents[1] / "suites"
+
+
+def reference(qp: QP) -> Solution:
+    """Solve to the last digits, by a method that is none of the solvers compared."""
+    from solvers.reference.solve import reference_solution
+
+    return reference_solution(qp)
+
+
+def _report(
+    folder: Path, formats: Sequence[str], *, factor: float | None = None
+) -> list[Path]:
+    from harness.record import VERIFIED_FACTOR
+    from reports import write_report
+
+    return write_report(folder, formats, VERIFIED_FACTOR if factor is None else factor)
+
+
+ValidationPage: TypeAlias = (
+    "Callable[[Path, Mapping[str, Any], Sequence[Discretisation]], list[Path]]"
+)
+
+
+def _validation_page(
+    folder: Path, data: Mapping[str, Any], meshes: Sequence[Discretisation]
+) -> list[Path]:
+    from reports.validation.report import write_validation
+
+    return write_validation(folder, data, meshes)
+
+
+def _paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
+    from mortarbench.paper import measured_paper
+
+    return measured_paper(out, quick, say)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registries:
+    """What can be measured, and how the processes are started that measure it."""
+
+    families: Mapping[str, Family] = field(default_factory=lambda: PROBLEMS)
+    solvers: Mapping[str, Solver] = field(default_factory=lambda: SOLVERS)
+    reference: Reference = reference
+    report: Reporter = _report
+    validation_page: ValidationPage = _validation_page
+    #: measures and writes the paper's figures: folder, quick?, who is told
+    paper: Callable[[Path, bool, Callable[[str], None]], list[Path]] = _paper
+    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
+    #: those of them that did not come in a file
+    own_operators: Mapping[str, Maker] = field(default_factory=dict)
+    suites: Path = field(default_factory=suites_folder)
+    files: tuple[Path, ...] = ()  #: plug-ins that the processes of a run load, too
+    #: which plug-in a family came in, for those that did
+    origins: Mapping[str, str] = field(default_factory=dict)
+    #: starts the command line, less the name of a process that runs need. -P: what lies
+    #: in the working directory must not pass for a library
+    start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
+
+    def extended(self, plugin: Plugin) -> Registries:
+        """Add the solvers, problems and operators of a plug-in.
+
+        Raises
+        ------
+        InputError
+            When one of its names exists.
+
+        """
+        return replace(
+            self,
+            families=merged("problem", self.families, plugin.problems),
+            solvers=merged("solver", self.solvers, plugin.solvers),
+            operators=merged("operator", self.operators, plugin.operators),
+            origins={**self.origins, **dict.fromkeys(plugin.problems, plugin.origin)},
+        )
+
+    def with_files(self, files: Plugins) -> Registries:
+        """Add the plug-ins in `files`.
+
+        Raises
+        ------
+        InputError
+            When one cannot be loaded, or a name of it exists.
+
+        """
+        extended = self
+        for file in map(Path, files):
+            plugin = load_plugin(file)
+            try:
+                extended = extended.extended(plugin)
+            except InputError as e:
+                raise InputError(f"{file}: {e}") from None
+            extended = replace(extended, files=(*extended.files, file))
+        return extended
+
+    def worker_command(self, spec: SolverSpec) -> list[str]:
+        """Make the command that starts the worker of a solver, less its two pipes."""
+        request = {
+            "name": spec.name,
+            "options": spec.options,
+            "plugins": self._absolute_files(),
+        }
+        return [*self.start, "worker", json.dumps(request)]
+
+    def commands(self, specs: Iterable[SolverSpec]) -> Commands:
+        """Make the commands that start the processes of a run."""
+        from harness.results.work_unit import Commands
+
+        request = {"plugins": self._absolute_files()}
+        return Commands(
+            solvers={s.label: self.worker_command(s) for s in specs},
+            generator=[*self.start, "generator", json.dumps(request)],
+        )
+
+    def environment(self) -> dict[str, Any]:
+        """Describe what the processes of a run measure in; see `capture`.
+
+        In a process that is not ours, other libraries and more threads are at work.
+        """
+        from harness.environment.environment import capture, capture_in
+
+        if ONE_THREAD.items() <= os.environ.items():
+            return capture(self.files)
+        return capture_in(ONE_THREAD, self.files)
+
+    def _absolute_files(self) -> list[str]:
+        return [str(file.resolve()) for file in self.files]
+
+    def suite_path(self, text: str | Path) -> Path:
+        """Find a suite by path, or by its bare name among those that come with us.
+
+        Raises
+        ------
+        InputError
+            When there is neither.
+
+        """
+        path = Path(text)
+        if path.is_file():
+            return path
+        known = {p.stem: p for p in self.suites.glob("*.toml")}
+        if str(text) in known:
+            return known[str(text)]
+        if path.exists():
+            return path  # what it is instead of a file, says who reads it
+        if len(path.parts) > 1 or path.suffix:
+            raise InputError(f"{text}: no such file; expected a suite in TOML")
+        raise unknown("suite", str(text), known)
+
+
+def installed(registries: Registries) -> Registries:
+    """Add what installed packages offer as entry points.
+
+    Raises
+    ------
+    InputError
+        When one fails to import, or one of its names exists.
+
+    """
+    return registries.extended(entry_point_plugins())
+
+
+def known(plugins: Plugins = ()) -> Registries:
+    """Give all that is known: ours, installed plug-ins, and those in files.
+
+    Raises
+    ------
+    InputError
+        When a plug-in cannot be loaded, or one of its names exists.
+
+    """
+    return installed(Registries()).with_files(plugins)

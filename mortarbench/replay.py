@@ -1,0 +1,255 @@
+"""One stored measurement against the same made anew: what is the same, what is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from harness.environment.environment import digest
+from harness.errors import FaultError, InputError
+from harness.files.store import Arrays, digest_of, load_solution, point_arrays
+from harness.record import Record, finite
+from harness.results.folder import differences
+from harness.results.stored_run import StoredRun, block_of, open_capsule
+from harness.results.work_unit import Result, Unbuilt, Unmade
+from harness.running.executor import one_by_one
+from harness.solution import Status
+from mortarbench.registries import Plugins, Registries, known
+from mortarbench.text import aligned
+
+_RESIDUALS = ("primal", "dual", "complementarity", "gap")
+_SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
+_SHOWN = 48  #: characters of a value of an environment
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Replay:
+    """A stored measurement (`then`) and its repetition (`now`)."""
+
+    then: Record
+    now: Record
+    same_qp: bool | None  #: None where the record is too old to tell
+    same_options: bool  #: with all defaults resolved
+    same_counts: bool  #: iterations too
+    distance: float | None  #: ‖x_now − x_then‖∞ / ‖x_then‖∞; None without two points
+    ratios: Mapping[str, tuple[float, float, float] | None]
+    """Of times: now over the median of the stored repeats; and those repeats' least
+    and greatest over that median. None where one was not measured."""
+    stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, s
+    environment: list[tuple[str, Any, Any]]  #: dotted key, then, now
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether the same QP got the same verdict."""
+        return self.same_qp is not False and self.then.status is self.now.status
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        data: dict[str, Any] = finite({**asdict(self), "reproduced": self.reproduced})
+        data["environment"] = [
+            {"key": key, "then": then, "now": now}
+            for key, then, now in self.environment
+        ]
+        return data
+
+
+def replay(
+    folder: str | Path,
+    run_id: str,
+    *,
+    plugins: Plugins = (),
+    registries: Registries | None = None,
+) -> Replay:
+    """Make one stored measurement again, and compare.
+
+    Parameters
+    ----------
+    run_id : of a line of the journal, or its first digits
+    plugins : Python files with more solvers or families
+    registries : what is known, instead of ours, what is installed and `plugins`
+
+    Raises
+    ------
+    InputError
+        When there is no such measurement, or its case or solver is not known.
+    FaultError
+        When something else than the solver prevented it.
+
+    """
+    registries = known(plugins) if registries is None else registries
+    families, solvers = registries.families, registries.solvers
+    stored = open_capsule(Path(folder), run_id, families, solvers)
+    environment = registries.environment()
+    unit = block_of(stored, families, solvers, digest(environment))
+    commands = registries.commands([stored.spec])
+    with (
+        TemporaryDirectory(prefix="mortarbench-") as scratch,
+        one_by_one(
+            commands,
+            Path(scratch),
+            Path(scratch) / "cases",
+            operators=registries.operators,
+        ) as execute,
+    ):
+        *_, result = execute(iter([unit]))
+    if isinstance(result, Unbuilt):
+        raise InputError(f"{stored.record.run_id}: {result.reason}")
+    if isinstance(result, Unmade):
+        raise FaultError(f"{stored.record.run_id}: {result.reason}")
+    return compared(Path(folder), stored, result, environment)
+
+
+def compared(
+    folder: Path,
+    run: StoredRun,
+    result: Result,
+    environment: Mapping[str, Any],
+) -> Replay:
+    """Compare a new measurement and its point with what `folder` holds."""
+    then, now = run.record, result.record
+    stored = {
+        name: tuple(s for r in run.repeats if (s := getattr(r, name)) is not None)
+        for name in _SECONDS
+    }
+    return Replay(
+        then=then,
+        now=now,
+        same_qp=None if then.qp is None else then.qp == now.qp,
+        same_options=then.options == now.options,
+        same_counts=(then.iterations, then.counts) == (now.iterations, now.counts),
+        distance=_distance(folder, then, result.point),
+        ratios={name: _ratio(stored[name], getattr(now, name)) for name in _SECONDS},
+        stored=stored,
+        environment=list(differences(_keyed(run.environment), _keyed(environment))),
+    )
+
+
+def render(c: Replay) -> str:
+    """Lay out a comparison: then, now, and what is the same."""
+    rows = [["", "then", "now", ""], *_verdicts(c), *_numbers(c), *_times(c)]
+    lines = [f"{c.now.run_id}  {c.now.solver} on {c.now.case}, tolerance {c.now.tol:g}"]
+    lines += ["", aligned(rows), ""]
+    if c.environment:
+        lines.append("The environment differs:")
+        shown = [[f"  {k}", _short(a), f"→ {_short(b)}"] for k, a, b in c.environment]
+        lines += [aligned(shown), ""]
+    else:
+        lines += ["The environment is the same.", ""]
+    if c.reproduced:
+        lines.append("Reproduced: the same verdict.")
+    elif c.same_qp is False:
+        lines.append("Not reproduced: the case builds another QP than it did.")
+    else:
+        lines.append(f"Not reproduced: {c.then.status} then, {c.now.status} now.")
+    return "\n".join(lines)
+
+
+def _verdicts(c: Replay) -> Iterable[list[str]]:
+    then, now = c.then, c.now
+    yield ["status", then.status, now.status, _same(then.status is now.status)]
+    yield [
+        "claimed", _text(then.claimed), _text(now.claimed),
+        _same(then.claimed == now.claimed),
+    ]  # fmt: skip
+    if then.message or now.message:
+        yield [
+            "message", _short(then.message), _short(now.message),
+            _same(then.message == now.message),
+        ]  # fmt: skip
+    verdict = "not recorded" if c.same_qp is None else _same(c.same_qp)
+    yield ["QP", _text(then.qp), _text(now.qp), verdict]
+    yield ["options", "", "", _same(c.same_options)]
+
+
+def _numbers(c: Replay) -> Iterable[list[str]]:
+    for name in ("iterations", *sorted({*c.then.counts, *c.now.counts})):
+        a, b = (
+            r.iterations if name == "iterations" else r.counts.get(name)
+            for r in (c.then, c.now)
+        )
+        if (a, b) != (None, None):
+            yield [name, _text(a), _text(b), _same(a == b)]
+    if c.then.schema != c.now.schema:
+        yield ["residuals", f"schema {c.then.schema}", f"schema {c.now.schema}",
+               "defined differently"]  # fmt: skip
+    for name in (*_RESIDUALS, "objective"):
+        a, b = getattr(c.then, name), getattr(c.now, name)
+        if (a, b) != (None, None):
+            digits = ".10g" if name == "objective" else ".2g"
+            yield [name, _text(a, digits), _text(b, digits), _same(a == b)]
+    if c.distance is not None:
+        yield ["point", "", "", _same(c.distance == 0) + f": off by {c.distance:.1e}"]
+
+
+def _times(c: Replay) -> Iterable[list[str]]:
+    for name, ratio in c.ratios.items():
+        a, b = getattr(c.then, name), getattr(c.now, name)
+        if ratio is None:
+            continue
+        row = _ratio_text(ratio, c.stored[name])
+        yield [
+            name.removesuffix("_seconds") + ", s", _text(a, ".3g"), _text(b, ".3g"), row
+        ]  # fmt: skip
+
+
+def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> str:
+    """Say what a new time is divided by: `then` is but one of several repeats."""
+    now, least, greatest = ratio
+    if len(stored) == 1:
+        return f"{now:.2f} of the only stored repeat"
+    return (
+        f"{now:.2f} of {median(stored):.3g}, the median of {len(stored)} stored "
+        f"repeats ({least:.2f} … {greatest:.2f} of it)"
+    )
+
+
+def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
+    if then.vectors is None or point is None:
+        return None
+    try:
+        solution = load_solution(folder, then.vectors, Status.SOLVED)
+    except InputError:  # the vectors may have been thrown away: records suffice
+        return None
+    if digest_of(point_arrays(solution)) != then.vectors:  # not what was stored
+        return None
+    stored = solution.x
+    if stored.shape != point["x"].shape:
+        return None
+    scale = np.abs(stored).max(initial=0.0) or 1.0
+    return float(np.abs(point["x"] - stored).max(initial=0.0) / scale)
+
+
+def _ratio(
+    stored: Sequence[float], new: float | None
+) -> tuple[float, float, float] | None:
+    if new is None or not stored or not (middle := median(stored)):
+        return None
+    return new / middle, min(stored) / middle, max(stored) / middle
+
+
+def _keyed(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Name each thread pool by its library, so that one that differs is named."""
+    threads = environment.get("threads")
+    if not isinstance(threads, Mapping) or "pools" not in threads:
+        return dict(environment)
+    pools = {f"{p['library']} of {p['owner']}": p for p in threads["pools"]}
+    return {**environment, "threads": {**threads, "pools": pools}}
+
+
+def _same(yes: bool) -> str:
+    return "same" if yes else "differs"
+
+
+def _text(value: Any, digits: str = "") -> str:
+    return "–" if value is None else format(value, digits)
+
+
+def _short(value: Any) -> str:
+    text = _text(value) if isinstance(value, str | None) else str(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"

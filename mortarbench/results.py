@@ -1,0 +1,209 @@
+"""A suite measured into a folder, and what such a folder holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from harness.environment.doctor import load_advice
+from harness.environment.environment import digest
+from harness.errors import InputError, some
+from harness.record import Record
+from harness.registry import resolve
+from harness.results.faults import in_words
+from harness.results.folder import keep_environment
+from harness.results.journal import read_journal
+from harness.running.executor import one_by_one
+from harness.running.progress import Progress
+from harness.running.run import Missing
+from harness.running.run import run as run_suite
+from harness.suite.overrides import with_overrides
+from harness.suite.suite import load_suite
+from mortarbench.progress import Callback, shown
+from mortarbench.registries import Plugins, Registries, known
+from mortarbench.text import summary, summary_rows
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from harness.results.work_unit import Opens
+    from mortarbench.reporting import Report
+    from mortarbench.validation import Validation
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Results:
+    """The measurements of a result folder."""
+
+    folder: Path
+    records: tuple[Record, ...]  #: one per measurement, in the order of the journal
+    solvers: tuple[str, ...] = ()  #: of the suite, in its order
+    missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
+    #: what was not measured; the same call tries it again
+
+    @cached_property
+    def df(self) -> DataFrame:
+        """A row per measurement, a column per field of the journal."""
+        from pandas import DataFrame
+
+        return DataFrame([record.to_dict() for record in self.records])
+
+    @property
+    def shortfall(self) -> list[str]:
+        """Say what could not be measured, a line each; none if all was."""
+        lines = []
+        if count := len(self.missing.unbuilt):
+            cases = "case" if count == 1 else "cases"
+            names = some(self.missing.unbuilt)
+            lines.append(f"{count} {cases} could not be built: {names}")
+        if self.missing.faults:
+            faults = in_words(self.missing.faults)
+            lines.append(f"{faults}; the same command tries again")
+        return lines
+
+    def report(self, **options: object) -> Report:
+        """Write the report; see `mortarbench.report`."""
+        from mortarbench.reporting import report
+
+        return report(self.folder, **options)  # type: ignore[arg-type]
+
+    def validate(self, **options: object) -> Validation:
+        """Cross-validate the answers; see `mortarbench.validate`."""
+        from mortarbench.validation import validate
+
+        return validate(self.folder, **options)  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __repr__(self) -> str:
+        text = [summary(self.records, self.solvers), *self.shortfall]
+        return "\n".join(text)
+
+    def _repr_html_(self) -> str:
+        head, *rows = summary_rows(self.records, self.solvers)
+        cells = [
+            "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row)
+            for tag, row in [("th", head), *(("td", row) for row in rows)]
+        ]
+        notes = "".join(f"<p>{escape(line)}</p>" for line in self.shortfall)
+        return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>{notes}"
+
+
+def ignore(text: str) -> None:
+    """Take no notice."""
+
+
+def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:
+    """Read the measurements of a result folder.
+
+    warn : is told of lines that were cut off, or damaged
+
+    Raises
+    ------
+    InputError
+        When the folder holds no measurements.
+
+    """
+    path = Path(folder)
+    records = read_journal(path, warn)
+    if not records:
+        raise InputError(f"{path}: no measurements; expected a result folder of `run`")
+    return Results(folder=path, records=tuple(records))
+
+
+def run(
+    suite: str | Path,
+    *,
+    out: str | Path | None = None,
+    solvers: Sequence[str] = (),
+    cases: Sequence[str] = (),
+    repeats: int | None = None,
+    time_limit: float | None = None,
+    memory_limit: float | None = None,
+    fresh: bool = False,
+    dask: str | None = None,
+    plugins: Plugins = (),
+    progress: bool | Callback | Progress | None = None,
+    registries: Registries | None = None,
+) -> Results:
+    """Measure what a result folder lacks of a suite.
+
+    Parameters
+    ----------
+    suite : path of a TOML, or the name of one of `suites`
+    out : the result folder; ``out/NAME`` of the suite if not given
+    solvers : only these; names that the suite has not are added
+    cases : only these, patterns or names
+    repeats, time_limit (s), memory_limit (MiB) : instead of the suite's
+    fresh : forget first what the folder holds
+    dask : address of a scheduler, or ``local``
+    plugins : Python files with more solvers or families
+    progress : True: a bar, or lines where stderr is no terminal; a function: is called
+        with every `Event`; False: nothing; None: a bar in a notebook, else nothing
+    registries : what is known, instead of ours, what is installed and `plugins`
+
+    Raises
+    ------
+    InputError
+        When something of that is wrong, the folder is in use, or its disk is full.
+
+    """
+    registries = known(plugins) if registries is None else registries
+    asked = with_overrides(
+        load_suite(
+            registries.suite_path(suite), registries.families, registries.solvers
+        ),
+        registries.families,
+        registries.solvers,
+        solvers=solvers,
+        cases=cases,
+        repeats=repeats,
+        time_limit=time_limit,
+        memory_limit=memory_limit,
+    )
+    folder = Path("out") / asked.name if out is None else Path(out)
+    environment = registries.environment()
+    with shown(progress) as display:
+        if load_advice(busy := environment["now"]["load"]):
+            display.warn(
+                f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
+                "be less certain"
+            )
+        engine: Opens
+        if dask is None:
+            engine = partial(one_by_one, operators=registries.operators)
+        else:
+            from harness.running.cluster import on_cluster
+
+            engine = on_cluster(
+                dask,
+                plugins=registries.files,
+                operators=registries.own_operators,
+                environment=environment,
+                keep=lambda name, there: keep_environment(folder, name, there),
+                warn=display.warn,
+            )
+        missing = run_suite(
+            asked,
+            families=registries.families,
+            out=folder,
+            commands=registries.commands(asked.solvers),
+            resolve=lambda spec: resolve(spec, registries.solvers),
+            environment=environment,
+            digest=digest(environment),
+            progress=display,
+            fresh=fresh,
+            engine=engine,
+        )
+        records = read_journal(folder, display.warn)
+    return Results(
+        folder=folder,
+        records=tuple(records),
+        solvers=tuple(s.label for s in asked.solvers),
+        missing=missing,
+    )

@@ -1,0 +1,234 @@
+"""Cross-validation: whether the answers that a result folder holds agree."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from harness.crossval.comparison import brief
+from harness.crossval.discretisation import Discretisation, discretisation_errors
+from harness.crossval.summary import as_data
+from harness.crossval.validation import validated
+from harness.errors import InputError
+from harness.files.durable import full_disk_told, replace_file
+from harness.names import assemble
+from harness.results.journal import read_journal
+from mortarbench.arguments import budget as checked_budget
+from mortarbench.registries import Plugins, Registries, known
+from mortarbench.results import ignore
+from mortarbench.text import aligned, legible
+
+_MOST = 12  #: entries of a list on the terminal; the page has them all
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Validation:
+    """What a cross-validation found."""
+
+    agreed: bool  #: no claim is refuted, and no two answers disagree
+    data: Mapping[str, Any]  #: everything, as in validation.json
+    meshes: tuple[Discretisation, ...]  #: what finer meshes told
+    pages: tuple[Path, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON, without what concerns single problems."""
+        verdict = {k: v for k, v in self.data.items() if k != "problems"}
+        return {**verdict, "discretisation": [asdict(d) for d in self.meshes]}
+
+    def __repr__(self) -> str:
+        return as_text(self.data, self.meshes)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def validate(
+    folder: str | Path,
+    *,
+    budget: float = 300.0,
+    plugins: Plugins = (),
+    progress: Callable[[str], None] = ignore,
+    registries: Registries | None = None,
+) -> Validation:
+    """Build every case of a result folder again, and judge every stored answer.
+
+    Writes validation.json and the page report/validation.html.
+
+    Parameters
+    ----------
+    budget : s, for finer meshes, which tell discretisation errors
+    plugins : Python files with more solvers or families
+    progress : is told what happens
+    registries : what is known, instead of ours, what is installed and `plugins`
+
+    Raises
+    ------
+    InputError
+        When the folder holds no answer that can be judged.
+
+    """
+    checked_budget(budget)
+    registries = known(plugins) if registries is None else registries
+    path = Path(folder)
+    found = validated(path, registries.families, registries.reference, progress)
+    data = as_data(found, path.resolve().name)
+    if not (data["counts"]["answers"] or found.false_claims):
+        why = found.not_validated[0].text if found.not_validated else "none is a claim"
+        raise InputError(f"{path}: no stored answer can be judged: {why}")
+    text = json.dumps(data, allow_nan=False) + "\n"
+    with full_disk_told(path):
+        replace_file(path / "validation.json", text.encode())
+    pages = registries.validation_page(path, data, ())
+    meshes = _meshes(registries, path, budget, progress)
+    if meshes:  # the page was there while they were solved; now it tells of them, too
+        pages = registries.validation_page(path, data, meshes)
+    return Validation(
+        agreed=found.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
+    )
+
+
+def _meshes(
+    registries: Registries,
+    folder: Path,
+    seconds: float,
+    progress: Callable[[str], None],
+) -> list[Discretisation]:
+    """Solve the folder's cases on finer meshes, where families say what these are."""
+    records = {r.case: r for r in read_journal(folder, progress)}
+    used = {r.family for r in records.values()} & set(registries.families)
+    refinable = {
+        name: family
+        for name in used
+        if hasattr(family := registries.families[name], "refined")
+    }
+    names = []
+    for r in records.values():
+        if r.family in refinable:
+            with suppress(InputError):  # of another version: listed as not validated
+                names.append(assemble(refinable[r.family], r.params, r.form))
+    return discretisation_errors(
+        names, refinable, registries.reference, folder, seconds, progress
+    )
+
+
+def _mesh(d: Discretisation) -> str:
+    before = "less than " if d.kind == "rounding" else ""
+    return f"{before}{_e(d.error)}{' to the next mesh' * (d.kind == 'change')}"
+
+
+def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
+    """Lay out one screen of what `harness.crossval.summary.as_data` returns."""
+    parts = [legible(data["headline"]), _solvers(data["solvers"])]
+    entries = {
+        "Refuted claims": _refuted(data["disagreements"]),
+        "Apart without a culprit": [
+            f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
+            f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
+            for d in data["unresolved"]
+        ],
+        "Certificates contradicted (a fault of ours)": list(
+            map(_listed, data["contradictions"])
+        ),
+        "Not validated": _together(data["not_validated"]),
+        "Without a reference": [
+            f"{d['problem']}: {d['text']}" for d in data["without_reference"]
+        ],
+    }
+    parts += [_list(title, lines) for title, lines in entries.items() if lines]
+    small = [
+        f"{data['counts'][key]} {words}"
+        for key, words in (
+            ("remarks", "stand out from the other solvers, within what they claim"),
+            ("unanswered", "measurements ended without an answer"),
+        )
+        if data["counts"][key]
+    ]
+    parts += ["; ".join(small) + "."] if small else []
+    if known := [d for d in meshes if d.error is not None]:
+        title = (
+            "Discretisation errors, relative, in the energy norm; `report` shows what "
+            "they are worth"
+        )
+        parts.append(_list(title, [f"{d.case}: {_mesh(d)}" for d in known]))
+    return "\n\n".join(parts)
+
+
+def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Lay out a row per solver."""
+    columns = {
+        "error_median": "error: median", "error_worst": "worst",
+        "penetration": "penetration/h", "balance": "balance",
+        "primal_dual": "primal-dual", "from_ours": "from smalbe",
+    }  # fmt: skip
+    if all(row["from_ours"] is None for row in rows):
+        del columns["from_ours"]  # there is no smalbe to compare with
+    head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
+    lines = [
+        [
+            legible(row["solver"]),
+            f"{row['tol']:g}",
+            *(str(row[key]) for key in ("answers", "refuted", "unanswered")),
+            *(_e(row[key]) for key in columns),
+        ]
+        for row in rows
+    ]
+    table = aligned([head, *lines], right=range(1, len(head)))
+    return f"Certified errors: relative, in the energy norm.\n{table}"
+
+
+def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List every claim, or, of very many, the worst of each solver."""
+    if len(wrong) <= _MOST:
+        return list(map(_wrong, wrong))
+    own: dict[str, list[Mapping[str, Any]]] = {}
+    for d in wrong:
+        own.setdefault(d["solver"], []).append(d)
+    return [
+        f"{_wrong(max(claims, key=lambda d: d['error'] or 0.0))}"
+        + (f" (the worst of {len(claims)})" if len(claims) > 1 else "")
+        for claims in own.values()
+    ]
+
+
+def _wrong(d: Mapping[str, Any]) -> str:
+    error = f"; error {_e(d['error'])}" if d["error"] is not None else ""
+    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {_reasons(d)}{error}"
+
+
+def _reasons(d: Mapping[str, Any]) -> str:
+    return "; ".join(d["reasons"])
+
+
+def _listed(d: Mapping[str, Any]) -> str:
+    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {d['text']}"
+
+
+def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Say once what concerns all answers to a case."""
+    counted: dict[tuple[str, str], int] = {}
+    for d in listed:
+        key = (d["case"], d["text"])
+        counted[key] = counted.get(key, 0) + 1
+    return [
+        f"{case} ({n} answer{'s' * (n != 1)}): {text}"
+        for (case, text), n in counted.items()
+    ]
+
+
+def _list(title: str, lines: Sequence[str]) -> str:
+    shown = [f"  {legible(line)}" for line in lines[:_MOST]]
+    more = len(lines) - _MOST
+    if more > 0:
+        shown.append(f"  … and {more} more, see the page")
+    return "\n".join([f"{title}:", *shown])
+
+
+def _e(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return brief(value) if value else "0"

@@ -1,0 +1,1 @@
+"""What the families build: meshes, materials, loads and exact solutions."""

@@ -1,0 +1,10 @@
+"""Write mortarbench/catalogue.json: what `list solvers` says of our own solvers."""
+
+import json
+
+from mortarbench.listing import CATALOGUE, described
+from solvers import SOLVERS
+
+CATALOGUE.write_text(
+    json.dumps({name: described(s) for name, s in SOLVERS.items()}, indent=1) + "\n"
+)
