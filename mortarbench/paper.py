@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mortarbench.registries import Registries, reference
+from mortarbench.registries import Registries
 from mortarbench.results import run
 
 if TYPE_CHECKING:
@@ -27,7 +27,9 @@ BEYOND: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def measured_paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
+def measured_paper(
+    registries: Registries, out: Path, quick: bool, say: Callable[[str], None]
+) -> list[Path]:
     """Measure what the paper's figures and tables show, and write them.
 
     quick : fewer sizes and repeats
@@ -39,16 +41,19 @@ def measured_paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[P
         When the folder is in use, or no folder of such measurements.
 
     """
-    from harness.environment.environment import capture
     from harness.files.experiment import save_experiment
     from problems.experiments import PAPER, QUICK, paper_experiment
     from reports.paper.report import write_paper
 
     data = out / "data"
     experiment = paper_experiment(
-        QUICK if quick else PAPER, _answer("smalbe"), capture(), say,
-        baseline=_answer("smalbe-paper"), reference=reference,
-    )  # fmt: skip
+        QUICK if quick else PAPER,
+        _answer(registries, "smalbe"),
+        registries.environment(),
+        say,
+        baseline=_answer(registries, "smalbe-paper"),
+        reference=registries.reference,
+    )
     save_experiment(experiment, data)
     for name, narrowed in BEYOND.items():
         say(f"Suite {name}")
@@ -57,13 +62,13 @@ def measured_paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[P
             out=data / name,
             fresh=True,
             progress=True,
-            registries=Registries(),
+            registries=registries,
             **(narrowed if quick else {}),
         )
     return write_paper(out)
 
 
-def _answer(name: str) -> Reference:
+def _answer(registries: Registries, name: str) -> Reference:
     """Solve with a solver of ours to the paper's accuracy, which it does not state."""
-    solver = Registries().solvers[name]
+    solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

@@ -258,3 +258,7 @@ def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
         yield _Told(progress)
     else:
         yield _Silent()
+
+
+def ignore(text: str) -> None:
+    """Take no notice."""

@@ -77,12 +77,6 @@ def _validation_page(
     return write_validation(folder, data, meshes)
 
 
-def _paper(out: Path, quick: bool, say: Callable[[str], None]) -> list[Path]:
-    from mortarbench.paper import measured_paper
-
-    return measured_paper(out, quick, say)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Registries:
     """What can be measured, and how the processes are started that measure it."""
@@ -92,8 +86,6 @@ class Registries:
     reference: Reference = reference
     report: Reporter = _report
     validation_page: ValidationPage = _validation_page
-    #: measures and writes the paper's figures: folder, quick?, who is told
-    paper: Callable[[Path, bool, Callable[[str], None]], list[Path]] = _paper
     operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
     #: those of them that did not come in a file
     own_operators: Mapping[str, Maker] = field(default_factory=dict)

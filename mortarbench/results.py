@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -23,16 +24,16 @@ from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
 from harness.suite.suite import load_suite
-from mortarbench.progress import Callback, shown
+from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import Plugins, Registries, known
+from mortarbench.reporting import Report, report
 from mortarbench.text import summary, summary_rows
+from mortarbench.validation import Validation, validate
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
     from harness.results.work_unit import Opens
-    from mortarbench.reporting import Report
-    from mortarbench.validation import Validation
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -67,14 +68,10 @@ class Results:
 
     def report(self, **options: object) -> Report:
         """Write the report; see `mortarbench.report`."""
-        from mortarbench.reporting import report
-
         return report(self.folder, **options)  # type: ignore[arg-type]
 
     def validate(self, **options: object) -> Validation:
         """Cross-validate the answers; see `mortarbench.validate`."""
-        from mortarbench.validation import validate
-
         return validate(self.folder, **options)  # type: ignore[arg-type]
 
     def __len__(self) -> int:
@@ -92,10 +89,6 @@ class Results:
         ]
         notes = "".join(f"<p>{escape(line)}</p>" for line in self.shortfall)
         return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>{notes}"
-
-
-def ignore(text: str) -> None:
-    """Take no notice."""
 
 
 def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:
@@ -169,7 +162,7 @@ def run(
     folder = Path("out") / asked.name if out is None else Path(out)
     environment = registries.environment()
     with shown(progress) as display:
-        if load_advice(busy := environment["now"]["load"]):
+        if load_advice(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less certain"

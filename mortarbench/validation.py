@@ -19,8 +19,8 @@ from harness.files.durable import full_disk_told, replace_file
 from harness.names import assemble
 from harness.results.journal import read_journal
 from mortarbench.arguments import budget as checked_budget
+from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, known
-from mortarbench.results import ignore
 from mortarbench.text import aligned, legible
 
 _MOST = 12  #: entries of a list on the terminal; the page has them all

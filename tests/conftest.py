@@ -7,6 +7,7 @@ import pytest
 
 from harness import QP, Solution
 from harness.conformance.manufactured import planted as drawn
+from harness.limits import ONE_THREAD
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -15,6 +16,7 @@ def pytest_configure(config: pytest.Config) -> None:
     The harness binds what it measures to the last CPU that it may use; without this,
     all workers would measure on the same one.
     """
+    os.environ.update(ONE_THREAD)  # as the command line does
     worker = getattr(config, "workerinput", None)
     if worker is not None:
         cpus = sorted(os.sched_getaffinity(0))

@@ -17,7 +17,9 @@ def run(registries: Registries, options: Namespace) -> int:
         raise InputError(
             f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
         ) from None
+    from mortarbench.paper import measured_paper
+
     with full_disk_told(options.out):
-        written = registries.paper(options.out, options.quick, say)
+        written = measured_paper(registries, options.out, options.quick, say)
     print(*(file for file in written if file.suffix == ".html"), sep="\n")
     return 0

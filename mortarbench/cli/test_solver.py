@@ -1,4 +1,4 @@
-"""The command that runs the conformance suite on solvers, each in its own process."""
+"""The command `test-solver`: the conformance suite on solvers."""
 
 from __future__ import annotations
 
@@ -6,19 +6,15 @@ import fnmatch
 import json
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING
 
-from harness.conformance.conformance import CHECKS, FINDS, KEEPS, Grade, Result
-from harness.conformance.weaknesses import weaknesses_page
-from harness.processes.measurement import scratch_folder
-from harness.processes.supervisor import WorkerProcess
-from harness.registry import SolverSpec, resolve
+from harness.registry import SolverSpec, check_name, resolve
 from mortarbench.registries import Registries
 from mortarbench.text import aligned
 
-TIME_LIMIT = 60.0  #: s per check
-MEMORY_LIMIT = 4096.0  #: MiB per check
+if TYPE_CHECKING:
+    from harness.conformance.conformance import Result
 
 
 def run(registries: Registries, options: Namespace) -> int:
@@ -29,6 +25,12 @@ def run(registries: Registries, options: Namespace) -> int:
         for pattern in options.solver
         for name in _named(pattern, registries.solvers)
     ]
+    for spec in specs:
+        check_name(spec.name, registries.solvers)
+    from harness.conformance.conformance import CHECKS, KEEPS
+    from harness.conformance.weaknesses import weaknesses_page
+    from mortarbench.conformance import conforms, examined
+
     for spec in specs:
         resolve(spec, registries.solvers)
     checks = [c for c in CHECKS if c.startswith(KEEPS) or not options.markdown]
@@ -48,7 +50,7 @@ def run(registries: Registries, options: Namespace) -> int:
             for name, r in found.items()
         ]
         print(json.dumps(rows))
-    return 0 if all(map(_conforms, results.values())) else 1
+    return 0 if all(map(conforms, results.values())) else 1
 
 
 def _named(pattern: str, solvers: Collection[str]) -> list[str]:
@@ -60,36 +62,8 @@ def _named(pattern: str, solvers: Collection[str]) -> list[str]:
 
 
 def _show(solver: str, results: Mapping[str, Result]) -> None:
+    from harness.conformance.conformance import Grade
+
     print(aligned([r.grade, name, r.message] for name, r in results.items()))
     grades = Counter(r.grade for r in results.values())
     print(f"{solver}: {', '.join(f'{grades[g]} {g}' for g in Grade)}")
-
-
-def _conforms(results: Mapping[str, Result]) -> bool:
-    solved = any(
-        r.grade is Grade.PASS and name.startswith(FINDS) for name, r in results.items()
-    )
-    return solved and all(r.grade is not Grade.FAIL for r in results.values())
-
-
-def examined(
-    command: list[str], checks: Iterable[str], time_limit: float = TIME_LIMIT
-) -> Iterator[tuple[str, Result]]:
-    """Run checks; what kills or hangs the solver's process fails one check only.
-
-    command : starts the worker; two file descriptors are appended to it
-    """
-    with ExitStack() as stack:
-        scratch = stack.enter_context(scratch_folder())
-        worker = WorkerProcess(command, scratch / "worker.log")
-        stack.callback(worker.close)
-        for name in checks:
-            reply = worker.ask(
-                {"check": name}, time_limit=time_limit, memory_limit=MEMORY_LIMIT
-            )
-            if reply.answer is None:
-                weak = name.startswith(KEEPS)
-                yield name, Result(Grade.WEAK if weak else Grade.FAIL, reply.message)
-            else:
-                grade, *others = (reply.answer[field] for field in Result._fields)
-                yield name, Result(Grade(grade), *others)

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from harness import InputError
-from problems.families.ranges import (
+from problems.ranges import (
     CONTACT_FORMS,
     METHODS,
     MOST_STEPS,

@@ -9,7 +9,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from harness import InputError
-from problems.families.ranges import (
+from problems.files.file_digest import check_digest, digest
+from problems.ranges import (
     CONTACT_FORMS,
     METHODS,
     MOST_STEPS,
@@ -19,7 +20,6 @@ from problems.families.ranges import (
     at_most,
     one_of,
 )
-from problems.files.file_digest import check_digest, digest
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from problems.families.ranges import (
+from problems.ranges import (
     METHODS,
     PLANES,
     at_least,

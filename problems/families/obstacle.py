@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from problems.families.ranges import at_least, doubled, fits, one_of
+from problems.ranges import at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value

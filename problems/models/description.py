@@ -47,10 +47,10 @@ from harness.checked import located
 from harness.errors import shown, unknown
 from harness.files.reading import read_toml
 from problems.contact.bodies import Bodies, ContactPair, assemble
-from problems.families.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
+from problems.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS
 
 _KEYS = ("mesh", *SETTINGS, "units", "bodies", "supports", "loads", "contacts")
 

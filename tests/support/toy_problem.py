@@ -60,16 +60,16 @@ class Well:
 
     def fields(self, s):
         return Fields(
-            points=np.zeros((4, 2)),
+            points=np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]),
             cells=np.array([[0, 1, 2, 3]]),
-            bodies=np.zeros(1),
+            bodies=np.zeros(1, dtype=np.int64),
             displacement=np.zeros((4, 2)),
         )
 
 
 @dataclass(frozen=True)
 class Exact:
-    """Divides by a diagonal. Only for toy_problem."""
+    """Divides by a diagonal. Only for toy problems."""
 
     factor: float = 1.0
     reason: str | None = None

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from harness import Solution, Status, kkt_residuals
+from harness.conformance import conformance
 from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
 from harness.conformance.equivalence import (
     CHANGES,
@@ -23,7 +24,6 @@ from harness.conformance.equivalence import (
 )
 from harness.conformance.manufactured import FORMS, SHAPES, planted, strings
 from harness.conformance.weaknesses import line_of
-from mortarbench.cli import test_solver as examine
 from solvers import SOLVERS
 from tests.support import ROOT
 
@@ -408,7 +408,7 @@ def test_weaknesses_are_told_and_solvers_that_have_some_conform(
     plugin, capsys, monkeypatch
 ):
     few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
-    monkeypatch.setattr(examine, "CHECKS", few)
+    monkeypatch.setattr(conformance, "CHECKS", few)
     assert command("test-solver", "minds", "--plugin", plugin) == 0
     out = capsys.readouterr().out
     (line,) = (x for x in out.splitlines() if "primal, units N, m " in x)
@@ -435,7 +435,7 @@ def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
 
 def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
     few = ("refuses a misspelt option", "keeps its answer: dual, mirrored")
-    monkeypatch.setattr(examine, "CHECKS", few)
+    monkeypatch.setattr(conformance, "CHECKS", few)
     command("test-solver", "piqp-*", "sound", "--plugin", plugin, "--json")
     rows = json.loads(capsys.readouterr().out)
     named = ["piqp-dense", "piqp-sparse", "sound"]
@@ -450,7 +450,7 @@ def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
 
 def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):
     few = ("gives multipliers our signs", "refuses a misspelt option")
-    monkeypatch.setattr(examine, "CHECKS", few)
+    monkeypatch.setattr(conformance, "CHECKS", few)
     assert command("test-solver", "dies", "--plugin", plugin) == 1
     lines = capsys.readouterr().out.splitlines()
     (options,) = (line for line in lines if "misspelt option" in line)

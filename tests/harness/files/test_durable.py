@@ -270,7 +270,7 @@ forms = ["dual"]
 """
 
 
-def first_page(folder, _formats):
+def first_page(folder, _formats, *, factor=10.0):
     """Write what the summary of a report says."""
     (folder / "said").write_text("\n".join(summary(read_evidence(folder)).prose))
     return []

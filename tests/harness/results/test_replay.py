@@ -37,7 +37,7 @@ params = { depth = [1, 2] }
 """
 
 
-def no_report(folder, formats):
+def no_report(folder, formats, *, factor=10.0):
     return []
 
 

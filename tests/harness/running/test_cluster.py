@@ -103,7 +103,7 @@ def cli(capsys, monkeypatch, tmp_path):
     registries = Registries(
         families=PLUGIN.problems,
         solvers=PLUGIN.solvers,
-        report=lambda folder, formats: [],
+        report=lambda *_, **__: [],
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )
@@ -307,8 +307,8 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
         "from mortarbench.registries import Registries; "
         "nothing = {'reference': None}; "
         "main(Registries(families=toy_problem.PROBLEMS, solvers=toy_problem.SOLVERS, "
-        "report=lambda *_: [], start=(sys.executable, '-P', toy_problem.__file__), "
-        "**nothing), sys.argv[2:])"
+        "report=lambda *_, **__: [], **nothing, "
+        "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:])"
     )
     command = [
         sys.executable,

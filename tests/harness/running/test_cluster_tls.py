@@ -79,7 +79,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     registries = Registries(
         families=plugin.problems,
         solvers=plugin.solvers,
-        report=lambda folder, formats: [],
+        report=lambda *_, **__: [],
         start=(sys.executable, "-P", str(TOY_PROBLEM)),
         **nothing,
     )

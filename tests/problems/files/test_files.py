@@ -357,7 +357,7 @@ def command(capsys):
     """Run the command line; return exit code, stdout and stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
-        report=lambda out, formats: [],
+        report=lambda *_, **__: [],
     )  # fmt: skip
 
     def run(*arguments):

@@ -1,0 +1,284 @@
+"""The library that the command line and notebooks call."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import mortarbench as mb
+from harness import Verdict
+from harness.results.journal import read_journal
+from mortarbench.listing import CATALOGUE, described
+from mortarbench.registries import Registries
+from solvers import SOLVERS
+from tests.support import ROOT, TOY_PROBLEM
+
+SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
+
+
+@pytest.fixture(scope="module")
+def answer():
+    return mb.solve(mb.build(SMALL), "smalbe")
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A run of a plug-in's solvers on its family."""
+    folder = tmp_path_factory.mktemp("results")
+    (folder / "s.toml").write_text(
+        'name = "s"\nsolvers = ["exact", "picky"]\nrepeats = 2\n'
+        '[[problems]]\nfamily = "well"\nforms = ["primal", "dual"]\n'
+    )
+    return mb.run(folder / "s.toml", out=folder / "out", plugins=[TOY_PROBLEM])
+
+
+def test_every_name_that_is_promised_is_there():
+    assert {name for name in mb.__all__ if not hasattr(mb, name)} == set()
+    assert set(mb.__all__) <= set(dir(mb))
+    with pytest.raises(AttributeError, match="no attribute 'solv'"):
+        mb.solv  # noqa: B018
+
+
+def test_a_case_bears_its_canonical_name_and_tells_its_sizes():
+    case = mb.build("beam-ring/Nh=3/Nr=4/radial=6/steps=1/step=1/primal")
+
+    assert case.name == "beam-ring/Nr=4/Nh=3/steps=1/primal"
+    assert case.params["radial"] == 6
+    assert repr(case) == (
+        "<Case beam-ring/Nr=4/Nh=3/steps=1/primal: 848 variables, 38 equalities, "
+        "37 inequalities, 0 bounds>"
+    )
+
+
+def test_a_point_gives_the_physics_of_its_case():
+    case = mb.build("obstacle/dim=1/n=12/primal")  # exact at nodes: u = (|x| − 1)²
+    answer = mb.solve(case, "clarabel")
+
+    u = case.made.recover(answer.solution)
+    x = np.linspace(-1.5, 1.5, 13)
+    assert np.abs(u - np.maximum(np.abs(x) - 1, 0) ** 2).max() < 0.02
+    assert case.quantities(answer.solution) == pytest.approx(answer.quantities)
+    with pytest.raises(mb.InputError, match="has no bodies to draw"):
+        answer.plot()
+
+
+def test_an_answer_is_judged_certified_and_told(answer):
+    assert answer.verdict is Verdict.VERIFIED
+    assert max(answer.residuals) <= 1e-7
+    assert 0 < answer.energy_bound < 1e-4
+    assert answer.quantities["energy"] == answer.record.quantities["energy"]
+    assert {"step", "infeasibility"} <= answer.history.keys()
+    assert "verified (claimed solved)" in repr(answer)
+    assert "<td style='text-align:left'>verified" in answer._repr_html_()
+    assert json.loads(json.dumps(answer.to_dict()))["case"] == SMALL
+
+
+def test_an_answer_is_drawn_and_written_for_paraview(answer, tmp_path):
+    figure = answer.plot(tmp_path / "a.pdf")
+
+    assert figure.axes
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
+    assert answer.save_vtu(tmp_path / "a.vtu").stat().st_size > 1000
+    with pytest.raises(mb.InputError, match=r"unknown format '\.txt'"):
+        answer.plot(tmp_path / "a.txt")
+
+
+def test_options_are_those_asked_for_and_history_can_be_left_out():
+    case = mb.build(SMALL)
+    few = mb.solve(case, "smalbe", options={"max_steps": 3, "history": False})
+
+    assert few.verdict is Verdict.ITERATION_LIMIT
+    assert few.record.options["max_steps"] == 3
+    assert few.history == {}
+    with pytest.raises(mb.InputError, match="smalbe: unknown option 'max_step'"):
+        mb.solve(case, "smalbe", options={"max_step": 3})
+
+
+def test_solvers_of_a_plug_in_meet_a_case_of_ours_and_the_reverse():
+    ours = mb.build("obstacle/dim=1/n=4/primal")
+    its = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
+
+    assert mb.solve(ours, "lost", plugins=[TOY_PROBLEM]).verdict is Verdict.FAILED
+    assert mb.solve(its, "clarabel").verdict is Verdict.VERIFIED
+    assert mb.solve(its, "exact", plugins=[TOY_PROBLEM]).verdict is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: mb.build("beam-rin/dual"), "did you mean 'beam-ring'"),
+        (lambda: mb.build("beam-ring/Nr=0/dual"), "Nr=0 must be at least 1"),
+        (lambda: mb.solve(SMALL, "smalb"), "did you mean 'smalbe'"),
+        (lambda: mb.solve(SMALL, "smalbe", tol=2), "tol = 2; expected a number bet"),
+        (lambda: mb.run("dem"), "did you mean 'demo'"),
+        (lambda: mb.load("nowhere"), "nowhere"),
+        (lambda: mb.report("nowhere", formats=["htm"]), "did you mean 'html'"),
+        (lambda: mb.validate("nowhere", budget=-1), "expected a number of seconds"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(call, message):
+    with pytest.raises(mb.InputError, match=message) as e:
+        call()
+    assert "\n" not in str(e.value)
+
+
+def test_a_run_is_a_table_of_its_journal(results, capfd):
+    records = read_journal(results.folder)
+
+    assert list(results.df["run_id"]) == [r.run_id for r in records]
+    assert list(results.df.columns) == list(records[0].to_dict())
+    assert (results.df.query("solver == 'exact'").status == "verified").all()
+    assert len(results) == len(results.df) == 6  # declined once, not twice
+    pd.testing.assert_frame_equal(mb.load(results.folder).df, results.df)
+    assert "<th>verified</th>" in results._repr_html_()
+    assert repr(results).splitlines()[1].split()[:4] == ["exact", "4", "4", "4"]
+    assert results.shortfall == []
+
+
+def test_nothing_prints_unless_asked(tmp_path, results, capfd):
+    suite = results.folder.parent / "s.toml"
+    mb.run(suite, out=tmp_path / "a", plugins=[TOY_PROBLEM])
+    mb.load(tmp_path / "a")
+    assert capfd.readouterr() == ("", "")
+
+    mb.run(suite, out=tmp_path / "b", plugins=[TOY_PROBLEM], progress=True)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "8/8 " in err
+
+
+def test_progress_is_told_to_a_function(tmp_path, results):
+    told = []
+    mb.run(
+        results.folder.parent / "s.toml",
+        out=tmp_path / "a",
+        plugins=[TOY_PROBLEM],
+        progress=told.append,
+    )
+
+    measured = [event.record for event in told if event.record is not None]
+    assert [r.run_id for r in measured] == [
+        r.run_id for r in read_journal(tmp_path / "a")
+    ]
+    assert (told[-1].done, told[-1].total) == (8, 8)
+    assert {event.done for event in told} == set(range(9))
+
+
+def test_a_report_names_its_page(results):
+    found = results.report(formats=["html", "md"])
+
+    assert found.page == results.folder / "report/index.html"
+    assert repr(found) == str(found.page)
+    assert str(found.page) in found._repr_html_()
+    assert mb.report(results.folder, results.folder, formats=["md"]).said
+
+
+def test_answers_of_a_folder_are_validated(tmp_path):
+    found = mb.run(
+        "smoke", out=tmp_path, cases=["*/dual"], solvers=["smalbe", "clarabel"]
+    ).validate(budget=0)
+
+    assert found.agreed
+    assert found.data["counts"]["answers"] == 2
+    assert (tmp_path / "report/validation.html") in found.pages
+    assert "smalbe" in repr(found)
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_lists_are_tables():
+    assert "smalbe" in mb.solvers().names
+    assert "beam-ring" in mb.problems().names
+    assert "demo" in mb.suites().names
+    assert list(mb.solvers().df["name"]) == list(SOLVERS)
+    assert "<code>smalbe</code>" in mb.solvers()._repr_html_()
+    assert len(mb.problems()[:2]) == 2
+    assert "well" in mb.problems(plugins=[TOY_PROBLEM]).names
+
+
+def test_the_catalogue_is_what_the_solvers_say_of_themselves():
+    stored = json.loads(CATALOGUE.read_text())
+    live = {name: described(solver) for name, solver in SOLVERS.items()}
+
+    assert stored == json.loads(json.dumps(live)), "run `make docs`"
+
+
+def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
+    class Other:
+        """Another one."""
+
+        def declines(self, qp):
+            return "always"
+
+        def prepare(self, qp, tol):
+            raise AssertionError
+
+    (row,) = mb.solvers(registries=Registries(solvers={"smalbe": Other()}))
+    assert row["description"] == "Another one."
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--help"],
+        ["run", "--help"],
+        ["list", "solvers"],
+        ["list", "problems", "--json"],
+        ["list", "suites"],
+        ["solve", "beam-ring/Nr=0/dual", "--solver", "smalbe"],
+        ["solve", "beam-ring/dual", "--solver", "smalb"],
+        ["solve", "beam-ring/dual", "--solver", "smalbe", "--plot", "a.txt"],
+        ["export", "hertz-plane/Q=1/dual", "a.npz"],
+        ["run", "dem"],
+        ["report", "nowhere"],
+        ["validate", "nowhere"],
+        ["replay", "nowhere", "abc"],
+        ["test-solver", "smalb"],
+    ],
+)
+def test_help_lists_and_refusals_wait_for_no_library(argv, tmp_path):
+    program = (
+        "import sys, mortarbench.__main__ as m\n"
+        "sys.argv[0] = 'mortarbench'\n"
+        "try: m.main()\n"
+        "except SystemExit: pass\n"
+        "slow = {'numpy', 'scipy', 'numba', 'pandas', 'matplotlib', 'rich'}\n"
+        "print('loaded', *sorted(slow & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *argv],
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+    assert done.stdout.splitlines()[-1] == "loaded"
+
+
+@pytest.mark.slow
+def test_a_wheel_does_without_the_checkout(tmp_path):
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT],
+        check=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    target, empty = tmp_path / "site", tmp_path / "empty"
+    empty.mkdir()
+    subprocess.run(
+        [sys.executable, "-m", "zipfile", "-e", str(wheel), str(target)], check=True
+    )
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import mortarbench as mb, os\n"
+        "os.environ['PYTHONPATH'] = sys.argv[1]\n"
+        "assert mb.__file__.startswith(sys.argv[1])\n"
+        "found = mb.run('smoke', repeats=1)\n"
+        "print(len(found), found.report().page)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program, str(target)],
+        cwd=empty, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+    assert done.stdout.split() == ["12", "out/smoke/report/index.html"]
+    assert (empty / "out/smoke/report/index.html").is_file()
