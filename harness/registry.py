@@ -12,12 +12,12 @@ import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from hashlib import blake2s
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from harness.digest import hex_digest
 from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver
 from harness.recipe import Maker
@@ -191,8 +191,7 @@ def _option(where: str, value: Any, current: Any) -> Any:
 
 def _imported(path: Path) -> ModuleType:
     """Import by path under a name of its own; dataclasses need it in sys.modules."""
-    digest = blake2s(str(path.resolve()).encode(), digest_size=4).hexdigest()
-    name = f"plugin_{path.stem}_{digest}"
+    name = f"plugin_{path.stem}_{hex_digest([bytes(path.resolve())])}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: no Python file; its name must end in .py")

@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
 from harness.files.durable import replace_file
@@ -237,9 +237,11 @@ def save(folder: Path, arrays: Arrays) -> str:
 
 def digest_of(arrays: Arrays) -> str:
     """Hash names, types, shapes and values, not the archive, which holds dates."""
-    content = sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
-        content.update(array.tobytes())
-    return content.hexdigest()[:16]
+
+    def parts() -> Iterator[bytes]:
+        for name in sorted(arrays):
+            array = np.ascontiguousarray(arrays[name])
+            yield f"{name} {array.dtype.str} {arrays[name].shape}\n".encode()
+            yield array.tobytes()
+
+    return hex_digest(parts(), 16)

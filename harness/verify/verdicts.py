@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from hashlib import sha256
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
+from harness.digest import hex_digest
 from harness.names import CaseName
 from harness.plugin import Case
 from harness.qp import QP
@@ -52,7 +52,7 @@ def new_record(
         identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
     return Record(
-        run_id=sha256(text.encode()).hexdigest()[:12],
+        run_id=hex_digest([text.encode()]),
         case=case,
         family=name.family,
         params=name.params,
