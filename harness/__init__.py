@@ -1,10 +1,18 @@
 """The contract between problems, solvers and reports, and the clock."""
 
-from harness.about import About
 from harness.errors import InputError
 from harness.limits import memory_limit_mib, too_large
 from harness.mechanics import Grid, Mechanics
-from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
+from harness.plugin import (
+    About,
+    Case,
+    Chained,
+    Family,
+    Fields,
+    Reference,
+    Solver,
+    Value,
+)
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 from harness.record import Record, Verdict
 from harness.solution import Solution, Status

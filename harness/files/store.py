@@ -17,9 +17,8 @@ from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
 from harness.files.durable import replace_file
-from harness.history import History, checked
 from harness.plugin import Fields
-from harness.solution import Solution, Status
+from harness.solution import History, Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -175,7 +174,7 @@ def point_arrays(solution: Solution) -> Arrays:
 def _history(path: Path, arrays: Arrays) -> History:
     """Find the history among the arrays of a point; none in files of old."""
     try:
-        return checked(_with_prefix(_HISTORY, arrays))
+        return checked_history(_with_prefix(_HISTORY, arrays))
     except ValueError as e:
         raise InputError(f"{path}: malformed history: {e}") from None
 

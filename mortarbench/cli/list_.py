@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from textwrap import dedent
 
-from harness.about import About
-from harness.plugin import Solver
+from harness.plugin import About, Solver
 from harness.registry import options_of
 from mortarbench.cli.text import first_sentence
 

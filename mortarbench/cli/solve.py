@@ -15,12 +15,12 @@ from harness.errors import InputError, say
 from harness.files.matfile import save_mat
 from harness.files.parquetfile import save_parquet
 from harness.files.qpfile import save_qp
-from harness.history import History
 from harness.names import CaseName, canonical, parse
 from harness.plugin import Case, Fields
 from harness.processes.measurement import measured_once
 from harness.record import Record, Verdict, finite
 from harness.registry import SolverSpec, options_of, resolve
+from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.cli import text as show
 from mortarbench.cli.registries import Registries

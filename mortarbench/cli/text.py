@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.history import History
 from harness.record import Record, Verdict
-from harness.solution import Status
+from harness.solution import History, Status
 
 #: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {
