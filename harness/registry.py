@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from harness.digest import hex_digest
 from harness.errors import PLUGINS, InputError, unknown
-from harness.plugin import Family, Solver
+from harness.plugin import Family, Solver, as_family
 from harness.recipe import Maker
 
 T = TypeVar("T")
@@ -234,7 +234,8 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 "expected the same name twice"
             )
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
-    return Plugin(solvers=dict(solvers), problems=dict(problems), origin=where)
+    families = {name: as_family(offered) for name, offered in problems.items()}
+    return Plugin(solvers=dict(solvers), problems=families, origin=where)
 
 
 def _check_names(where: str, family: Any) -> None:

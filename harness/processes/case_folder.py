@@ -13,7 +13,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -25,7 +25,6 @@ from typing import Any
 
 from harness.digest import hex_digest, pieces
 from harness.files.durable import keep_private, move_file, replace_file
-from harness.names import CaseName
 
 _KEY_BYTES = 32
 
@@ -41,19 +40,17 @@ class Entry:
 
 def entry(
     folder: Path,
-    name: CaseName,
-    environment: str,
+    identity: Sequence[Any],
     make: Callable[[Path], Mapping[str, Any]],
 ) -> Entry:
     """Find a case, or have it built by the one process that comes first.
 
     folder : made if need be, in one that is there
-    environment : digest of what the case is built with
+    identity : plain data: of the case, and of what it is built with
     make : writes the QP to a file, on the disk, and returns the meta data; what it
         raises comes through and leaves no entry
     """
     folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
-    identity = [name.family, name.params, name.form, environment]
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
     with _held(folder / f"{key}.lock"):
         found = _found(folder, key)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from harness.digest import hex_digest
-from harness.names import CaseName
+from harness.names import CaseId
 from harness.plugin import Case
 from harness.qp import QP
 from harness.record import Record, Verdict
@@ -27,8 +27,7 @@ IDENTITY = 1
 
 
 def new_record(
-    name: CaseName,
-    case: str,
+    case: CaseId,
     spec: SolverSpec,
     *,
     options: Mapping[str, Any],
@@ -41,22 +40,21 @@ def new_record(
 ) -> Record:
     """Make the record of a measurement before it is made.
 
-    case : the canonical name
     options : every option of the solver, defaults resolved
     environment : digest
     mode, accuracy : see `Record`
     """
     options = plain(options)
-    identity = [IDENTITY, case, spec.label, spec.name, options, tol, repeat]
+    identity = [IDENTITY, case.name, spec.label, spec.name, options, tol, repeat]
     if (mode, accuracy) != ("cold", None):
         identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=hex_digest([text.encode()]),
-        case=case,
-        family=name.family,
-        params=name.params,
-        form=name.form,
+        case=case.name,
+        family=case.family.name,
+        params=case.params,
+        form=case.form,
         sizes={},
         solver=spec.label,
         options=options,

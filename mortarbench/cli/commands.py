@@ -108,7 +108,6 @@ def run(registries: Registries, options: Namespace) -> int:
     with shown_on(sys.stderr) as progress:
         missing = run_suite(
             suite,
-            families=registries.families,
             out=out,
             commands=registries.commands(suite.solvers, options.plugin),
             resolve=lambda spec: resolve(spec, registries.solvers),
@@ -207,9 +206,7 @@ def replay(registries: Registries, options: Namespace) -> int:
         options.folder, options.run_id, registries.families, registries.solvers
     )
     environment = capture(options.plugin)
-    block = block_of(
-        capsule, registries.families, registries.solvers, digest(environment)
-    )
+    block = block_of(capsule, registries.solvers, digest(environment))
     commands = registries.commands([capsule.spec], options.plugin)
     with TemporaryDirectory(prefix="mortarbench-") as scratch:
         folder = Path(scratch)

@@ -46,7 +46,6 @@ def measured(
     with shown_on(sys.stderr) as progress:
         run(
             suite,
-            families=registries.families,
             out=out,
             commands=registries.commands(suite.solvers, ()),
             resolve=lambda spec: resolve(spec, registries.solvers),

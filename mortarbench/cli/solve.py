@@ -9,13 +9,12 @@ from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 
-from harness.build import build, unbuilt
 from harness.environment.environment import capture, digest
 from harness.errors import InputError, say
 from harness.files.matfile import save_mat
 from harness.files.parquetfile import save_parquet
 from harness.files.qpfile import save_qp
-from harness.names import CaseName, canonical, parse
+from harness.names import CaseId, assemble, parse, unbuilt
 from harness.plugin import Case, Fields
 from harness.processes.measurement import measured_once
 from harness.record import Record, Verdict, finite
@@ -44,7 +43,6 @@ def solve(registries: Registries, options: Namespace) -> int:
     case = _built(registries, name)
     record = new_record(
         name,
-        canonical(name, registries.families[name.family]),
         spec,
         options=options_of(solver),
         tol=options.tol,
@@ -69,7 +67,7 @@ def solve(registries: Registries, options: Namespace) -> int:
 
 
 def _draw(
-    registries: Registries, options: Namespace, name: CaseName, fields: Fields
+    registries: Registries, options: Namespace, name: CaseId, fields: Fields
 ) -> None:
     """Write the pictures that were asked for; for .pvd solve the steps before too."""
     if options.plot is not None:
@@ -83,10 +81,10 @@ def _draw(
     spec = SolverSpec(name=options.solver, label=options.solver)
     command = registries.worker_command(spec, options.plugin)
     for step in range(1, last):
-        earlier = replace(name, params={**name.params, "step": step})
+        earlier = assemble(name.family, {**name.params, "step": step}, name.form)
         case = _built(registries, earlier)
         record = new_record(
-            earlier, "", spec, options={}, tol=options.tol, repeat=0, environment=""
+            earlier, spec, options={}, tol=options.tol, repeat=0, environment=""
         )
         _, solution = measured_once(command, case, record, registries.reference)
         if solution is None or not has_point(solution) or case.fields is None:
@@ -102,8 +100,8 @@ def export(registries: Registries, options: Namespace) -> int:
     name = parse(options.case, registries.families)
     case = _built(registries, name)
     meta = {
-        "name": canonical(name, registries.families[name.family]),
-        "family": name.family,
+        "name": name.name,
+        "family": name.family.name,
         "params": name.params,
         "form": name.form,
         "units": "non-dimensional; energy in SI = scale * objective + constant",
@@ -121,7 +119,7 @@ def export(registries: Registries, options: Namespace) -> int:
     return 0
 
 
-def _built(registries: Registries, name: CaseName) -> Case:
+def _built(registries: Registries, name: CaseId) -> Case:
     """Build a case; what a plug-in or too little memory prevents is no fault of ours.
 
     Raises
@@ -130,16 +128,15 @@ def _built(registries: Registries, name: CaseName) -> Case:
         For both, and what the family itself refuses.
 
     """
-    family = registries.families[name.family]
-    origin = registries.origins.get(name.family)
+    origin = registries.origins.get(name.family.name)
     try:
-        return build(name, family, registries.reference)
+        return name.build(registries.reference)
     except InputError:
         raise
     except (Exception, SystemExit) as e:
         if origin is None and not isinstance(e, MemoryError):
             raise
-        text = unbuilt(canonical(name, family), e)
+        text = unbuilt(name, e)
         raise InputError(f"{origin}: {text}" if origin else text) from e
 
 

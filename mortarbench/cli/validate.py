@@ -66,15 +66,15 @@ def _meshes(
     registries: Registries, folder: Path, budget: float
 ) -> list[Discretisation]:
     """Solve the folder's cases on finer meshes, where families say what these are."""
-    refinable = {k: f for k, f in registries.families.items() if hasattr(f, "refined")}
-    records = {r.case: r for r in read_journal(folder, say) if r.family in refinable}
-    names = []
+    families = registries.families
+    records = {r.case: r for r in read_journal(folder, say) if r.family in families}
+    cases = []
     for r in records.values():
         with suppress(InputError):  # of another version: listed as not validated
-            names.append(assemble(refinable[r.family], r.params, r.form))
-    return discretisation_errors(
-        names, refinable, registries.reference, folder, budget, say
-    )
+            case = assemble(families[r.family], r.params, r.form)
+            if case.family.refined(case.params) is not None:
+                cases.append(case)
+    return discretisation_errors(cases, registries.reference, folder, budget, say)
 
 
 def _mesh(d: Discretisation) -> str:

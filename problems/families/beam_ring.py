@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case, InputError, Reference, Value
+from harness import Case, Family, InputError, Reference, Value
 from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
 from problems.contact.linearise import METHODS, linearisation
 from problems.contact.results import quantities
@@ -46,7 +46,7 @@ RING = Material(E=20e9, nu=0.3)
 
 
 @dataclass(frozen=True)
-class BeamRing:
+class BeamRing(Family):
     """The paper's benchmark: beam on a half ring, plane elasticity, frictionless."""
 
     name: str = "beam-ring"

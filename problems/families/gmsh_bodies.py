@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from harness import QP, Case, InputError, Reference, Value
+from harness import QP, Case, Family, InputError, Reference, Value
 from problems.contact.bodies import Bodies, clamped, floating, supported
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
@@ -32,7 +32,7 @@ from problems.files.file_digest import check_digest, digest
 
 
 @dataclass(frozen=True)
-class GmshBodies:
+class GmshBodies(Family):
     """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
     The digest of the content of both files is a parameter of the case, so that a

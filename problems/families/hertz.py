@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import QP, Case, Reference, Solution, Value, Vector
+from harness import QP, Case, Family, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -81,7 +81,7 @@ class LineContact:
 
 
 @dataclass(frozen=True)
-class HertzPlane:
+class HertzPlane(Family):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
     name: str = "hertz-plane"
@@ -128,7 +128,7 @@ class HertzPlane:
 
 
 @dataclass(frozen=True)
-class HertzCylinder:
+class HertzCylinder(Family):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
     name: str = "hertz-cylinder"

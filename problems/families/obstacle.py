@@ -31,6 +31,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 from harness import (
     QP,
     Case,
+    Family,
     Grid,
     Mechanics,
     Reference,
@@ -49,7 +50,7 @@ LOAD = 2.0  #: q, 1/m
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Family):
     """A string or membrane over a flat obstacle, with known exact solution."""
 
     name: str = "obstacle"

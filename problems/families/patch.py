@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case, Reference, Solution, Value
+from harness import Case, Family, Reference, Solution, Value
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -45,7 +45,7 @@ E_UPPER, NU = 10e6, 0.3  #: Pa
 
 
 @dataclass(frozen=True)
-class ContactPatch:
+class ContactPatch(Family):
     """Contact patch test: two blocks on each other under uniform pressure."""
 
     name: str = "contact-patch"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import eye_array
 
-from harness import QP, Case, InputError, Reference, Solution, Value
+from harness import QP, Case, Family, InputError, Reference, Solution, Value
 from harness.checked import is_number, located
 from harness.errors import unknown
 from harness.files.datafile import check_size, opened
@@ -31,7 +31,7 @@ _COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
 
 
 @dataclass(frozen=True)
-class FromFile:
+class FromFile(Family):
     """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
 
     The digest of the file's content is a parameter of the case, so that records say
