@@ -17,7 +17,7 @@ from pathlib import Path
 from statistics import median, quantiles
 from time import perf_counter
 
-from harness.names import CaseName
+from harness.names import assemble
 from harness.registry import SolverSpec, load_plugin, resolve
 from harness.results.journal import read_journal
 from harness.results.work_unit import Commands
@@ -79,11 +79,11 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
     suite = Suite(
         name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,
         memory_limit=4096.0, solvers=tuple(specs), text="",
-        cases=(CaseName(family="tiny", params=dict(tiny.defaults), form="plain"),),
+        cases=(assemble(tiny, {}, "plain"),),
     )  # fmt: skip
     watch = Watch()
     run(
-        suite, families=plugin.problems, out=out, environment={}, digest="here",
+        suite, out=out, environment={}, digest="here",
         commands=Commands(
             solvers={s.label: [*start, s.name] for s in specs},
             generator=[*start, "generator"],

@@ -12,8 +12,7 @@ from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.outer_loop import first_iterate
-from solvers.smalbe.products import product
-from solvers.smalbe.projected import by_lanczos, projected_problem
+from solvers.smalbe.projected import by_lanczos, product, projected_problem
 
 #: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8
 PERMON = {

@@ -8,11 +8,19 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from harness.about import About
     from harness.errors import InputError
     from harness.limits import memory_limit_mib, too_large
     from harness.mechanics import Grid, Mechanics
-    from harness.plugin import Case, Chained, Family, Fields, Reference, Solver, Value
+    from harness.plugin import (
+        About,
+        Case,
+        Chained,
+        Family,
+        Fields,
+        Reference,
+        Solver,
+        Value,
+    )
     from harness.qp import QP, Matrix, Structure, Vector, no_rows
     from harness.record import Record, Verdict
     from harness.solution import Solution, Status
@@ -20,7 +28,7 @@ if TYPE_CHECKING:
     from harness.verify.kkt import Residuals, kkt_residuals, verdict
 
 _MODULES = {
-    "About": "harness.about",
+    "About": "harness.plugin",
     "Case": "harness.plugin",
     "Certificate": "harness.verify.certificate",
     "Chained": "harness.plugin",

@@ -1,8 +1,7 @@
-"""Case names: ``FAMILY/key=value/…/FORM``, parsed strictly and written canonically.
+"""Cases by name: ``FAMILY/key=value/…/FORM``, parsed strictly, written canonically.
 
-A family may derive a default from other keys (a number of layers from another one). It
-then has ``complete(params) -> params``, which takes the keys that were set and returns
-all of them; without it, keys left out take the value in the family's ``defaults``.
+Keys left out take the value that the family's ``complete`` gives them, which may derive
+a default from other keys (a number of layers from another one).
 
 A family whose problems lie in files has the key ``path`` and says in ``path_suffix``
 how paths end. Its names are ``FAMILY:PATH/key=value/…/FORM``, where PATH is the first
@@ -15,12 +14,13 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 from harness.checked import has_control
 from harness.errors import PLUGINS, InputError, shortened, shown, unknown
-from harness.plugin import Family, Value
+from harness.plugin import Case, Family, Reference, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -33,15 +33,36 @@ _CALLED = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaseName:
-    """One case of a family: what `Family.build` needs, checked."""
+class CaseId:
+    """One case of a family, checked; as a text it is its canonical name."""
 
-    family: str
+    family: Family = field(compare=False, repr=False)
+    name: str  #: canonical: it has only those keys that the others do not imply
     params: Mapping[str, Value]  #: every key, in the family's order
     form: str
 
+    def __str__(self) -> str:
+        return self.name
 
-def parse(text: str, families: Mapping[str, Family]) -> CaseName:
+    def build(self, reference: Reference) -> Case:
+        """Build the case; what its family prints goes to stderr.
+
+        What the family raises comes through.
+
+        Raises
+        ------
+        TypeError
+            When the family returns something else.
+
+        """
+        with redirect_stdout(sys.stderr):
+            case = self.family.build(self.form, self.params, reference)
+        if not isinstance(case, Case):
+            raise TypeError(f"build returned {type(case).__name__}, expected Case")
+        return case
+
+
+def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     """Parse ``beam-ring/Nr=30/dual``; keys left out take the family's defaults.
 
     Raises
@@ -55,7 +76,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
     if head not in families:
         raise unknown("family", head, families, more=PLUGINS)
     family = families[head]
-    if (suffix := getattr(family, "path_suffix", None)) is None:
+    if (suffix := family.path_suffix) is None:
         parts, given = text.split("/")[1:], {}
     else:
         path, parts = _split_path(text, head, suffix)
@@ -81,8 +102,8 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseName:
 
 def assemble(
     family: Family, given: Mapping[str, object], form: str, *, texts: bool = False
-) -> CaseName:
-    """Make the checked name of the case with the keys `given`.
+) -> CaseId:
+    """Make the checked case with the keys `given`.
 
     texts : whether texts stand for numbers, as in a name
 
@@ -103,25 +124,37 @@ def assemble(
             value = _number(value, kind)
         typed[key] = _typed(where, value, kind, free=key == _path_key(family))
     params = completed(family, typed)
-    if (check := getattr(family, "check", None)) is not None:
-        check(params)
-    return CaseName(family=family.name, params=params, form=form)
+    family.check(params)
+    name = _canonical(family, params, form)
+    return CaseId(family=family, name=name, params=params, form=form)
 
 
-def canonical(name: CaseName, family: Family) -> str:
-    """Write `name` with only those keys that its other keys do not imply."""
-    needed, head = dict(name.params), name.family
+def _canonical(family: Family, params: Mapping[str, Value], form: str) -> str:
+    """Write the name with only those keys that the other keys do not imply."""
+    needed, head = dict(params), family.name
     if (path := needed.pop(_path_key(family), None)) is not None:
         head = f"{head}:{path}"
-        if not getattr(family, "path_suffix", ""):
+        if not family.path_suffix:
             return head
     for key in list(needed):
         fewer = {k: v for k, v in needed.items() if k != key}
         given = fewer if path is None else {"path": path, **fewer}
-        if completed(family, given) == name.params:
+        if completed(family, given) == params:
             needed = fewer
     middle = [f"{key}={value}" for key, value in needed.items()]
-    return "/".join([head, *middle, name.form])
+    return "/".join([head, *middle, form])
+
+
+def unbuilt(name: object, e: BaseException) -> str:
+    """Say in one line why the case of that name could not be built."""
+    match e:
+        case InputError():
+            why = str(e)
+        case MemoryError():
+            why = "it needs more memory than there is"
+        case _:
+            why = f"{type(e).__name__}: {e}"
+    return " ".join(f"{name} could not be built: {why}".split())
 
 
 def match(pattern: str, names: Iterable[str]) -> list[str]:
@@ -131,14 +164,13 @@ def match(pattern: str, names: Iterable[str]) -> list[str]:
 
 def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
     """Fill in the keys that are not given, in the family's order."""
-    complete = getattr(family, "complete", lambda given: {**family.defaults, **given})
-    params = complete(given)
+    params = family.complete(given)
     return {key: params[key] for key in family.defaults}
 
 
 def _path_key(family: Family) -> str:
     """Name the key that holds a path; empty where the family takes none."""
-    return "" if getattr(family, "path_suffix", None) is None else "path"
+    return "" if family.path_suffix is None else "path"
 
 
 def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 if TYPE_CHECKING:
@@ -44,6 +46,33 @@ class Chained(Solver, Protocol):
         """
 
 
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """The descriptive facts of a solver, kept with its adapter.
+
+    A solver may have one as its attribute ``about``. Texts are Markdown, a sentence or
+    two each. The tolerance mapping is no part of it: it is in the class's docstring.
+    """
+
+    title: str
+    method: str  #: the class of methods, e.g. "interior point"
+    licence: str
+    linear_solver: str  #: what solves its linear systems
+    phases: str  #: what is timed as preparing and what as solving
+    package: str = ""  #: to install, with a module of the same name unless given below
+    module: str = ""  #: to import, where its name differs
+    sequence: str = ""  #: what it carries from one QP to the next; empty: nothing
+    limits: tuple[str, ...] = ()  #: known limits found here, each with its evidence
+
+    @property
+    def missing(self) -> str | None:
+        """Say what to install, or None if the library can be imported."""
+        module = self.module or self.package
+        if not module or find_spec(module) is not None:
+            return None
+        return f"not installed: {module} (pip install {self.package})"
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fields:
     """A deformed state of bodies, for pictures and files; SI units."""
@@ -78,33 +107,79 @@ class Case:
     mechanics: Mechanics | None = None  #: to certify errors with, where there are any
 
 
-class Family(Protocol):
-    """A parametrised family of problems; in practice a frozen dataclass."""
+class Family(ABC):
+    """A parametrised family of problems; in practice a frozen dataclass.
 
-    @property
-    def name(self) -> str:
-        """The first component of its case names."""
+    All methods raise `InputError` for values outside the family's range.
+    """
 
-    @property
-    def defaults(self) -> Mapping[str, Value]:
-        """Every key with its default, in the order of canonical names."""
+    name: str  #: the first component of its case names
+    defaults: Mapping[str, Value]  #: every key, in the order of canonical names
+    forms: tuple[str, ...]  #: that it can emit
+    path_suffix: str | None = None  #: where it takes a file; see `harness.names`
+    singular: str = ""  #: why refinement has no limit of finite energy, if it has none
 
-    @property
-    def forms(self) -> tuple[str, ...]:
-        """The forms that it can emit."""
+    @abstractmethod
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Build one case from complete params."""
+
+    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Add the keys that are not given; a default may depend on another key."""
+        return {**self.defaults, **given}
+
+    def check(self, params: Mapping[str, Value]) -> None:  # noqa: B027  # may be none
+        """Refuse complete params out of range; called before a run starts."""
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        """Give the case whose mesh has every cell halved; None where there is none.
+
+        The mechanics of both have a grid, for `harness.crossval.discretisation`.
+        """
+        return None
+
+
+def as_family(offered: Any) -> Family:
+    """Give what somebody offers as a family, wrapped if its class does not inherit.
+
+    offered : has `name`, `defaults`, `forms` and `build`, and may have what else
+        `Family` has
+    """
+    if isinstance(offered, Family):
+        return offered
+    kind = type(offered)
+    wrapper = type(kind.__name__, (_Offered,), {"__doc__": kind.__doc__})
+    wrapped: Family = wrapper(offered)
+    return wrapped
+
+
+class _Offered(Family):
+    """A family whose class does not inherit from `Family`."""
+
+    def __init__(self, offered: Any) -> None:
+        self._offered = offered
+        self.name, self.defaults = offered.name, offered.defaults
+        self.forms = offered.forms
+        self.path_suffix = getattr(offered, "path_suffix", Family.path_suffix)
+        self.singular = getattr(offered, "singular", Family.singular)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Build one case from complete params.
+        case: Case = self._offered.build(form, params, reference)
+        return case
 
-        A family may also have ``check(params) -> None``, which is called before a run
-        starts, and ``complete(given) -> params`` where a default depends on another
-        key. All raise `InputError` for values outside the family's range. One with
-        ``path_suffix`` takes a file; see `harness.names`.
+    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
+        params: Mapping[str, Value] = self._own("complete")(given)
+        return params
 
-        One with ``refined(params) -> params`` says which case has every cell halved,
-        for `harness.crossval.discretisation`; its mechanics have a grid. A text
-        ``singular`` says why refinement has no limit of finite energy, where it has
-        none.
-        """
+    def check(self, params: Mapping[str, Value]) -> None:
+        self._own("check")(params)
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        finer: Mapping[str, Value] | None = self._own("refined")(params)
+        return finer
+
+    def _own(self, method: str) -> Any:
+        return getattr(self._offered, method, getattr(super(), method))

@@ -12,15 +12,15 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from hashlib import blake2s
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from harness.digest import hex_digest
 from harness.errors import PLUGINS, InputError, unknown
-from harness.plugin import Family, Solver
+from harness.plugin import Family, Solver, as_family
 
 if TYPE_CHECKING:
     from harness.recipe import Maker
@@ -251,8 +251,7 @@ def _option(where: str, value: Any, current: Any) -> Any:
 
 def _imported(path: Path) -> ModuleType:
     """Import by path under a name of its own; dataclasses need it in sys.modules."""
-    digest = blake2s(str(path.resolve()).encode(), digest_size=4).hexdigest()
-    name = f"plugin_{path.stem}_{digest}"
+    name = f"plugin_{path.stem}_{hex_digest([bytes(path.resolve())])}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: no Python file; its name must end in .py")
@@ -295,7 +294,8 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 "expected the same name twice"
             )
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
-    return Plugin(solvers=dict(solvers), problems=dict(problems), origin=where)
+    families = {name: as_family(offered) for name, offered in problems.items()}
+    return Plugin(solvers=dict(solvers), problems=families, origin=where)
 
 
 def _check_names(where: str, family: Any) -> None:

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 from harness import Fields, Record, Residuals, Solution, Verdict
 from harness.environment.environment import digest
 from harness.errors import InputError
-from harness.history import History
+from harness.names import assemble
 from harness.processes.measurement import measured_once
 from harness.record import finite
 from harness.registry import SolverSpec, options_of, resolve
+from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
 from mortarbench.case import Case, build, built_case
@@ -125,11 +126,10 @@ class Answer:
             return path
         states, last = [], int(self.case.params.get("step", 1))
         for step in range(1, last):
-            parsed = replace(
-                self.case.parsed, params={**self.case.params, "step": step}
-            )
+            params = {**self.case.params, "step": step}
+            case_id = assemble(self.case.id.family, params, self.case.form)
             earlier = solve(
-                built_case(parsed, self.case.registries),
+                built_case(case_id, self.case.registries),
                 self.spec.name,
                 tol=self.record.tol,
                 options=self.spec.options,
@@ -195,8 +195,7 @@ def solve(
         spec = replace(spec, options={**given, "history": True})
         configured = resolve(spec, registries.solvers)
     record = new_record(
-        case.parsed,
-        case.name,
+        case.id,
         spec,
         options=options_of(configured),
         tol=tol,

@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from harness import QP, Fields, Solution, plugin
-from harness.build import build as built
-from harness.build import unbuilt
 from harness.errors import InputError
-from harness.names import CaseName, canonical, parse
+from harness.names import CaseId, parse, unbuilt
 from harness.verify.verdicts import plain
 from mortarbench.arguments import EXPORTS, writable
 from mortarbench.registries import Plugins, Registries, known
@@ -21,10 +19,14 @@ from mortarbench.registries import Plugins, Registries, known
 class Case:
     """One QP of one problem, under its canonical name."""
 
-    name: str  #: FAMILY/key=value/…/FORM, without keys that others imply
-    parsed: CaseName  #: the same, in parts
+    id: CaseId  #: its name, in parts
     made: plugin.Case  #: what the family made
     registries: Registries  #: those that it was built with
+
+    @property
+    def name(self) -> str:
+        """FAMILY/key=value/…/FORM, without keys that others imply."""
+        return self.id.name
 
     @property
     def qp(self) -> QP:
@@ -34,12 +36,12 @@ class Case:
     @property
     def params(self) -> Mapping[str, plugin.Value]:
         """Every key of the name with its value, defaults included."""
-        return self.parsed.params
+        return self.id.params
 
     @property
     def form(self) -> str:
         """Which of the equivalent QPs of the problem this is: primal, dual, …."""
-        return self.parsed.form
+        return self.id.form
 
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
@@ -71,7 +73,7 @@ class Case:
         meta = plain(
             {
                 "name": self.name,
-                "family": self.parsed.family,
+                "family": self.id.family.name,
                 "params": self.params,
                 "form": self.form,
                 "units": "non-dimensional; energy in SI = scale * objective + constant",
@@ -114,7 +116,7 @@ def build(name: str, *, plugins: Plugins = ()) -> Case:
     return built_case(parse(name, registries.families), registries)
 
 
-def built_case(parsed: CaseName, registries: Registries) -> Case:
+def built_case(case: CaseId, registries: Registries) -> Case:
     """Build a case; what a plug-in or too little memory prevents is no fault of ours.
 
     Raises
@@ -123,16 +125,14 @@ def built_case(parsed: CaseName, registries: Registries) -> Case:
         For both, and what the family itself refuses.
 
     """
-    family = registries.families[parsed.family]
-    name = canonical(parsed, family)
-    origin = registries.origins.get(parsed.family)
+    origin = registries.origins.get(case.family.name)
     try:
-        made = built(parsed, family, registries.reference)
+        made = case.build(registries.reference)
     except InputError:
         raise
     except (Exception, SystemExit) as e:
         if origin is None and not isinstance(e, MemoryError):
             raise
-        text = unbuilt(name, e)
+        text = unbuilt(case, e)
         raise InputError(f"{origin}: {text}" if origin else text) from e
-    return Case(name=name, parsed=parsed, made=made, registries=registries)
+    return Case(id=case, made=made, registries=registries)

@@ -11,9 +11,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from harness.about import About
 from harness.names import completed
-from harness.plugin import Solver
+from harness.plugin import About, Solver
 from harness.registry import options_of
 from mortarbench.registries import Plugins, Registries, known
 from mortarbench.text import first_comment, first_sentence, listing

@@ -86,7 +86,7 @@ def replay(
     families, solvers = registries.families, registries.solvers
     stored = open_capsule(Path(folder), run_id, families, solvers)
     environment = registries.environment()
-    unit = block_of(stored, families, solvers, digest(environment))
+    unit = block_of(stored, solvers, digest(environment))
     commands = registries.commands([stored.spec])
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,

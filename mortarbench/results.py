@@ -183,7 +183,6 @@ def run(
             )
         missing = run_suite(
             asked,
-            families=registries.families,
             out=folder,
             commands=registries.commands(asked.solvers),
             resolve=lambda spec: resolve(spec, registries.solvers),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from harness.history import History
+    from harness.solution import History
 
 #: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {

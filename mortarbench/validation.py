@@ -99,21 +99,16 @@ def _meshes(
     progress: Callable[[str], None],
 ) -> list[Discretisation]:
     """Solve the folder's cases on finer meshes, where families say what these are."""
+    families = registries.families
     records = {r.case: r for r in read_journal(folder, progress)}
-    used = {r.family for r in records.values()} & set(registries.families)
-    refinable = {
-        name: family
-        for name in used
-        if hasattr(family := registries.families[name], "refined")
-    }
-    names = []
+    cases = []
     for r in records.values():
-        if r.family in refinable:
+        if r.family in families:
             with suppress(InputError):  # of another version: listed as not validated
-                names.append(assemble(refinable[r.family], r.params, r.form))
-    return discretisation_errors(
-        names, refinable, registries.reference, folder, seconds, progress
-    )
+                case = assemble(families[r.family], r.params, r.form)
+                if case.family.refined(case.params) is not None:
+                    cases.append(case)
+    return discretisation_errors(cases, registries.reference, folder, seconds, progress)
 
 
 def _mesh(d: Discretisation) -> str:

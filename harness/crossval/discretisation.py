@@ -32,13 +32,12 @@ from math import log2, sqrt
 from pathlib import Path
 from time import perf_counter
 
-from harness.build import build, unbuilt
 from harness.crossval.mesh_refinement import prolongation
 from harness.errors import InputError
 from harness.files.durable import full_disk_told, replace_file
 from harness.files.reading import read_json
 from harness.mechanics import Extended, Grid, Mechanics, Real
-from harness.names import CaseName, assemble, canonical
+from harness.names import CaseId, assemble, unbuilt
 from harness.plugin import Family, Reference
 from harness.verify.references import UnsolvedError, reference_point
 
@@ -112,8 +111,7 @@ def estimated(
 
 
 def discretisation_errors(
-    names: Iterable[CaseName],
-    families: Mapping[str, Family],
+    cases: Iterable[CaseId],
     reference: Reference,
     folder: Path,
     budget: float,
@@ -123,7 +121,7 @@ def discretisation_errors(
 
     What the file says already stays where there was less time than there was then.
 
-    names : forms of one physical case count once
+    cases : forms of one physical case count once
     folder : the result folder; its ``references`` keep what was solved
     budget : seconds; a mesh that would take longer than what is left is not begun
     tell : is told of each case that begins
@@ -132,16 +130,14 @@ def discretisation_errors(
     earlier: dict[str, Discretisation] = {}
     with suppress(InputError):  # a damaged file is replaced
         earlier = read_discretisation(folder)
-    for name in names:
-        family = families[name.family]
-        physical = canonical(name, family).removesuffix(f"/{name.form}")
+    for case in cases:
+        physical = case.name.removesuffix(f"/{case.form}")
         if physical not in found:
             tell(f"finer meshes of {physical}")
-            left = _Halving(family, reference, folder / "references", end)
-            levels = tuple(left.levels(name))
-            singular = getattr(family, "singular", "")
-            new = estimated(physical, levels, singular, left.why)
-            new = replace(new, params=name.params)
+            left = _Halving(case.family, reference, folder / "references", end)
+            levels = tuple(left.levels(case))
+            new = estimated(physical, levels, case.family.singular, left.why)
+            new = replace(new, params=case.params)
             old = earlier.get(physical, new)
             found[physical] = old if left.late and _continues(old, new) else new
     _write(folder / FILE, found.values())
@@ -207,17 +203,16 @@ class _Halving:
         self.why = ""
         self.late = False  #: stopped for lack of time
 
-    def levels(self, name: CaseName) -> Iterator[Level]:
+    def levels(self, case: CaseId) -> Iterator[Level]:
         """Yield the levels that can be afforded, coarsest first."""
-        form = "primal" if "primal" in self._family.forms else name.form
-        refined = getattr(self._family, "refined", None)
-        if refined is None:
-            self.why = "its family does not say which mesh is the next finer one"
-            return
+        form = "primal" if "primal" in self._family.forms else case.form
         sizes: list[int] = []
         seconds = 0.0
-        params: Mapping[str, object] = name.params
+        params = None if self._family.refined(case.params) is None else case.params
         while len(sizes) < LEVELS:
+            if params is None:
+                self.why = "its family does not say which mesh is the next finer one"
+                return
             growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else GROWTH
             if sizes and self._refused(growth * sizes[-1]):
                 return
@@ -233,7 +228,8 @@ class _Halving:
             yield level
             sizes.append(level.unknowns)
             seconds = perf_counter() - start
-            params = refined(assemble(self._family, params, form).params)
+            complete = assemble(self._family, params, form).params
+            params = self._family.refined(complete)
 
     def _refused(self, size: float) -> bool:
         if size <= MOST_UNKNOWNS:
@@ -250,9 +246,9 @@ class _Halving:
         """Solve one mesh; None, with the reason, where that is impossible."""
         text = self._family.name
         try:
-            name = assemble(self._family, params, form)
-            text = canonical(name, self._family)
-            mechanics = build(name, self._family, self._reference).mechanics
+            case = assemble(self._family, params, form)
+            text = case.name
+            mechanics = case.build(self._reference).mechanics
             if mechanics is None:
                 self.why = "there is no elastic problem behind it"
                 return None

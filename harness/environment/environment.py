@@ -6,7 +6,6 @@ result folder can be handed to others.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -23,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from threadpoolctl import threadpool_info
+
+from harness.digest import hex_digest
 
 PACKAGES = (
     "mortarbench", "numpy", "scipy", "scikit-sparse", "qpsolvers", "osqp", "clarabel",
@@ -121,7 +122,7 @@ def digest(environment: Mapping[str, Any]) -> str:
     """
     lasting = {k: v for k, v in environment.items() if k not in VOLATILE}
     canonical = json.dumps(lasting, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()[:12]
+    return hex_digest([canonical.encode()])
 
 
 def source(root: Path) -> dict[str, Any] | None:
@@ -140,14 +141,14 @@ def source(root: Path) -> dict[str, Any] | None:
     try:
         commit = git("rev-parse", "HEAD").decode().strip()
         dirty = git("status", "--porcelain", "--", *_CODE) != b""
-        changes = hashlib.sha256(git("diff", "--no-ext-diff", "HEAD", "--", *_CODE))
+        changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]
         listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
         for name in sorted(listed.split(b"\0")):
             if name.endswith(b".py"):
-                changes.update(name + b"\0" + (root / os.fsdecode(name)).read_bytes())
+                changes += [name, b"\0", (root / os.fsdecode(name)).read_bytes()]
     except (OSError, subprocess.CalledProcessError):
         return None
-    digits = changes.hexdigest()[:12] if dirty else None
+    digits = hex_digest(changes) if dirty else None
     return {"commit": commit, "dirty": dirty, "changes": digits}
 
 
@@ -239,10 +240,10 @@ def _version(package: str) -> str | None:
 
 def _plugins(files: Iterable[Path]) -> dict[str, str]:
     """Name the content of files by 12 hex digits; those of one name are as one."""
-    contents: dict[str, Any] = defaultdict(hashlib.sha256)
+    contents: dict[str, list[bytes]] = defaultdict(list)
     for file in files:
-        contents[file.name].update(file.read_bytes())
-    return {name: content.hexdigest()[:12] for name, content in contents.items()}
+        contents[file.name].append(file.read_bytes())
+    return {name: hex_digest(content) for name, content in contents.items()}
 
 
 def _physical_cores() -> int | None:

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 from types import TracebackType
-from typing import Self
+from typing import IO, Self
 
 from harness.errors import InputError
 
@@ -31,22 +31,61 @@ _CHUNK = 2**16
 _MIB = 2**20
 
 
-def replace_file(path: Path, content: bytes | memoryview) -> None:
-    """Write a file, and return when it is on the disk; its folder is made if need be.
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """Open a new file that takes the place of `path` at the end of the block.
 
-    Whatever happens, `path` leads to what was there before or to all of `content`.
+    It is on the disk by then. Whatever happens, `path` leads to what was there before
+    or to all that was written; who has opened or mapped the old file keeps that.
     """
+    with _unfinished(path, 0o666) as (new, file):
+        yield file
+        _sync(file)
+        move_file(new, path)
+
+
+def replace_file(path: Path, content: bytes | memoryview) -> None:
+    """Write a file as `replacing` does; its folder is made if need be."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(content)
+
+
+def keep_private(path: Path, content: bytes) -> None:
+    """Write a file that only its owner can read, unless there is one.
+
+    Of several processes that do so at once, one writes.
+    """
+    with _unfinished(path, 0o600) as (new, file):
+        file.write(content)
+        _sync(file)
+        with suppress(FileExistsError):
+            os.link(new, path)
+            _sync_folder(path.parent)
+
+
+def move_file(whole: Path, path: Path) -> None:
+    """Have a file that is on the disk take the place of `path`, in the same folder."""
+    os.replace(whole, path)
+    _sync_folder(path.parent)
+
+
+@contextmanager
+def _unfinished(path: Path, mode: int) -> Iterator[tuple[Path, IO[bytes]]]:
+    """Open a file beside `path` that is gone after the block, unless it was moved."""
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     try:
-        with new.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(new, path)
-        _sync_folder(path.parent)
+        with os.fdopen(os.open(new, flags, mode), "w+b") as file:
+            yield new, file
     finally:
         new.unlink(missing_ok=True)
+
+
+def _sync(file: IO[bytes]) -> None:
+    """Have all that was written on the disk."""
+    file.flush()
+    os.fsync(file.fileno())
 
 
 def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:

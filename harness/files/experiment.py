@@ -13,10 +13,12 @@ import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from harness.errors import InputError
+from harness.files.durable import replace_file
 from harness.files.reading import read_json
 from harness.files.store import load_fields, save_fields
 from harness.plugin import Fields, Value
@@ -44,9 +46,8 @@ def save_experiment(experiment: Experiment, folder: Path) -> None:
         "tables": list(experiment.tables),
         "states": states,
     }
-    (folder / "setting.json").write_text(
-        json.dumps(setting, indent=1, ensure_ascii=False) + "\n", "utf-8"
-    )
+    text = json.dumps(setting, indent=1, ensure_ascii=False) + "\n"
+    replace_file(folder / "setting.json", text.encode())
 
 
 def load_experiment(folder: Path) -> Experiment:
@@ -72,10 +73,11 @@ def load_experiment(folder: Path) -> Experiment:
 
 def _write_csv(path: Path, rows: Iterable[Row]) -> None:
     rows = list(rows)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    text = StringIO(newline="")
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_file(path, text.getvalue().encode())
 
 
 def _read_csv(path: Path) -> list[Row]:

@@ -21,6 +21,7 @@ from scipy.sparse import csc_array, issparse
 
 from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, json_object, opened, parsing
+from harness.files.durable import replacing
 from harness.files.qpfile import (
     canonical,
     check_dense,
@@ -65,7 +66,7 @@ def save_mat(
     arrays |= {name: csc_array(M) for name, M in matrices.items()}
     arrays["meta"] = json.dumps({**meta, "dense": dense})
     try:
-        with path.open("wb") as file:  # given a name, savemat would append .mat to it
+        with replacing(path) as file:
             savemat(file, arrays, do_compression=True, oned_as="column")
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None

@@ -8,7 +8,6 @@ others and `mapped` gives arrays that lie in the page cache, shared by all proce
 from __future__ import annotations
 
 import mmap
-import os
 import zipfile
 from collections.abc import Mapping
 from io import BytesIO
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from harness.errors import shortened
 from harness.files.datafile import check_size, opened
+from harness.files.durable import replacing
 
 EXPECTED = "an npz file"
 ALIGNMENT = 64
@@ -39,17 +39,7 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     A file that is there is replaced, not written over: whoever has mapped it keeps what
     it held, while truncating it would kill them by SIGBUS.
     """
-    new = path.with_name(f".{path.name}.new")
-    new.unlink(missing_ok=True)  # of one that was killed; a link is not followed
-    try:
-        _write(new, arrays)
-        os.replace(new, path)
-    finally:
-        new.unlink(missing_ok=True)
-
-
-def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    with path.open("xb") as file, zipfile.ZipFile(file, "w") as archive:
+    with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
             header = BytesIO()
             stored = np.ascontiguousarray(array).reshape(array.shape)

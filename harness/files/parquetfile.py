@@ -29,6 +29,7 @@ from scipy.sparse import csc_array, issparse
 
 from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, json_object, most_bytes, opened
+from harness.files.durable import replacing
 from harness.files.qpfile import check_symmetric, explicit_matrices, listed_dense
 from harness.qp import QP, Matrix, Vector, no_rows
 
@@ -74,7 +75,8 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     text = json.dumps({**meta, "dense": dense})
     table = table.replace_schema_metadata({_KEY: text})
     try:
-        pq.write_table(table, path, compression="zstd")
+        with replacing(path) as file:
+            pq.write_table(table, file, compression="zstd")
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 

@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
 from harness.files.durable import replace_file
-from harness.history import History, checked
 from harness.plugin import Fields
-from harness.solution import Solution, Status
+from harness.solution import History, Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -175,7 +174,7 @@ def point_arrays(solution: Solution) -> Arrays:
 def _history(path: Path, arrays: Arrays) -> History:
     """Find the history among the arrays of a point; none in files of old."""
     try:
-        return checked(_with_prefix(_HISTORY, arrays))
+        return checked_history(_with_prefix(_HISTORY, arrays))
     except ValueError as e:
         raise InputError(f"{path}: malformed history: {e}") from None
 
@@ -237,9 +236,11 @@ def save(folder: Path, arrays: Arrays) -> str:
 
 def digest_of(arrays: Arrays) -> str:
     """Hash names, types, shapes and values, not the archive, which holds dates."""
-    content = sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        content.update(f"{name} {array.dtype.str} {arrays[name].shape}\n".encode())
-        content.update(array.tobytes())
-    return content.hexdigest()[:16]
+
+    def parts() -> Iterator[bytes]:
+        for name in sorted(arrays):
+            array = np.ascontiguousarray(arrays[name])
+            yield f"{name} {array.dtype.str} {arrays[name].shape}\n".encode()
+            yield array.tobytes()
+
+    return hex_digest(parts(), 16)

@@ -13,19 +13,18 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from hashlib import blake2b, file_digest, sha256
 from hmac import compare_digest
+from hmac import digest as keyed_digest
 from pathlib import Path
 from secrets import token_bytes
-from tempfile import NamedTemporaryFile
 from typing import Any
 
-from harness.files.durable import replace_file
-from harness.names import CaseName
+from harness.digest import hex_digest, pieces
+from harness.files.durable import keep_private, move_file, replace_file
 
 _KEY_BYTES = 32
 
@@ -41,20 +40,18 @@ class Entry:
 
 def entry(
     folder: Path,
-    name: CaseName,
-    environment: str,
+    identity: Sequence[Any],
     make: Callable[[Path], Mapping[str, Any]],
 ) -> Entry:
     """Find a case, or have it built by the one process that comes first.
 
     folder : made if need be, in one that is there
-    environment : digest of what the case is built with
-    make : writes the QP to a file and returns the meta data; what it raises comes
-        through and leaves no entry
+    identity : plain data: of the case, and of what it is built with
+    make : writes the QP to a file, on the disk, and returns the meta data; what it
+        raises comes through and leaves no entry
     """
     folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
-    identity = [name.family, name.params, name.form, environment]
-    key = sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+    key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
     with _held(folder / f"{key}.lock"):
         found = _found(folder, key)
         if found is not None:
@@ -63,7 +60,7 @@ def entry(
         try:
             meta = make(new)
             digest = content_digest(new)
-            os.replace(new, folder / f"{digest}.npz")
+            move_file(new, folder / f"{digest}.npz")
         finally:
             new.unlink(missing_ok=True)
         index = {"digest": digest, "name": identity, "meta": meta}
@@ -75,7 +72,7 @@ def entry(
 def content_digest(path: Path) -> str:
     """Hash the content of a file."""
     with path.open("rb") as file:
-        return file_digest(file, lambda: blake2b(digest_size=12)).hexdigest()
+        return hex_digest(pieces(file), 24)
 
 
 def _found(folder: Path, key: str) -> Entry | None:
@@ -96,7 +93,7 @@ def _found(folder: Path, key: str) -> Entry | None:
 def _signature(index: Mapping[str, Any]) -> str:
     """Sign an entry, so that no other user can have written it."""
     text = json.dumps(index, sort_keys=True).encode()
-    return blake2b(text, key=user_key(), digest_size=16).hexdigest()
+    return keyed_digest(user_key(), text, "sha256").hex()
 
 
 @cache
@@ -111,11 +108,7 @@ def user_key() -> bytes:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not path.exists():
-            with NamedTemporaryFile(dir=path.parent) as new:
-                new.write(token_bytes(_KEY_BYTES))
-                new.flush()
-                with suppress(FileExistsError):  # another process was first
-                    os.link(new.name, path)
+            keep_private(path, token_bytes(_KEY_BYTES))
         fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         with os.fdopen(fd, "rb") as file:
             private = os.fstat(fd).st_uid == os.getuid()

@@ -12,9 +12,9 @@ It answers the requests of `harness.processes.protocol` with these of its own:
   ``{"event": "done", "found": true}``, or false where it finds none
 
 or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME
-is ``{"family": …, "params": {…}, "form": …}`` and N the number of cases that are to
-stay in memory. What leads back from a point to the bodies is code, which no file can
-hold: a case that is on file is built again when a point of it comes.
+is ``{"family": …, "params": {…}, "form": …, "name": …}`` and N the number of cases that
+are to stay in memory. What leads back from a point to the bodies is code, which no file
+can hold: a case that is on file is built again when a point of it comes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from harness.build import build, unbuilt
 from harness.files.qpfile import load_qp, save_qp
 from harness.files.store import (
     digest_of,
@@ -37,7 +36,7 @@ from harness.files.store import (
     write_arrays,
     write_point,
 )
-from harness.names import CaseName, canonical
+from harness.names import CaseId, unbuilt
 from harness.plugin import Case, Family, Reference
 from harness.processes.protocol import Events, answer_requests
 from harness.qp import QP
@@ -71,18 +70,18 @@ class CaseWorker:
         """Answer one request, whatever the family's code does."""
         if "solve" in request:
             return self._solved(Path(request["solve"]), Path(request["point"]))
-        name = CaseName(**(request.get("build") or request["describe"]))
+        asked = request.get("build") or request["describe"]
+        name = CaseId(**{**asked, "family": self._families[asked["family"]]})
         try:
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # the family's code
-            text = unbuilt(canonical(name, self._families[name.family]), e)
-            return {"unbuilt": text, "trace": traceback.format_exc()}
+            return {"unbuilt": unbuilt(name, e), "trace": traceback.format_exc()}
         if "build" in request:
             return self._written(case, name, Path(request["qp"]))
         return self._described(case, name, request)
 
     def _described(
-        self, case: Case, name: CaseName, request: dict[str, Any]
+        self, case: Case, name: CaseId, request: dict[str, Any]
     ) -> dict[str, Any]:
         s = read_point(Path(request["point"]), Status.SOLVED)
         start = perf_counter()
@@ -105,14 +104,14 @@ class CaseWorker:
         }
 
     def _certified(
-        self, case: Case, name: CaseName, s: Solution
+        self, case: Case, name: CaseId, s: Solution
     ) -> tuple[dict[str, Any], str]:
         """Bound the error of a point; one that came before is not certified again.
 
         Most solvers give the same digits at each repeat. Only the first takes time, and
         only its record has a `certify_seconds`.
         """
-        key = canonical(name, self._families[name.family]), digest_of(point_arrays(s))
+        key = name.name, digest_of(point_arrays(s))
         if key in self._bounds:
             bounds, objection = self._bounds[key]
             return {
@@ -133,22 +132,20 @@ class CaseWorker:
     def _loaded(self, qp: Path) -> QP:
         return load_qp(qp, operators=self._operators)[0]
 
-    def _case(self, name: CaseName, keep: int) -> Case:
-        family = self._families[name.family]
-        key = canonical(name, family)
-        case = self._cases.pop(key, None)
+    def _case(self, name: CaseId, keep: int) -> Case:
+        case = self._cases.pop(name.name, None)
         while len(self._cases) >= keep:  # before building: two may be too large
             del self._cases[next(iter(self._cases))]
         if case is None:
             start = perf_counter()
-            case = build(name, family, self._reference)
+            case = name.build(self._reference)
             self._build_seconds = perf_counter() - start
-        self._cases[key] = case
+        self._cases[name.name] = case
         return case
 
-    def _written(self, case: Case, name: CaseName, path: Path) -> dict[str, Any]:
+    def _written(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
         meta = {
-            "name": canonical(name, self._families[name.family]),
+            "name": name.name,
             "scale": case.scale,
             "constant": case.constant,
         }

@@ -24,14 +24,13 @@ from numpy.typing import NDArray
 from harness.errors import FaultError
 from harness.files.qpfile import save_qp
 from harness.files.store import write_point
-from harness.history import checked
 from harness.plugin import Case, Reference
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import MOST_ECHOED
 from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from harness.qp import QP
 from harness.record import Record, Verdict
-from harness.solution import Solution, Status
+from harness.solution import Solution, Status, checked_history
 from harness.verify.measure import Measurement, one_line
 from harness.verify.optimum import Proves, proves
 from harness.verify.verdicts import certified, has_point, judged, noted, quantities_of
@@ -187,7 +186,12 @@ def _point(path: Path, qp: QP) -> Solution:
         history = {k[len(_HISTORY) :]: v for k, v in arrays.items() if k not in _POINT}
         x, y, z, z_box = (arrays[name] for name in _POINT)
         point = Solution(
-            status=Status.FAILED, x=x, y=y, z=z, z_box=z_box, history=checked(history)
+            status=Status.FAILED,
+            x=x,
+            y=y,
+            z=z,
+            z_box=z_box,
+            history=checked_history(history),
         )
     except Exception as e:  # bytes of any kind meet numpy's and zipfile's parsers
         raise _ForeignPointError(f"no point: {one_line(e)[:MOST_ECHOED]}") from None

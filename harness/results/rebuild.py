@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from harness.build import build, unbuilt
 from harness.errors import InputError
 from harness.files.qpfile import qp_digest
-from harness.names import assemble
+from harness.names import assemble, unbuilt
 from harness.plugin import Case, Family, Reference
 from harness.record import Record
 from harness.results.folder import environment_of
@@ -32,10 +31,9 @@ def rebuilt(
         except InputError:
             needs = ""
         raise InputError(f"unknown family {r.family!r}{needs}")
-    family = families[r.family]
-    name = assemble(family, r.params, r.form)
+    name = assemble(families[r.family], r.params, r.form)
     try:
-        case = build(name, family, reference)
+        case = name.build(reference)
     except (Exception, SystemExit) as e:  # the family's code
         raise InputError(unbuilt(r.case, e)) from None
     if r.qp is not None and (now := qp_digest(case.qp, recipe=True)) != r.qp:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.errors import InputError
-from harness.names import CaseName, assemble, canonical
+from harness.names import CaseId, assemble
 from harness.plugin import Family, Solver
 from harness.record import Record
 from harness.registry import SolverSpec, options_of, resolve
@@ -26,7 +26,7 @@ class StoredRun:
 
     record: Record
     repeats: list[Record]  #: of the same cell: other repeats, and itself
-    cases: tuple[CaseName, ...]  #: its own is the last; of a sequence those before
+    cases: tuple[CaseId, ...]  #: its own is the last; of a sequence those before
     spec: SolverSpec
     environment: Mapping[str, Any]
     time_limit: float  #: s
@@ -77,7 +77,6 @@ def open_capsule(
 
 def block_of(
     capsule: StoredRun,
-    families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
     environment: str,
 ) -> WorkUnit:
@@ -89,7 +88,6 @@ def block_of(
     turn = tuple(
         new_record(
             name,
-            canonical(name, families[name.family]),
             capsule.spec,
             options=options_of(resolve(capsule.spec, solvers)),
             tol=record.tol,
@@ -102,7 +100,6 @@ def block_of(
     )
     return WorkUnit(
         number=0,
-        cases=capsule.cases,
         turns=(turn,),
         time_limit=capsule.time_limit,
         memory_limit=capsule.memory_limit,

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Protocol
 
 from harness.files.store import Arrays
-from harness.names import CaseName
 from harness.record import Record
 
 
@@ -31,11 +30,16 @@ class WorkUnit:
     """What to measure, in which order."""
 
     number: int
-    cases: tuple[CaseName, ...]  #: one, or the steps of a sequence
-    #: per solver, in the order to measure: its records to fill in, one per case
+    #: per solver, in the order to measure: its records to fill in, one per case, which
+    #: is one, or the steps of a sequence
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
+
+    @property
+    def cases(self) -> tuple[str, ...]:
+        """The names of its cases, in order."""
+        return tuple(record.case for record in self.turns[0])
 
     @property
     def is_sequence(self) -> bool:

@@ -14,7 +14,6 @@ from harness.errors import FaultError
 from harness.files.durable import full_disk_told, refuse_full_disk
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays, read_arrays, read_point
-from harness.names import CaseName
 from harness.processes.case_folder import Entry, entry
 from harness.processes.measurement import measured
 from harness.processes.supervisor import WorkerProcess
@@ -124,12 +123,10 @@ class Executor:
 
         """
         if not self._entries:
-            self._entries = tuple(self._entry(name, block) for name in block.cases)
+            self._entries = tuple(self._entry(record, block) for record in turn)
             self._loaded = {e.digest: self._qp(e) for e in self._entries}
         worker = self._worker(turn[0].solver)
-        for step, (name, record, at) in enumerate(
-            zip(block.cases, turn, self._entries, strict=True)
-        ):
+        for step, (record, at) in enumerate(zip(turn, self._entries, strict=True)):
             request = {
                 "qp": str(at.qp),
                 "digest": at.digest,
@@ -152,7 +149,7 @@ class Executor:
             )
             if record.status in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self._scratch, "")  # whatever it died of
-            yield self._described(block, name, record, solution)
+            yield self._described(block, record, solution)
             stopped = record.status is not Verdict.DECLINED and (
                 solution is None or not has_point(solution)
             )
@@ -161,7 +158,7 @@ class Executor:
                 return
 
     def _described(
-        self, block: WorkUnit, name: CaseName, record: Record, solution: Solution | None
+        self, block: WorkUnit, record: Record, solution: Solution | None
     ) -> Result:
         """Add what the point means, which the generator knows."""
         if solution is None or not has_point(solution):
@@ -170,7 +167,7 @@ class Executor:
         fields = self._scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
-            "describe": _plain(name),
+            "describe": _case(record),
             "point": str(self._point),
             "fields": str(fields) if first else None,
         }
@@ -190,13 +187,14 @@ class Executor:
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, name: CaseName, block: WorkUnit) -> Entry:
+    def _entry(self, record: Record, block: WorkUnit) -> Entry:
         def make(path: Path) -> Mapping[str, Any]:
-            request = {"build": _plain(name), "qp": str(path)}
+            request = {"build": _case(record), "qp": str(path)}
             meta: Mapping[str, Any] = self._ask_generator(request, block)["meta"]
             return meta
 
-        return entry(self._cases, name, block.turns[0][0].environment, make)
+        r = record
+        return entry(self._cases, [r.family, r.params, r.form, r.environment], make)
 
     def _ask_generator(
         self, request: Mapping[str, Any], block: WorkUnit
@@ -317,5 +315,6 @@ class _UnbuiltError(Exception):
         self.trace = trace
 
 
-def _plain(name: CaseName) -> dict[str, Any]:
-    return {"family": name.family, "params": dict(name.params), "form": name.form}
+def _case(r: Record) -> dict[str, Any]:
+    """Ask for the case of a record, as `harness.processes.case_worker` is asked."""
+    return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}

@@ -19,8 +19,7 @@ from typing import Any
 from harness.errors import InputError
 from harness.files.durable import Lines, full_disk_told
 from harness.files.store import save
-from harness.names import canonical
-from harness.plugin import Family, Solver
+from harness.plugin import Solver
 from harness.record import Record
 from harness.registry import SolverSpec, options_of
 from harness.results.faults import FAULTS, Fault
@@ -55,7 +54,6 @@ class Missing:
 def run(
     suite: Suite,
     *,
-    families: Mapping[str, Family],
     out: Path,
     commands: Commands,
     resolve: Callable[[SolverSpec], Solver],
@@ -89,10 +87,9 @@ def run(
             Journal(out, digest, progress.warn) as journal,
         ):
             past = read_journal(out)
-            _check_same(out, past, suite, families)
+            _check_same(out, past, suite)
             schedule = Schedule(
                 suite=suite,
-                families=families,
                 options={s.label: options_of(resolve(s)) for s in suite.solvers},
                 environment=digest,
                 progress=progress,
@@ -118,8 +115,7 @@ def run(
                             "is there again, solutions stored before are lost; the "
                             "same command continues"
                         )
-        unbuilt = [canonical(c, families[c.family]) for c in schedule.unbuilt]
-        return Missing(unbuilt=unbuilt, faults=book.left())
+        return Missing(unbuilt=schedule.unbuilt, faults=book.left())
 
 
 @dataclass(eq=False, kw_only=True)
@@ -226,11 +222,9 @@ def _ended_by_sigterm(progress: Progress) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def _check_same(
-    out: Path, past: list[Record], suite: Suite, families: Mapping[str, Family]
-) -> None:
+def _check_same(out: Path, past: list[Record], suite: Suite) -> None:
     """Refuse to go on where a name now means another case: its file has changed."""
-    now = {canonical(c, families[c.family]): c.params for c in suite.names}
+    now = {case.name: case.params for case in suite.names}
     for record in past:
         params = now.get(record.case, record.params)
         for key in params.keys() & record.params.keys():

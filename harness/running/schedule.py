@@ -16,8 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.names import CaseName, canonical
-from harness.plugin import Family
+from harness.names import CaseId
 from harness.record import Record, Verdict
 from harness.results.work_unit import WorkUnit
 from harness.running.pairs import widest
@@ -25,7 +24,7 @@ from harness.running.progress import Progress
 from harness.suite.suite import Suite
 from harness.verify.verdicts import new_record
 
-Group = tuple[CaseName, ...]
+Group = tuple[CaseId, ...]
 Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 
@@ -34,11 +33,10 @@ class Schedule:
     """The blocks of a suite, given what the journal holds."""
 
     suite: Suite
-    families: Mapping[str, Family]
     options: Mapping[str, Mapping[str, Any]]  #: of each solver, defaults resolved
     environment: str  #: digest
     progress: Progress
-    unbuilt: list[CaseName] = field(default_factory=list)
+    unbuilt: list[str] = field(default_factory=list)  #: names of cases
     _seen: dict[Cell, list[Record]] = field(default_factory=dict)  # for `_enough`
     _declined: set[tuple[str, Cell]] = field(default_factory=set)
     _done: set[str] = field(default_factory=set)  #: run ids
@@ -106,8 +104,8 @@ class Schedule:
         assert self.suite.precision is not None
         records = [
             r
-            for name in group
-            for r in self._seen.get((_mode(group), self._canonical(name), tol), ())
+            for case in group
+            for r in self._seen.get((_mode(group), case.name, tol), ())
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
@@ -126,8 +124,7 @@ class Schedule:
         for spec in self.suite.solvers:
             turn = tuple(
                 new_record(
-                    name,
-                    self._canonical(name),
+                    case,
                     spec,
                     options=self.options[spec.label],
                     tol=tol,
@@ -137,7 +134,7 @@ class Schedule:
                     mode=_mode(group),
                     accuracy=self.suite.accuracy,
                 )
-                for name in group
+                for case in group
             )
             if self._given_up(group) or all(map(self.knows, turn)):
                 self._skip(len(turn))
@@ -145,24 +142,20 @@ class Schedule:
                 left.append(turn)
         if not left:
             return None
-        seed = f"{self.suite.name} {self._canonical(group[0])} {tol} {repeat // 2}"
+        seed = f"{self.suite.name} {group[0]} {tol} {repeat // 2}"
         random.Random(seed).shuffle(left)
         if repeat % 2:  # who was first is last: no place in a block favours anybody
             left.reverse()
         self._next += 1
         return WorkUnit(
             number=left[0][0].block,
-            cases=group,
             turns=tuple(left),
             time_limit=self.suite.time_limit,
             memory_limit=self.suite.memory_limit,
         )
 
     def _given_up(self, group: Group) -> bool:
-        return any(name in self.unbuilt for name in group)
-
-    def _canonical(self, name: CaseName) -> str:
-        return canonical(name, self.families[name.family])
+        return any(case.name in self.unbuilt for case in group)
 
     def _skip(self, cells: int) -> None:
         for _ in range(cells):

@@ -10,7 +10,7 @@ from typing import Any
 from harness import checked
 from harness.errors import InputError, some
 from harness.files.reading import toml
-from harness.names import CaseName, canonical, match, parse
+from harness.names import CaseId, match, parse
 from harness.plugin import Family, Solver
 from harness.registry import SolverSpec, resolve
 from harness.suite.suite import NULL, Suite
@@ -84,7 +84,7 @@ def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
 ) -> dict[str, Any]:
     """Keep what matches; of a sequence all or nothing."""
-    named = {canonical(case, families[case.family]): case for case in suite.names}
+    named = [case.name for case in suite.names]
     kept: set[str] = set()
     for pattern in patterns:
         matched = match(_canonical_pattern(pattern, families), named)
@@ -95,8 +95,8 @@ def _chosen_cases(
             )
         kept.update(matched)
 
-    def wanted(case: CaseName) -> bool:
-        return canonical(case, families[case.family]) in kept
+    def wanted(case: CaseId) -> bool:
+        return case.name in kept
 
     return {
         "cases": tuple(filter(wanted, suite.cases)),
@@ -109,7 +109,6 @@ def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
     if set("*?[") & set(pattern):
         return pattern
     try:
-        name = parse(pattern, families)
+        return parse(pattern, families).name
     except InputError:
         return pattern
-    return canonical(name, families[name.family])

@@ -12,7 +12,7 @@ from typing import Any
 
 from harness import checked
 from harness.errors import PLUGINS, InputError, shown, some, unknown
-from harness.names import CaseName, assemble, canonical
+from harness.names import CaseId, assemble
 from harness.plugin import Family
 
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
@@ -20,7 +20,7 @@ _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 
 def planned(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
-) -> tuple[tuple[CaseName, ...], tuple[tuple[CaseName, ...], ...]]:
+) -> tuple[tuple[CaseId, ...], tuple[tuple[CaseId, ...], ...]]:
     """All cold cases in the order written, and all sequences of cases.
 
     A case that two blocks share is kept once. A sequence are the cases that differ in
@@ -29,14 +29,14 @@ def planned(
     folder : of the suite; a path that leads nowhere from here is sought there
     most : cases that the blocks may span in all
     """
-    cold: dict[str, CaseName] = {}
-    sequences: dict[str, tuple[CaseName, ...]] = {}
+    cold: dict[str, CaseId] = {}
+    sequences: dict[str, tuple[CaseId, ...]] = {}
     for block in _blocks(blocks, families, folder, most):
         if block.along is None:
             for case in block.cases:
-                cold.setdefault(canonical(case, block.family), case)
+                cold.setdefault(case.name, case)
             continue
-        steps: dict[str, list[CaseName]] = {}
+        steps: dict[str, list[CaseId]] = {}
         for case in block.cases:
             rest = {k: v for k, v in case.params.items() if k != block.along}
             steps.setdefault(f"{case.form} {rest}", []).append(case)
@@ -46,8 +46,7 @@ def planned(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Block:
-    family: Family
-    cases: list[CaseName]
+    cases: list[CaseId]
     along: str | None  #: the key of a sequence
 
 
@@ -84,7 +83,7 @@ def _blocks(
                 for point in _points(axes)
                 for form in forms
             ]
-            yield _Block(family=family, cases=cases, along=along)
+            yield _Block(cases=cases, along=along)
 
 
 def _located(point: dict[str, object], folder: Path) -> dict[str, object]:

@@ -11,7 +11,7 @@ from typing import Any
 from harness import checked
 from harness.errors import InputError, shown, unknown
 from harness.files.reading import MOST_TOML, read_text, toml
-from harness.names import CaseName
+from harness.names import CaseId
 from harness.plugin import Family, Solver
 from harness.registry import SolverSpec, resolve
 from harness.suite.parameter_grid import planned
@@ -43,9 +43,9 @@ class Suite:
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
     solvers: tuple[SolverSpec, ...]  #: of distinct labels
-    cases: tuple[CaseName, ...]  #: all distinct; those that are solved cold
+    cases: tuple[CaseId, ...]  #: all distinct; those that are solved cold
     text: str  #: the TOML as read, but with the limits that hold
-    sequences: tuple[tuple[CaseName, ...], ...] = ()  #: each: its steps in order
+    sequences: tuple[tuple[CaseId, ...], ...] = ()  #: each: its steps in order
     precision: float | None = None
     """Go on beyond `repeats` until every ratio to the fastest is known so well."""
     max_repeats: int = 30  #: where there is a precision to reach
@@ -53,12 +53,12 @@ class Suite:
     accuracy: float | None = None  #: judge answers at this, whatever was asked for
 
     @property
-    def groups(self) -> tuple[tuple[CaseName, ...], ...]:
+    def groups(self) -> tuple[tuple[CaseId, ...], ...]:
         """What one block is made of: a single case, or the steps of a sequence."""
         return (*((case,) for case in self.cases), *self.sequences)
 
     @property
-    def names(self) -> tuple[CaseName, ...]:
+    def names(self) -> tuple[CaseId, ...]:
         """Every case, cold or in a sequence."""
         return tuple(case for group in self.groups for case in group)
 
@@ -117,8 +117,8 @@ def asked_solvers(text: str) -> dict[str, SolverSpec]:
 
 
 def steps_up_to(
-    text: str, name: CaseName, families: Mapping[str, Family]
-) -> tuple[CaseName, ...]:
+    text: str, name: CaseId, families: Mapping[str, Family]
+) -> tuple[CaseId, ...]:
     """Read from a suite's TOML the steps of a sequence that lead to one of them.
 
     Raises

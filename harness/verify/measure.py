@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 
-from harness.history import usable
 from harness.plugin import Solver
 from harness.qp import QP, Matrix, Vector
 from harness.recipe import Recipe
-from harness.solution import Solution, Status
+from harness.solution import Solution, Status, usable_history
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
 MOST_INNER = 100
@@ -228,7 +227,7 @@ def _checked(answer: object, qp: QP) -> Solution:
 
 def _plain(s: Solution) -> Solution:
     """Replace whatever compares or prints like the right type by the right type."""
-    history, objection = usable(s.history)
+    history, objection = usable_history(s.history)
     vectors = {name: _numbers(name, getattr(s, name)) for name in _VECTORS}
     iterations = None if s.iterations is None else _count("iterations", s.iterations)
     return replace(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from hashlib import sha256
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from harness.names import CaseName
+from harness.digest import hex_digest
+from harness.names import CaseId
 from harness.plugin import Case
 from harness.qp import QP
 from harness.record import Record, Verdict
@@ -27,8 +27,7 @@ IDENTITY = 1
 
 
 def new_record(
-    name: CaseName,
-    case: str,
+    case: CaseId,
     spec: SolverSpec,
     *,
     options: Mapping[str, Any],
@@ -41,22 +40,21 @@ def new_record(
 ) -> Record:
     """Make the record of a measurement before it is made.
 
-    case : the canonical name
     options : every option of the solver, defaults resolved
     environment : digest
     mode, accuracy : see `Record`
     """
     options = plain(options)
-    identity = [IDENTITY, case, spec.label, spec.name, options, tol, repeat]
+    identity = [IDENTITY, case.name, spec.label, spec.name, options, tol, repeat]
     if (mode, accuracy) != ("cold", None):
         identity += [mode, accuracy]
     text = json.dumps(identity, sort_keys=True)
     return Record(
-        run_id=sha256(text.encode()).hexdigest()[:12],
-        case=case,
-        family=name.family,
-        params=name.params,
-        form=name.form,
+        run_id=hex_digest([text.encode()]),
+        case=case.name,
+        family=case.family.name,
+        params=case.params,
+        form=case.form,
         sizes={},
         solver=spec.label,
         options=options,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
+from harness import Family, InputError
 from problems.ranges import (
     CONTACT_FORMS,
     METHODS,
@@ -27,7 +27,7 @@ MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 
 @dataclass(frozen=True)
-class BeamRing:
+class BeamRing(Family):
     """The paper's benchmark: beam on a half ring, plane elasticity, frictionless."""
 
     name: str = "beam-ring"

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import InputError
+from harness import Family, InputError
 from harness.errors import unknown
 from problems.files.file_digest import check_digest, digest
 
@@ -19,7 +19,7 @@ SUFFIXES = (".npz", ".mat", ".parquet", ".qps", ".mps", ".sif")
 
 
 @dataclass(frozen=True)
-class FromFile:
+class FromFile(Family):
     """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
 
     The digest of the file's content is a parameter of the case, so that records say

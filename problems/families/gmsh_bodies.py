@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
+from harness import Family, InputError
 from problems.files.file_digest import check_digest, digest
 from problems.ranges import (
     CONTACT_FORMS,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GmshBodies:
+class GmshBodies(Family):
     """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
     The digest of the content of both files is a parameter of the case, so that a

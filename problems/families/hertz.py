@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from harness import Family
 from problems.ranges import (
     METHODS,
     PLANES,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class HertzPlane:
+class HertzPlane(Family):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
     name: str = "hertz-plane"
@@ -59,7 +60,7 @@ class HertzPlane:
 
 
 @dataclass(frozen=True)
-class HertzCylinder:
+class HertzCylinder(Family):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
     name: str = "hertz-cylinder"

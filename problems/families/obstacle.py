@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from harness import Family
 from problems.ranges import at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(Family):
     """A string or membrane over a flat obstacle, with known exact solution."""
 
     name: str = "obstacle"

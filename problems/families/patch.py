@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from harness import Family
 from problems.ranges import (
     METHODS,
     PLANES,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ContactPatch:
+class ContactPatch(Family):
     """Contact patch test: two blocks on each other under uniform pressure."""
 
     name: str = "contact-patch"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from hashlib import sha256
+from collections.abc import Iterator
 from pathlib import Path
 
 from harness import InputError, Value
+from harness.digest import hex_digest, pieces
 from harness.files.datafile import opened
-
-_PIECE = 2**20  #: bytes that are read at once
 
 
 def digest(*paths: Path) -> str:
@@ -21,12 +20,13 @@ def digest(*paths: Path) -> str:
         `harness.files.datafile` allows.
 
     """
-    content = sha256()
-    for path in paths:
-        with opened(path, "a file that can be read") as file:
-            while piece := file.read(_PIECE):
-                content.update(piece)
-    return content.hexdigest()[:12]
+
+    def parts() -> Iterator[bytes]:
+        for path in paths:
+            with opened(path, "a file that can be read") as file:
+                yield from pieces(file)
+
+    return hex_digest(parts())
 
 
 def check_digest(path: Value, asked: Value, found: str) -> None:

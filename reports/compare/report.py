@@ -8,6 +8,7 @@ from typing import Any
 
 import pandas as pd
 
+from harness.files.durable import replacing
 from harness.record import VERIFIED_FACTOR
 from reports.compare.changes import Comparison, Pair, compare
 from reports.compare.conclusions import verdict_lines
@@ -47,7 +48,8 @@ def write_comparison(
         written.append(write_text(tables / "changes.csv", text))
     if "parquet" in formats:
         tables.mkdir(parents=True, exist_ok=True)
-        frame.to_parquet(tables / "changes.parquet", index=False)
+        with replacing(tables / "changes.parquet") as file:
+            frame.to_parquet(file, index=False)
         written.append(tables / "changes.parquet")
     return verdict_lines(comparison), written
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from harness import InputError, Record, Vector
 from harness.files.store import load_history
-from harness.history import History
+from harness.solution import History
 from reports.data.evidence import Evidence, Outcome
 
 MOST = 4  #: cases that are drawn

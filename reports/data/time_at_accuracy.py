@@ -19,7 +19,6 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from hashlib import blake2s
 from itertools import groupby
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from harness import Verdict
+from harness.digest import hex_digest
 from reports.data.evidence import Outcome
 from reports.statistics.intervals import COVERAGE, Interval
 from reports.statistics.resampling import limits
@@ -106,6 +106,6 @@ def time_at(error: float, errors: Floats, times: Floats) -> float:
 def _medians(times: Floats, outcome: Outcome) -> Floats:
     """Draw medians of repeats with replacement; the same for the same measurements."""
     names = "\n".join(outcome.run_ids).encode("utf-8", "replace")
-    seed = int.from_bytes(blake2s(names, digest_size=8).digest(), "big")
+    seed = int(hex_digest([names], 16), 16)
     chosen = np.random.default_rng(seed).choice(times, (RESAMPLES, times.size))
     return np.asarray(np.median(chosen, axis=1))

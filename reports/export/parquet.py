@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from harness import Record
+from harness.files.durable import replacing
 from harness.record import finite
 
 _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
@@ -31,7 +32,8 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
         for f in fields(Record)
     })  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path, compression="zstd")
+    with replacing(path) as file:
+        pq.write_table(table, file, compression="zstd")
     return path
 
 

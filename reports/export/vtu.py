@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Fields, InputError, Vector
+from harness.files.durable import replacing
 
 IN_CONTACT = 1e-6  #: a node is in contact where its force exceeds this · the largest
 
@@ -72,7 +73,8 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
         "  <Collection>", *lines, "  </Collection>", "</VTKFile>", "",
     ])  # fmt: skip
     try:
-        path.write_text(text, "utf-8")
+        with replacing(path) as file:
+            file.write(text.encode())
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
     return [path, *written]

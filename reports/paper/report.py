@@ -12,7 +12,7 @@ from reports.paper.csv_tables import csv_tables
 from reports.paper.page import BEYOND, compose
 from reports.render.html_page import html
 from reports.render.latex import latex
-from reports.render.writing import ENDINGS
+from reports.render.writing import ENDINGS, write_text
 
 
 def write_paper(folder: Path) -> list[Path]:
@@ -34,7 +34,7 @@ def write_paper(folder: Path) -> list[Path]:
         if (folder / "data" / name).is_dir()
     }
     page = compose(experiment, suites)
-    written = [_write(folder / "index.html", html(page))]
+    written = [write_text(folder / "index.html", html(page))]
     figures, tables = folder / "figures", folder / "tables"
     figures.mkdir(exist_ok=True)
     for section in page.sections:
@@ -43,17 +43,11 @@ def write_paper(folder: Path) -> list[Path]:
             written += save_all(picture.figure, files)
         if section.tables:
             path = tables / f"{section.name}.tex"
-            written.append(_write(path, latex(section.tables)))
+            written.append(write_text(path, latex(section.tables)))
     frames = csv_tables(experiment)
     frames |= {name: report_tables(e)["outcomes"] for name, e in suites.items()}
     written += [
-        _write(tables / f"{name}.csv", frame.to_csv(index=False))
+        write_text(tables / f"{name}.csv", frame.to_csv(index=False))
         for name, frame in frames.items()
     ]
     return written
-
-
-def _write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8", newline="\n")
-    return path

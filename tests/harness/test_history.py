@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from solvers import SOLVERS
-from solvers.smalbe.driver import STEPS
-from solvers.smalbe.history import COLUMNS
+from solvers.smalbe.driver import COLUMNS, STEPS
 
 PRESETS = [
     "smalbe",

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness import InputError
-from harness.names import CaseName, assemble, canonical, match, parse
+from harness.names import CaseId, assemble, match, parse
+from harness.plugin import as_family
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class Ring:
             raise InputError(f"ring: Nh={params['Nh']} must be at least 1")
 
 
-RING = Ring()
-PLAIN = SimpleNamespace(
-    name="plain", defaults={"n": 4, "kind": "soft"}, forms=("primal",)
+RING = as_family(Ring())
+PLAIN = as_family(
+    SimpleNamespace(name="plain", defaults={"n": 4, "kind": "soft"}, forms=("primal",))
 )
 FAMILIES = {"ring": RING, "plain": PLAIN}
 
@@ -44,9 +45,10 @@ FAMILIES = {"ring": RING, "plain": PLAIN}
 def test_keys_left_out_take_their_defaults_in_the_family_s_order():
     name = parse("plain/kind=hard/primal", FAMILIES)
 
-    assert name == CaseName(
-        family="plain", params={"n": 4, "kind": "hard"}, form="primal"
-    )
+    assert name == CaseId(
+        family=PLAIN, name="plain/kind=hard/primal", form="primal",
+        params={"n": 4, "kind": "hard"},
+    )  # fmt: skip
     assert list(name.params) == ["n", "kind"]
 
 
@@ -57,17 +59,17 @@ def test_a_derived_default_follows_the_key_that_it_derives_from():
 
 
 def test_the_order_is_the_family_s_whatever_completes_the_keys():
-    family = SimpleNamespace(
+    odd = SimpleNamespace(
         name="odd",
         defaults={"a": 1, "b": 2},
         forms=("primal",),
         complete=lambda given: {"b": 2, "a": 1, **given},
     )
 
-    name = assemble(family, {"b": 7, "a": 8}, "primal")
+    name = assemble(as_family(odd), {"b": 7, "a": 8}, "primal")
 
     assert list(name.params) == ["a", "b"]
-    assert canonical(name, family) == "odd/a=8/b=7/primal"
+    assert str(name) == "odd/a=8/b=7/primal"
 
 
 @pytest.mark.parametrize(
@@ -90,7 +92,7 @@ def test_a_canonical_name_lists_what_is_not_implied_in_the_family_s_order(
 ):
     name = parse(text, FAMILIES)
 
-    assert canonical(name, FAMILIES[name.family]) == expected
+    assert str(name) == expected
 
 
 @given(
@@ -104,7 +106,7 @@ def test_a_canonical_name_lists_what_is_not_implied_in_the_family_s_order(
 def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
     name = assemble(RING, params, form)
 
-    assert parse(canonical(name, RING), FAMILIES) == name
+    assert parse(str(name), FAMILIES) == name
 
 
 @pytest.mark.parametrize(

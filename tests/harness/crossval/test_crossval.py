@@ -9,14 +9,13 @@ import pytest
 from scipy.sparse import csc_array
 
 from harness import QP, Case, Mechanics, Solution, Status, no_rows
-from harness.build import build
 from harness.crossval.assessment import assess, distances, energy_allowed
 from harness.crossval.comparison import brief, compared
 from harness.crossval.discretisation import read_discretisation
 from harness.crossval.ground_truth import Given, truth_of
 from harness.files.qpfile import qp_digest, save_qp
 from harness.files.store import save_solution, write_point
-from harness.names import canonical, parse
+from harness.names import parse
 from harness.record import Verdict
 from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
@@ -38,17 +37,15 @@ NOWHERE = {"report": None, "validation_page": lambda *_: []}
 
 
 def built(text, families=FAMILIES):
-    name = parse(text, families)
-    return build(name, families[name.family], reference_solution)
+    return parse(text, families).build(reference_solution)
 
 
 def record_of(text, label, tol=1e-8, **more):
-    name = parse(text, FAMILIES)
     spec = SolverSpec(name=label, label=label)
-    case = canonical(name, FAMILIES[name.family])
     return new_record(
-        name, case, spec, options={}, tol=tol, repeat=0, environment="here", **more
-    )
+        parse(text, FAMILIES), spec, options={}, tol=tol, repeat=0, environment="here",
+        **more,
+    )  # fmt: skip
 
 
 def write(folder, answers, tol=1e-8):

@@ -21,7 +21,8 @@ from harness.crossval.discretisation import (
     read_discretisation,
 )
 from harness.crossval.mesh_refinement import prolongation
-from harness.names import completed, parse
+from harness.names import assemble, completed, parse
+from harness.plugin import as_family
 from harness.verify.references import reference_point
 from problems import PROBLEMS
 from problems.models.hertz import halved
@@ -45,7 +46,7 @@ def converging(error, rate, count):
 
 def meshes(folder, *names, budget=1e9):
     return discretisation_errors(
-        [parse(name, PROBLEMS) for name in names], PROBLEMS, reference_solution,
+        [parse(name, PROBLEMS) for name in names], reference_solution,
         folder, budget,
     )  # fmt: skip
 
@@ -231,9 +232,8 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
     bare = SimpleNamespace(
         name="bare", defaults={}, forms=("primal",), build=PROBLEMS["obstacle"].build
     )
-    families = {"obstacle": broken, "bare": bare}
-    names = [parse("obstacle/primal", families), parse("bare/primal", families)]
-    found = discretisation_errors(names, families, reference_solution, tmp_path, 1e9)
+    cases = [assemble(family, {}, "primal") for family in (broken, as_family(bare))]
+    found = discretisation_errors(cases, reference_solution, tmp_path, 1e9)
     large = meshes(tmp_path, "obstacle/n=300/primal")
     late = meshes(tmp_path, "obstacle/primal", budget=-1.0)
 
@@ -258,7 +258,7 @@ def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
         refined=obstacle.refined, build=build,
     )  # fmt: skip
     (found,) = discretisation_errors(
-        [parse("obstacle/n=4/primal", PROBLEMS)], {"obstacle": slow},
+        [assemble(as_family(slow), {"n": 4}, "primal")],
         reference_solution, tmp_path, 0.4,
     )  # fmt: skip
 
@@ -292,7 +292,7 @@ def test_a_reason_other_than_time_replaces_what_was_told(tmp_path):
     meshes(tmp_path, name)
     broken = {"obstacle": replace_build(PROBLEMS["obstacle"], OSError("no longer"))}
     (found,) = discretisation_errors(
-        [parse(name, PROBLEMS)], broken, reference_solution, tmp_path, 1e9
+        [parse(name, broken)], reference_solution, tmp_path, 1e9
     )
 
     assert (found.error, "no longer" in found.note) == (None, True)
@@ -302,10 +302,10 @@ def replace_build(family, error):
     def build(*_):
         raise error
 
-    return SimpleNamespace(
+    return as_family(SimpleNamespace(
         name=family.name, defaults=family.defaults, forms=family.forms, build=build,
         refined=family.refined,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 @pytest.mark.parametrize(

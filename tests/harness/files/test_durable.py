@@ -18,9 +18,11 @@ from harness.errors import FaultError
 from harness.files.durable import (
     Lines,
     full_disk_told,
+    keep_private,
     refuse_full_disk,
     remove_unfinished,
     replace_file,
+    replacing,
 )
 from harness.processes import measurement as remote
 from harness.registry import load_plugin
@@ -94,6 +96,26 @@ def test_what_cannot_be_synced_does_not_replace(tmp_path, monkeypatch):
         replace_file(path, b"new")
 
     assert path.read_bytes() == b"old"
+
+
+def test_a_block_that_raises_replaces_nothing(tmp_path):
+    path = tmp_path / "file"
+    replace_file(path, b"old")
+    with pytest.raises(TypeError), replacing(path) as file:
+        file.writelines([b"new", "not bytes"])
+
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_private_file_is_its_owners_and_written_once(tmp_path):
+    path = tmp_path / "key"
+    for content in (b"first", b"second"):
+        keep_private(path, content)
+
+    assert path.read_bytes() == b"first"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert [p.name for p in tmp_path.iterdir()] == ["key"]
 
 
 def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):

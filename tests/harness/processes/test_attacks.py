@@ -16,7 +16,7 @@ import pytest
 from harness import Solution, Status, Verdict
 from harness.errors import FaultError
 from harness.files.qpfile import save_qp
-from harness.names import CaseName
+from harness.names import assemble
 from harness.processes import supervisor
 from harness.processes.measurement import _believed, measured, scratch_folder
 from harness.processes.protocol import ForeignReplyError, checked_answer, event_of
@@ -37,7 +37,7 @@ PLUGIN = ATTACKERS
 START = [sys.executable, "-P", str(PLUGIN)]
 ATTACKERS = load_plugin(PLUGIN)
 TINY = ATTACKERS.problems["tiny"]
-CASE = CaseName(family="tiny", params=dict(TINY.defaults), form="plain")
+CASE = assemble(TINY, {}, "plain")
 
 FOREIGN = "came, expected 'timed'"
 SUSPECT = "is kept between measurements"
@@ -168,7 +168,7 @@ class Bench:
             log = self.folder / f"{solver}.log"
             self.workers[solver] = WorkerProcess(command or [*START, solver], log)
         record = new_record(
-            CASE, "tiny/plain", SolverSpec(name=solver, label=solver),
+            CASE, SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
         ).but(qp=self.digest)  # fmt: skip
         request = dict(
@@ -325,7 +325,7 @@ class Silent:
 def attack(out, *solvers):
     given = suite(*solvers)
     run(
-        given, families={"tiny": TINY}, out=out, environment={"machine": "test"},
+        given, out=out, environment={"machine": "test"},
         commands=Commands(
             solvers={s: [*START, s] for s in solvers}, generator=[*START, "generator"]
         ),

@@ -2,11 +2,13 @@ import json
 import os
 import resource
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
 from harness import InputError, Record, Verdict
-from harness.names import CaseName
+from harness.names import assemble
+from harness.plugin import as_family
 from harness.registry import SolverSpec
 from harness.results.journal import Journal, read_journal
 from harness.verify.verdicts import new_record
@@ -155,8 +157,9 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
 
 def test_a_measurement_has_the_name_that_older_folders_give_it():
     """Or a folder that goes on would measure everything once more."""
+    box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(
-        CaseName(family="box", params={"n": 3}, form="dual"), "box/n=3/dual",
+        assemble(as_family(box), {"n": 3}, "dual"),
         SolverSpec(name="osqp", label="osqp"), options={"max_iter": 100}, tol=1e-6,
         repeat=2, environment="e",
     )  # fmt: skip

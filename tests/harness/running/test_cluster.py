@@ -305,8 +305,10 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
         "from mortarbench.registries import Registries; "
+        "from harness.plugin import as_family; "
+        "families = {k: as_family(f) for k, f in toy_problem.PROBLEMS.items()}; "
         "nothing = {'reference': None}; "
-        "main(Registries(families=toy_problem.PROBLEMS, solvers=toy_problem.SOLVERS, "
+        "main(Registries(families=families, solvers=toy_problem.SOLVERS, "
         "report=lambda *_, **__: [], **nothing, "
         "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:])"
     )

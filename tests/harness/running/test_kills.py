@@ -47,7 +47,7 @@ suite = load_suite(Path(sys.argv[1]), plugin.problems, plugin.solvers)
 try:
     with shown_on(sys.stderr) as progress:
         run(
-            suite, families=plugin.problems, out=Path(sys.argv[2]),
+            suite, out=Path(sys.argv[2]),
             commands=Commands(
                 solvers={{s.label: [*start, s.name] for s in suite.solvers}},
                 generator=[*start, "generator"],

@@ -18,7 +18,7 @@ import pytest
 from harness import InputError, Status, Verdict
 from harness.errors import FaultError
 from harness.files.store import load_fields, load_solution
-from harness.names import CaseName
+from harness.names import assemble
 from harness.processes import measurement as remote
 from harness.registry import SolverSpec, load_plugin, resolve
 from harness.results.faults import left, read_faults
@@ -70,7 +70,6 @@ class Tally:
 
 
 def suite(*solvers, cases=({},), **changes):
-    defaults = FAMILIES["tiny"].defaults
     fixed = Suite(
         name="test",
         tolerances=(1e-6,),
@@ -78,10 +77,7 @@ def suite(*solvers, cases=({},), **changes):
         time_limit=30.0,
         memory_limit=2000.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
-        cases=tuple(
-            CaseName(family="tiny", params={**defaults, **case}, form="plain")
-            for case in cases
-        ),
+        cases=tuple(assemble(FAMILIES["tiny"], case, "plain") for case in cases),
         text='name = "test"\n',
     )
     return replace(fixed, **changes)
@@ -105,7 +101,6 @@ def measure(tmp_path):
         tally = Tally(interrupt_after, after, act)
         missing = run(
             suite,
-            families=FAMILIES,
             out=out,
             commands=Commands(
                 solvers={spec.label: [*START, spec.name] for spec in suite.solvers},
@@ -214,8 +209,7 @@ def test_a_record_tells_its_phases_and_where_it_was_measured(measure, tmp_path):
 
 
 def three_steps(*solvers, **changes):
-    steps = [{**FAMILIES["tiny"].defaults, "h": h} for h in (0.5, 1.0, 1.5)]
-    names = [CaseName(family="tiny", params=p, form="plain") for p in steps]
+    names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (0.5, 1.0, 1.5)]
     return suite(*solvers, cases=(), sequences=(tuple(names),), **changes)
 
 
@@ -281,7 +275,7 @@ def test_answers_of_a_sweep_are_judged_at_one_accuracy(measure, tmp_path):
 def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
     measure, tmp_path
 ):
-    sizes = [CaseName(family="sized", params={"n": n}, form="plain") for n in SIZES]
+    sizes = [assemble(FAMILIES["sized"], {"n": n}, "plain") for n in SIZES]
     measure(replace(suite("sleepsbypower", repeats=5), cases=tuple(sizes)))
     (series,) = size_series(read_evidence(tmp_path))
     law = series.time_law("sleepsbypower")

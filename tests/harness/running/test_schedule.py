@@ -1,26 +1,28 @@
 """When there are enough blocks, and how sure one is of a ratio of times."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from harness import Verdict
-from harness.names import CaseName
+from harness.names import assemble
+from harness.plugin import Family
 from harness.registry import SolverSpec
 from harness.running.pairs import paired_ratio, widest
 from harness.running.schedule import Schedule
 from harness.suite.suite import Suite
 
 
-@dataclass(frozen=True)
-class Family:
-    name: str = "f"
-    forms: tuple = ("p",)
+class Squares(Family):
+    name, defaults, forms = "f", {"n": 1}, ("p",)
 
-    @property
-    def defaults(self):
-        return {"n": 1}
+    def build(self, form, params, reference):
+        raise NotImplementedError
+
+
+def cases_of(*sizes):
+    return tuple(assemble(Squares(), {"n": n}, "p") for n in sizes)
 
 
 class Quiet:
@@ -40,11 +42,11 @@ def planned(**changes):
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
-        cases=(CaseName(family="f", params={"n": 1}, form="p"),), text="",
+        cases=cases_of(1), text="",
     )  # fmt: skip
     suite = replace(suite, **changes)
     return Schedule(
-        suite=suite, families={"f": Family()}, environment="e", progress=Quiet(),
+        suite=suite, environment="e", progress=Quiet(),
         options={s.label: {} for s in suite.solvers},
     )  # fmt: skip
 
@@ -79,7 +81,7 @@ def test_who_was_first_in_a_block_is_last_in_the_next():
 def test_of_a_sequence_the_whole_is_compared():
     """Its steps are noisy, but what one takes longer the other takes less."""
     rng = np.random.default_rng(161803)
-    steps = tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2))
+    steps = cases_of(1, 2)
     schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
     blocks = 0
     for block in schedule.blocks():
@@ -104,7 +106,7 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
     """After every number of measurements; blocks keep their numbers apart."""
     suite = dict(
         tolerances=(1e-4, 1e-6), repeats=2,
-        cases=tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2)),
+        cases=cases_of(1, 2),
     )  # fmt: skip
     every = records_of(planned(**suite).blocks())
     assert len({r.run_id for r in every}) == planned(**suite).cells == 2 * 2 * 2 * 2
@@ -134,14 +136,14 @@ def test_a_solver_that_declined_a_case_is_not_asked_again():
 
 
 def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
-    cases = tuple(CaseName(family="f", params={"n": n}, form="p") for n in (1, 2))
+    cases = cases_of(1, 2)
     schedule = planned(cases=cases)
     blocks = schedule.blocks()
     failed = next(blocks)
 
     assert schedule.give_up(failed)
     assert not schedule.give_up(failed)  # known by now
-    assert [b.cases for b in blocks] == 3 * [cases[1:]]
+    assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
 def test_each_block_says_what_it_is_before_it_starts():

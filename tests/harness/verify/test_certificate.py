@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from harness import Mechanics, Solution, Status, UncertifiableError, certify
-from harness.build import build
 from harness.files.store import write_point
 from harness.mechanics import Extended, Real
 from harness.names import parse
@@ -62,8 +61,7 @@ class Known:
 
 @cache
 def known(name: str) -> Known:
-    family = PROBLEMS[name.partition("/")[0]]
-    case = build(parse(f"{name}/primal", PROBLEMS), family, reference_solution)
+    case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     point = reference_point(case.mechanics, reference_solution)
     return Known(case.mechanics, point)
@@ -162,8 +160,7 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
     """Bound over true error of the pairs that solvers return at 1e-3 to 1e-8."""
     problem, found = known(name), []
-    family = PROBLEMS[name.partition("/")[0]]
-    case = build(parse(f"{name}/{form}", PROBLEMS), family, reference_solution)
+    case = parse(f"{name}/{form}", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     for solver in (SOLVERS[label] for label in labels):
         if solver.declines(case.qp) is not None:
@@ -213,8 +210,7 @@ def test_so_are_those_of_the_fleet(name):
     ],
 )
 def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
-    family = PROBLEMS[name.partition("/")[0]]
-    case = build(parse(name, PROBLEMS), family, reference_solution)
+    case = parse(name, PROBLEMS).build(reference_solution)
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
     assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6
 
@@ -267,10 +263,10 @@ def test_the_same_point_is_certified_once_and_another_one_anew(tmp_path, monkeyp
 
     monkeypatch.setattr(generator, "certified", counted)
     name = parse("beam-ring/Nr=4/Nh=3/step=1/dual", PROBLEMS)
-    of = {"family": name.family, "params": dict(name.params), "form": name.form}
+    of = {"family": name.family.name, "params": dict(name.params), "form": name.form}
     at = {"describe": of, "point": str(tmp_path / "s.npz"), "fields": None, "keep": 1}
     made = generator.CaseWorker(PROBLEMS, reference_solution)
-    qp = build(name, PROBLEMS[name.family], reference_solution).qp
+    qp = name.build(reference_solution).qp
     s = SOLVERS["clarabel"].prepare(qp, 1e-8)()
 
     def bounds(point):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from harness import Case, Solution, Status, UncertifiableError, certify
-from harness.build import build
 from harness.mechanics import Extended, Mechanics, Real, _cancelling
 from harness.names import parse
 from harness.verify.admissible import _newton, admissible, balanced
@@ -26,8 +25,7 @@ ROUNDED = 1 + 1e-9
 
 
 def named(name: str) -> Case:
-    family = PROBLEMS[name.partition("/")[0]]
-    return build(parse(f"{name}/primal", PROBLEMS), family, reference_solution)
+    return parse(f"{name}/primal", PROBLEMS).build(reference_solution)
 
 
 disc = partial(partial, disc_between_plates)

@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Solution, Status, Verdict
-from harness.names import CaseName
+from harness.names import CaseId
 from harness.registry import SolverSpec
 from harness.verify.certificate import UncertifiableError
 from harness.verify.measure import Measurement
@@ -28,10 +28,11 @@ POINT = Solution(
 
 
 def record(tol=1e-8, options=None, **changes):
-    name = CaseName(family="f", params={"n": 1}, form="p")
+    family = SimpleNamespace(name="f")
+    name = CaseId(family=family, name="f/p", params={"n": 1}, form="p")
     spec = SolverSpec(name="s", label="s")
     return new_record(
-        name, "f/p", spec, options=options or {}, tol=tol,
+        name, spec, options=options or {}, tol=tol,
         **dict(repeat=0, environment="e") | changes,
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, vstack
 
 from harness import InputError, kkt_residuals
 from harness.files.qpfile import load_qp, save_qp
-from harness.names import assemble, canonical, parse
+from harness.names import assemble, parse
 from harness.registry import SolverSpec, resolve
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
@@ -61,7 +61,7 @@ ENDATA
 
 def build(text):
     name = parse(text, PROBLEMS)
-    return PROBLEMS[name.family].build(name.form, name.params, reference_solution)
+    return name.build(reference_solution)
 
 
 def solved(qp):
@@ -327,7 +327,7 @@ def test_all_after_the_colon_is_the_path_and_the_canonical_name(written):
     name = parse(text, PROBLEMS)
 
     assert name.params["path"] == "a b=c:1.qps"
-    assert canonical(name, family) == text
+    assert str(name) == text
     assert assemble(family, {"path": "a b=c:1.qps"}, "qp") == name
 
 

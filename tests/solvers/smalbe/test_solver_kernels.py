@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from solvers.smalbe import kernels
-from solvers.smalbe.products import product
+from solvers.smalbe.projected import product
 
 
 @pytest.fixture
