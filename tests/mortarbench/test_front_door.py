@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ import mortarbench as mb
 from harness import Verdict
 from harness.results.journal import read_journal
 from mortarbench.listing import CATALOGUE, described
+from mortarbench.progress import remaining, shown
 from mortarbench.registries import Registries
 from solvers import SOLVERS
 from tests.support import ROOT, TOY_PROBLEM
@@ -282,3 +284,54 @@ def test_a_wheel_does_without_the_checkout(tmp_path):
 
     assert done.stdout.split() == ["12", "out/smoke/report/index.html"]
     assert (empty / "out/smoke/report/index.html").is_file()
+
+
+class _Display:
+    """Stands for IPython's: keeps what was shown last."""
+
+    def __init__(self):
+        self.shown = ""
+
+    def __call__(self, thing, *, display_id):
+        assert display_id
+        self.update(thing)
+        return self
+
+    def update(self, thing):
+        self.shown = thing._repr_html_()
+
+
+def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
+    monkeypatch, results
+):
+    display = _Display()
+    shell = SimpleNamespace(config={"IPKernelApp": {}})
+    ipython = SimpleNamespace(get_ipython=lambda: shell)
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(
+        sys.modules, "IPython.display", SimpleNamespace(display=display)
+    )
+    good = results.records[0]
+    bad = good.but(status=Verdict.WRONG, solver="<osqp>")
+
+    with shown(None) as progress:
+        progress.start(2)
+        progress.advance(good)
+        progress.advance(bad)
+
+    assert "<progress value='2' max='2'></progress> 2/2" in display.shown
+    assert display.shown.count("<div>") == 1
+    assert "&lt;osqp&gt; on well/primal: wrong" in display.shown
+
+
+@pytest.mark.parametrize(
+    ("done", "total", "seconds", "said"),
+    [
+        (0, 9, 1.0, ""),
+        (9, 9, 1.0, ""),
+        (1, 61, 60.0, "1:00:00 left"),
+        (2, 4, 7, "0:00:07 left"),
+    ],
+)
+def test_what_is_left_takes_as_long_as_what_is_done(done, total, seconds, said):
+    assert remaining(done, total, seconds) == said
