@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from matplotlib.figure import Figure
-
 from harness import Record
+from reports.document.fields import FieldFigure
+from reports.document.figure import Figure
 from reports.document.formatting import ABSENT, clean
 
 _RUN = "run "  #: before the run_ids in a title
@@ -51,13 +51,12 @@ class Table:
 class Picture:
     """A figure, its file name without ending, and its caption.
 
-    The page reads curves back from the figure (`reports.render.plots`) and draws them
-    so that one can zoom; what it cannot read, it shows as it is.
+    The page draws curves so that one can zoom; bodies it shows as the file does.
     """
 
     name: str
     caption: str
-    figure: Figure
+    figure: Figure | FieldFigure
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from collections.abc import Sequence
+from dataclasses import replace
 
 from reports.data.evidence import Evidence, Outcome
-from reports.figures.provenance import behind
-from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
+from reports.document.figure import (
+    INK,
+    Figure,
+    Key,
+    Legend,
+    Look,
+    Panel,
+    Row,
+    Rule,
+    Series,
+    Text,
+)
+from reports.figures.style import LEGEND_LINE, legible, log, look, run_ids
 
 CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
+_LEAST = 1e-10  #: worst residuals over the tolerance below, zero among them
 
 
 def accuracy_figure(evidence: Evidence) -> Figure | None:
@@ -21,48 +29,43 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
     shown = [o for o in evidence.flat if o.worst is not None and o.seconds("total")]
     if not shown:
         return None
-    with rc_context(STYLE):
-        names = list(dict.fromkeys(o.solver for o in shown))
-        figure = Figure(figsize=(6.9, max(3.2, 0.5 + LEGEND_LINE * len(names))))
-        axes = figure.subplots()
-        crowd = {"markersize": 2.6, "alpha": 0.5} if len(shown) > CROWDED else {}
-        for index, solver in enumerate(evidence.solvers):
-            mine = [o for o in shown if o.solver == solver]
-            style = look(index, line=False) | crowd
-            _scatter(axes, [o for o in mine if o.verified], style=style)
-            refuted = {**style, "markerfacecolor": "none"}
-            _scatter(axes, [o for o in mine if not o.verified], style=refuted)
-        axes.axhline(evidence.factor, color=INK, linewidth=0.8)
-        axes.annotate(
-            "verified below",
-            (0.995, evidence.factor),
-            xycoords=("axes fraction", "data"),
-            xytext=(0, -3),
-            textcoords="offset points",
-            va="top",
-            ha="right",
-            fontsize=8.5,
-        )
-        log_log(axes, "median total time in s", "worst residual / tolerance")
-        keys = [
-            Line2D([], [], **look(evidence.solvers.index(s), line=False)) for s in names
-        ]
-        figure.legend(
-            keys,
-            [legible(s) for s in names],
-            loc="outside right upper",
-        )
-    return figure
+    names = list(dict.fromkeys(o.solver for o in shown))
+    looks = {s: replace(look(i), dash=None) for i, s in enumerate(evidence.solvers)}
+    crowded = len(shown) > CROWDED
+    marks = []
+    for solver in (s for s in evidence.solvers if s in names):
+        mine = [o for o in shown if o.solver == solver]
+        size, opacity = (2.6, 0.5) if crowded else (4.5, 0.85)
+        filled = replace(looks[solver], size=size, opacity=opacity)
+        for verified, style in ((True, filled), (False, replace(filled, fill="none"))):
+            if chosen := [o for o in mine if o.verified is verified]:
+                marks.append(_points(chosen, style))
+    panel = Panel(
+        x=log("median total time in s"),
+        y=log("worst residual / tolerance"),
+        marks=tuple(marks),
+        rules=(Rule(axis="y", at=evidence.factor, look=Look(colour=INK, width=0.8)),),
+        texts=(
+            Text(
+                text="verified below", place=(0.995, evidence.factor),
+                inside=(True, False), offset=(0, -3), align=("right", "top"),
+            ),
+        ),
+    )  # fmt: skip
+    keys = tuple(Key(label=legible(s), look=looks[s], solver=s) for s in names)
+    return Figure(
+        rows=(Row(panels=(panel,)),),
+        height=max(3.2, 0.5 + LEGEND_LINE * len(names)),
+        legend=Legend(keys=keys, place="right"),
+    )
 
 
-def _scatter(axes: Axes, outcomes: list[Outcome], *, style: dict[str, Any]) -> None:
-    """Plot (median time, worst residual / tolerance), zero raised to 1e-10."""
+def _points(outcomes: Sequence[Outcome], style: Look) -> Series:
+    """Median time, and worst residual over tolerance, of a solver's answers."""
     points = [
-        (t.value, max((o.worst or 0.0) / o.tol, 1e-10), o.records)
+        (t.value, max((o.worst or 0.0) / o.tol, _LEAST), run_ids(o.records))
         for o in outcomes
         if (t := o.seconds("total")) is not None
     ]
-    if points:
-        x, y, runs = zip(*points, strict=True)
-        (line,) = axes.plot(x, y, **({"alpha": 0.85} | style))
-        behind(line, runs)
+    x, y, runs = zip(*points, strict=True)
+    return Series(x=x, y=y, runs=runs, look=style, solver=outcomes[0].solver)

@@ -1,52 +1,40 @@
-"""Pictures of deformed bodies."""
+"""Deformed bodies: meshes, their outlines, their stress, the forces between them."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
-from matplotlib import colormaps, patheffects, rc_context
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from harness import Fields, InputError, Vector
-from reports.figures.saving import save
-from reports.figures.style import INK, STYLE
+from reports.document.fields import (
+    ColourField,
+    ColourScale,
+    FieldFigure,
+    FieldMark,
+    FieldPanel,
+    Label,
+    Path,
+    Points,
+    Polygons,
+    Strokes,
+    Vectors,
+)
+from reports.document.figure import INK, Look
 
 PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corners
 SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them
 _MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
-_MAP = colormaps["viridis"]
 _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
-_CASING: list[patheffects.AbstractPathEffect] = [
-    patheffects.withStroke(linewidth=1.6, foreground="white")
-]
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
 _FLAT = 0.34  #: height over width of the enlargement
-
-
-def draw_deformed(fields: Fields, path: Path) -> None:
-    """Draw the deformed bodies with their von Mises stress to a png, pdf or svg file.
-
-    Raises
-    ------
-    InputError
-        When the ending is none of these, or the displacement is not finite.
-
-    """
-    if path.suffix not in {".png", ".pdf", ".svg"}:
-        raise InputError(
-            f"{path}: unknown kind of picture {path.suffix!r}; known: .pdf, .png, .svg"
-        )
-    save(deformed_figure(fields), path)
+_PLAIN = ColourScale(colours="Greys", low=0, high=1)
+_OUTLINE = Look(colour=INK, width=0.7)
+_BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
@@ -57,8 +45,15 @@ def clipped_at(fields: Fields) -> tuple[float, float] | None:
     return float(np.percentile(stress, PERCENTILE)), float(np.max(stress))
 
 
-def deformed_figure(fields: Fields) -> Figure:
-    """Draw all bodies, and their contact enlarged where contact forces are given."""
+def deformed_figure(fields: Fields) -> FieldFigure:
+    """Show all bodies, and their contact enlarged where contact forces are given.
+
+    Raises
+    ------
+    InputError
+        When displacement or stress is not finite, or the bodies have no extent.
+
+    """
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError("displacement or stress holds NaN or inf: there is no picture")
@@ -66,54 +61,62 @@ def deformed_figure(fields: Fields) -> Figure:
         raise InputError("bodies of no width or no height: there is no picture")
     forces = fields.contact_forces
     loaded = forces is not None and bool(np.any(forces))
-    with rc_context(STYLE):
-        low, high = _box(fields)
-        width, height = high - low
-        pad = 0.02 * width
-        drawn = min(_WIDTH * (height + 2 * pad) / (width + 2 * pad), _TALLEST)
-        enlarged = _WIDTH * _FLAT if loaded else 0.0
-        figure = Figure(figsize=(6.9, drawn + enlarged + (1.24 if loaded else 0.55)))
-        ratios = [drawn, enlarged] if loaded else [drawn]
-        panels = list(
-            figure.subplots(len(ratios), 1, height_ratios=ratios, squeeze=False)[:, 0]
-        )
-        colours = _colours(fields)
-        for axes in panels:
-            _bodies(axes, fields, colours)
-            axes.set(aspect="equal", xlabel="$x$ in m", ylabel="$y$ in m")
-        panels[0].set(
-            xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad)
-        )
-        for loop in outlines(fields.cells):
-            style = {"color": "#8a93a0", "linewidth": 0.7, "dashes": (4, 2.5)}
-            panels[0].plot(*fields.points[loop].T, zorder=1, **style)
-        panels[0].set_title(
-            f"{'(a) ' if loaded else ''}deformed bodies, displacement × {SCALE:g}; "
-            "dashed: undeformed",
-            loc="left",
-        )
-        if loaded:
-            _enlarge(panels[1], panels[0], fields)
-        if colours is not None:
-            _bar(figure, panels, fields, colours)
-    return figure
+    low, high = _box(fields)
+    width, height = high - low
+    pad = 0.02 * width
+    drawn = min(_WIDTH * (height + 2 * pad) / (width + 2 * pad), _TALLEST)
+    enlarged = _WIDTH * _FLAT if loaded else 0.0
+    scale = _scale(fields)
+    bodies = _bodies(fields, scale)
+    before, after = (
+        [Path(points=points[loop], look=style) for loop in outlines(fields.cells)]
+        for points, style in ((fields.points, _BEFORE), (moved(fields), _OUTLINE))
+    )
+    corners = low - pad, high + pad
+    overview = FieldPanel(
+        low=_pair(corners[0]), high=_pair(corners[1]),
+        marks=(*bodies, *before, *after, *(_frame(fields, *corners) if loaded else ())),
+        title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {SCALE:g}; "
+        "dashed: undeformed",
+        xlabel="$x$ in m", ylabel="$y$ in m",
+    )  # fmt: skip
+    return FieldFigure(
+        panels=(overview, _enlarged(fields, (*bodies, *after)))
+        if loaded
+        else (overview,),
+        height=drawn + enlarged + (1.24 if loaded else 0.55),
+        heights=(drawn, enlarged) if loaded else (drawn,),
+        scale=scale,
+    )
 
 
-def _deformed(fields: Fields) -> NDArray[np.float64]:
-    moved: NDArray[np.float64] = fields.points + SCALE * fields.displacement
-    return moved
+def moved(fields: Fields) -> Points:
+    """(n, 2) where the displacement puts the nodes."""
+    return cast(Points, fields.points + SCALE * fields.displacement)
+
+
+def _pair(point: Vector) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
 
 
 def _box(fields: Fields) -> tuple[Vector, Vector]:
     """Lower left and upper right corner of the bodies, before and after."""
-    both = np.vstack([fields.points, _deformed(fields)])
+    both = np.vstack([fields.points, moved(fields)])
     return both.min(axis=0), both.max(axis=0)
 
 
-def _colours(fields: Fields) -> Normalize | None:
+def _scale(fields: Fields) -> ColourScale | None:
     """One scale in Pa, shared by all bodies."""
     limits = clipped_at(fields)
-    return None if limits is None else Normalize(0, limits[0] or 1.0)
+    if limits is None:
+        return None
+    clipped, largest = limits
+    factor, prefix = _prefixed(clipped)
+    return ColourScale(
+        colours="viridis", low=0, high=clipped or 1.0, unit=factor,
+        label=f"von Mises stress in {prefix}Pa",
+        beyond="max" if largest > clipped else "neither",
+    )  # fmt: skip
 
 
 def _prefixed(value: float) -> tuple[float, str]:
@@ -122,31 +125,32 @@ def _prefixed(value: float) -> tuple[float, str]:
     return next((p for p in known if value >= p[0]), (1.0, ""))
 
 
-def _bodies(axes: Axes, fields: Fields, colours: Normalize | None) -> None:
-    """Draw every body: stress, mesh and outline, deformed."""
-    moved = _deformed(fields)
+def _bodies(fields: Fields, scale: ColourScale | None) -> list[FieldMark]:
+    """Show every body: stress and mesh, deformed."""
+    points = moved(fields)
+    stress = np.full(len(points), 0.3) if scale is None else fields.nodal["von_mises"]
+    marks: list[FieldMark] = []
     for body in np.unique(fields.bodies):
         cells = fields.cells[fields.bodies == body]
-        triangles = np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
-        mesh = Triangulation(moved[:, 0], moved[:, 1], triangles)
-        stress = np.full(len(moved), 0.3)
-        plain = Normalize(0, 1)
-        axes.tripcolor(
-            mesh,
-            stress if colours is None else fields.nodal["von_mises"],
-            cmap="Greys" if colours is None else _MAP,
-            norm=plain if colours is None else colours,
-            shading="gouraud",
-            rasterized=True,
-        )
-        if len(fields.cells) <= _MESH_SHOWN:
-            lines = LineCollection(
-                list(moved[edges(cells)]), color="white", linewidth=0.25, alpha=0.35
+        marks.append(
+            ColourField(
+                points=points, triangles=triangles(cells), values=stress,
+                scale=scale or _PLAIN,
             )
-            lines.set_rasterized(True)
-            axes.add_collection(lines)
-    for loop in outlines(fields.cells):
-        axes.plot(*moved[loop].T, color=INK, linewidth=0.7, zorder=3)
+        )  # fmt: skip
+        if len(fields.cells) <= _MESH_SHOWN:
+            ends = points[edges(cells)]
+            marks.append(
+                Strokes(
+                    ends=ends, colour="white", width=0.25, opacity=0.35, rasterised=True
+                )
+            )
+    return marks
+
+
+def triangles(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Halve quadrilaterals: (2E, 3) node numbers."""
+    return np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
 
 
 def edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -182,62 +186,54 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
-def _enlarge(axes: Axes, overview: Axes, fields: Fields) -> None:
-    """Zoom to the loaded contact nodes and draw the force on each as an arrow."""
+def _loaded(fields: Fields) -> tuple[Points, Points]:
+    """Places of the loaded contact nodes, and the forces on them, N/m."""
     assert fields.contact_nodes is not None
     assert fields.contact_forces is not None
     size = np.hypot(*fields.contact_forces.T)
     active = size > _ACTIVE * size.max()
-    tips = _deformed(fields)[fields.contact_nodes[active]]
-    middle = (tips.min(axis=0) + tips.max(axis=0)) / 2
-    reach = max(0.75 * float(np.ptp(tips, axis=0).max()), 0.06 * _span(fields))
-    half = np.array([reach, _FLAT * reach])
-    low, high = middle - half, middle + half
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.spines[["top", "right"]].set_visible(True)
-    unit = 0.8 * half[1] / size.max()
-    arrows = axes.quiver(
-        *tips.T, *(unit * fields.contact_forces[active]).T, angles="xy", pivot="tip",
-        scale_units="xy", scale=1, width=0.0032 if len(tips) < 25 else 0.002,
-        color=_ARROW, zorder=5,
-    )  # fmt: skip
-    arrows.set_path_effects(_CASING)
-    factor, prefix = _prefixed(float(size.max()))
-    axes.set_title(
-        "(b) contact forces on the slave nodes; the largest is "
-        f"{size.max() / factor:.3g} {prefix}N/m",
-        loc="left",
-    )
-    corner = np.array([overview.get_xlim(), overview.get_ylim()]).T
-    low, high = np.maximum(low, corner[0]), np.minimum(high, corner[1])
-    frame = Rectangle((low[0], low[1]), *(high - low), fill=False, ec=_ARROW, lw=0.8)
-    frame.set(zorder=4, path_effects=_CASING)
-    overview.add_patch(frame)
-    overview.annotate(
-        "(b)", (high[0], high[1]), xytext=(3, 0), textcoords="offset points",
-        color=_ARROW, path_effects=_CASING, va="top",
-    )  # fmt: skip
+    return moved(fields)[fields.contact_nodes[active]], fields.contact_forces[active]
 
 
-def _span(fields: Fields) -> float:
+def _corners(fields: Fields) -> tuple[Vector, Vector]:
+    """Lower left and upper right corner of the enlargement."""
+    tips, _ = _loaded(fields)
     low, high = _box(fields)
-    return float((high - low).max())
+    span = float((high - low).max())
+    middle = (tips.min(axis=0) + tips.max(axis=0)) / 2
+    reach = max(0.75 * float(np.ptp(tips, axis=0).max()), 0.06 * span)
+    half = np.array([reach, _FLAT * reach])
+    return middle - half, middle + half
 
 
-def _bar(
-    figure: Figure, panels: list[Axes], fields: Fields, colours: Normalize
-) -> None:
-    limits = clipped_at(fields)
-    assert limits is not None
-    bar = figure.colorbar(
-        ScalarMappable(norm=colours, cmap=_MAP),
-        ax=panels,
-        extend="max" if limits[1] > limits[0] else "neither",
-        aspect=32,
-        pad=0.015,
-        fraction=0.04,
-    )
-    factor, prefix = _prefixed(limits[0])
-    bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value / factor:.4g}")
-    bar.set_label(f"von Mises stress in {prefix}Pa")
-    bar.outline.set_linewidth(0.5)
+def _enlarged(fields: Fields, bodies: Sequence[FieldMark]) -> FieldPanel:
+    """Zoom to the loaded contact nodes and show the force on each as an arrow."""
+    tips, forces = _loaded(fields)
+    low, high = _corners(fields)
+    largest = float(np.hypot(*forces.T).max())
+    drawn = 0.4 * (high - low)[1] / largest * forces
+    arrows = Vectors(
+        feet=tips - drawn, vectors=drawn, width=0.0032 if len(tips) < 25 else 0.002,
+        colour=_ARROW, cased=True,
+    )  # fmt: skip
+    factor, prefix = _prefixed(largest)
+    return FieldPanel(
+        low=_pair(low), high=_pair(high), marks=(*bodies, arrows), axes="frame",
+        title="(b) contact forces on the slave nodes; the largest is "
+        f"{largest / factor:.3g} {prefix}N/m",
+        xlabel="$x$ in m", ylabel="$y$ in m",
+    )  # fmt: skip
+
+
+def _frame(fields: Fields, least: Vector, most: Vector) -> tuple[FieldMark, ...]:
+    """Outline the enlargement in the overview."""
+    low, high = _corners(fields)
+    (x0, y0), (x1, y1) = np.maximum(low, least), np.minimum(high, most)
+    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+    return (
+        Polygons(corners=(corners,), edge=_ARROW, width=0.8, cased=True),
+        Label(
+            text="(b)", place=_pair(corners[2]), offset=(3, 0), align=("left", "top"),
+            colour=_ARROW, cased=True,
+        ),
+    )  # fmt: skip

@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
-from matplotlib.lines import Line2D
 
 from reports.data.aggregation import Ranking
-from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_ticks, look
-from reports.statistics.profiles import Array, Curve, curve, performance_ratios
+from reports.document.figure import (
+    INK,
+    Area,
+    Axis,
+    Figure,
+    Key,
+    Look,
+    Mark,
+    Panel,
+    Row,
+    Series,
+    in_rows,
+    numbers,
+)
+from reports.figures.style import LEGEND_LINE, below, legible, look
+from reports.statistics.profiles import Array, curve, performance_ratios
 
 ROW = 4  #: solvers that are told apart in one panel, with their bands
 ROWS = 4  #: of panels; further solvers are grey in all of them
 PAIRS = 6  #: panels of two solvers
 BANDED = 20  #: cases; with fewer, bands of more than two solvers hide each other
 _COLUMNS = 3  #: of those
-_GREY = "#d3d7dc"
+_GREY = Look(colour="#d3d7dc", width=0.5)
 _COARSE = 60  #: points of a grey curve, of which there may be hundreds
 
 #: up to which ratio to use which ticks; beyond, powers of ten
@@ -30,7 +40,11 @@ _FACTORS = {
     60.0: (1, 2, 5, 10, 20, 50),
 }
 
-Place = tuple[float, float]  #: ends of an axis
+_SHARES = Axis(
+    low=0, high=1.03, ticks=((0, "0.0"), (0.5, "0.5"), (1, "1.0")), shared="shares"
+)
+
+Ends = tuple[float, float]  #: of an axis
 
 
 def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
@@ -40,7 +54,7 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
     """
     rows: list[dict[str, int]] = []
     for i in map(int, ranking.order[: ROW * ROWS]):
-        colour = look(solvers.index(ranking.group.solvers[i]))["color"]
+        colour = look(solvers.index(ranking.group.solvers[i])).colour
         free = (row for row in rows if len(row) < ROW and colour not in row)
         row = next(free, None)
         if row is None:
@@ -67,31 +81,33 @@ def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     ratios = performance_ratios(group.times)
     known = group.times[group.solved]
     span = (float(known.min()) / 1.3, 1.3 * float(known.max()))
-    sides = (
-        (ratios, (1.0, _end(ratios)), "time / best time of the case"),
-        (group.times, span, "time in s"),
-    )
-    rows = rows_of(ranking, solvers)
-    heights = [1.9 + LEGEND_LINE] * len(rows)
-    heights[-1] += LEGEND_LINE  # for the labels of the axes
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, sum(heights)))
-        parts = figure.subfigures(len(rows), 1, height_ratios=heights, squeeze=False)
-        for part, mine in zip(parts[:, 0], rows, strict=True):
-            panels = part.subplots(1, 2, sharey=True)
-            for axes, (values, ends, name) in zip(panels, sides, strict=True):
-                _others(axes, values, mine, ends)
-                for i in mine:
-                    style = look(solvers.index(group.solvers[i]))
-                    drawn = curve(values[:, i], *ends)
-                    _profile(axes, drawn, style, band=banded(ranking))
-                _dress(axes, ends, name if mine is rows[-1] else "")
-                if values is ratios:
-                    _factors(axes, ends[1])
-            panels[0].set_ylabel("share of cases")
-            names = [group.solvers[i] for i in mine]
-            _legend(part, names, [look(solvers.index(name)) for name in names])
-    return figure
+    factors, times = (1.0, _end(ratios)), span
+    found = rows_of(ranking, solvers)
+    rows = []
+    for mine in found:
+        last = mine is found[-1]
+        names = [group.solvers[i] for i in mine]
+        left: list[Mark] = []
+        right: list[Mark] = []
+        for values, ends, marks in (
+            (ratios, factors, left),
+            (group.times, times, right),
+        ):
+            others = sorted(set(range(len(group.solvers))) - set(mine))
+            marks += [_grey(values[:, i], ends, group.solvers[i]) for i in others]
+            for i, name in zip(mine, names, strict=True):
+                style = look(solvers.index(name))
+                band = banded(ranking)
+                marks += _profile(values[:, i], ends, style, name, band=band)
+        panels = (
+            _panel(_factors("time / best time of the case" * last, factors), left),
+            _panel(_log("time in s" * last, times), right, first=False),
+        )
+        keys = [_key(name, look(solvers.index(name))) for name in names]
+        # the last row has the labels of the axes, too
+        height = 1.9 + LEGEND_LINE * (2 if last else 1)
+        rows.append(Row(panels=panels, height=height, legend=below(keys, ROW)))
+    return Figure(rows=tuple(rows), height=sum(row.height for row in rows))
 
 
 def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
@@ -100,28 +116,25 @@ def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     against = rivals(ranking)
     names = [group.solvers[i] for i in (leader, *against)]
     styles = [look(solvers.index(name)) for name in names]
-    styles[0] |= {"color": INK}
+    styles[0] = replace(styles[0], colour=INK)
     columns = min(len(against), _COLUMNS)
-    lines = -(-len(against) // columns)
-    with rc_context(STYLE):
-        legend = LEGEND_LINE * (1 + -(-len(names) // ROW))
-        figure = Figure(figsize=(6.9, 1.75 * lines + legend))
-        grid = figure.subplots(lines, columns, sharey=True, squeeze=False)
-        for n, axes in enumerate(grid.ravel()):
-            if n >= len(against):
-                axes.set_axis_off()
-                continue
-            ratios = performance_ratios(group.times[:, [leader, against[n]]])
-            ends = (1.0, _end(ratios))
-            _profile(axes, curve(ratios[:, 1], *ends), styles[n + 1])
-            _profile(axes, curve(ratios[:, 0], *ends), styles[0])
-            lowest = n + columns >= len(against)
-            _dress(axes, ends, "time / better of the two" if lowest else "")
-            _factors(axes, ends[1])
-        for axes in grid[:, 0]:
-            axes.set_ylabel("share of cases")
-        _legend(figure, names, styles)
-    return figure
+    panels = []
+    for n, rival in enumerate(against):
+        ratios = performance_ratios(group.times[:, [leader, rival]])
+        ends = (1.0, _end(ratios))
+        lowest = n + columns >= len(against)
+        axis = _factors("time / better of the two" * lowest, ends)
+        marks = _profile(ratios[:, 1], ends, styles[n + 1], names[n + 1])
+        marks += _profile(ratios[:, 0], ends, styles[0], names[0])
+        panels.append(_panel(axis, marks, first=n % columns == 0))
+    rows = in_rows(panels, columns)
+    height = 1.75 * len(rows) + LEGEND_LINE * (1 + -(-len(names) // ROW))
+    keys = [_key(name, style) for name, style in zip(names, styles, strict=True)]
+    return Figure(rows=rows, height=height, legend=below(keys, ROW))
+
+
+def _key(name: str, style: Look) -> Key:
+    return Key(label=legible(name), look=style, solver=name)
 
 
 def _end(ratios: Array) -> float:
@@ -129,48 +142,46 @@ def _end(ratios: Array) -> float:
     return float(max(2.0, 1.1 * ratios[np.isfinite(ratios)].max()))
 
 
-def _others(axes: Axes, values: Array, mine: Sequence[int], ends: Place) -> None:
-    """Draw all the other solvers in grey, behind."""
-    for i in set(range(values.shape[1])) - set(mine):
-        at, share = curve(values[:, i], *ends, points=_COARSE)
-        axes.step(at, share.value, where="post", color=_GREY, linewidth=0.5, zorder=1)
-
-
-def _profile(
-    axes: Axes, drawn: Curve, style: dict[str, Any], *, band: bool = True
-) -> None:
-    """Draw a step function with few markers, and its band."""
-    at, share = drawn
-    if band:
-        axes.fill_between(
-            at, share.low, share.high, step="post", color=style["color"], alpha=0.11,
-            linewidth=0,
-        )  # fmt: skip
-    axes.step(
-        at, share.value, where="post", markevery=(0.07, 0.19), clip_on=False, **style
+def _grey(values: Array, ends: Ends, solver: str) -> Series:
+    """Make the profile of a solver that is told apart in another row."""
+    at, share = curve(values, *ends, points=_COARSE)
+    return Series(
+        x=numbers(at), y=numbers(share.value), look=_GREY, step=True, solver=solver
     )
 
 
-def _dress(axes: Axes, ends: Place, label: str) -> None:
-    axes.set(xscale="log", xlim=ends, ylim=(0, 1.03), yticks=[0, 0.5, 1], xlabel=label)
-    axes.grid(visible=True, color="#8a93a0", alpha=0.3, linewidth=0.4)
-    axes.set_axisbelow(True)
-    log_ticks(axes.xaxis)
+def _profile(
+    values: Array, ends: Ends, style: Look, solver: str, *, band: bool = True
+) -> list[Mark]:
+    """Make a step function with few markers, and its band."""
+    at, share = curve(values, *ends)
+    x = numbers(at)
+    line = Series(
+        x=x, y=numbers(share.value), look=style, step=True, few=True, clipped=False,
+        solver=solver,
+    )  # fmt: skip
+    if not band:
+        return [line]
+    low, high = numbers(share.low), numbers(share.high)
+    around = Area(
+        x=x, low=low, high=high, colour=style.colour, opacity=0.11, step=True,
+        solver=solver,
+    )  # fmt: skip
+    return [around, line]
 
 
-def _factors(axes: Axes, stop: float) -> None:
+def _panel(axis: Axis, marks: Sequence[Mark], *, first: bool = True) -> Panel:
+    shares = replace(_SHARES, label="share of cases" * first, numbered=first)
+    return Panel(x=axis, y=shares, marks=tuple(marks))
+
+
+def _log(label: str, ends: Ends) -> Axis:
+    return Axis(label=label, log=True, low=ends[0], high=ends[1])
+
+
+def _factors(label: str, ends: Ends) -> Axis:
     """Label an axis of ratios, which begins at 1, as one says them."""
     for last, ticks in _FACTORS.items():
-        if stop <= last:
-            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-            axes.set_xticks([], minor=True)
-            axes.set_xlim(1, stop)
-            return
-
-
-def _legend(
-    figure: Figure | SubFigure, names: Sequence[str], styles: Sequence[dict[str, Any]]
-) -> None:
-    keys = [Line2D([], [], **style) for style in styles]
-    labels = [legible(name) for name in names]
-    figure.legend(keys, labels, loc="outside lower center", ncols=ROW)
+        if ends[1] <= last:
+            return replace(_log(label, ends), ticks=tuple((t, f"{t:g}") for t in ticks))
+    return _log(label, ends)

@@ -2,51 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from math import lcm
-from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-
+from harness import Record
+from reports.document.figure import INK, Axis, Key, Legend, Look
 from reports.document.formatting import clean
 
-INK = "#20242a"  #: text and axes; the page replaces it by its own text colour
 #: Okabe & Ito's colours without yellow and black: distinct for colour-blind readers.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-DASHES = ("-", "--", "-.", (0, (4, 1, 1, 1, 1, 1)), (0, (1, 1)))
-
-STYLE: Any = {
-    "font.family": ["STIXGeneral", "DejaVu Sans"],
-    "mathtext.fontset": "stix",
-    "font.size": 9.5,
-    "axes.titlesize": 9.5,
-    "legend.fontsize": 9,
-    "legend.frameon": False,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "axes.facecolor": "none",
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.minor.width": 0.4,
-    "ytick.minor.width": 0.4,
-    "lines.linewidth": 1.1,
-    "lines.markersize": 4.5,
-    "figure.facecolor": "none",
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 220,
-    "svg.hashsalt": "mortarbench",
-    "svg.fonttype": "path",
-    "pdf.fonttype": 42,
-}
+DASHED, DOTTED = (3.7, 1.6), (1.0, 1.65)
+DASHES = ((), DASHED, (6.4, 1.6, 1.0, 1.6), (4, 1, 1, 1, 1, 1), (1, 1))
+GUIDE = Look(colour=INK, width=0.6)  #: lines to compare with
 LEGEND_LINE = 0.21  #: height of a line of a legend, inches
 
 
@@ -62,32 +30,36 @@ def legible(label: str) -> str:
     return f" {escaped}" if escaped.startswith("_") else escaped
 
 
-def look(index: int, *, line: bool = True) -> dict[str, Any]:
+def look(index: int) -> Look:
     """Colour, marker and dashes of the index-th solver; distinct in grey print too."""
     rounds = index // lcm(len(COLOURS), len(MARKERS))  # of all pairs that come in turn
-    return {
-        "color": COLOURS[index % len(COLOURS)],
-        "marker": MARKERS[(index + rounds) % len(MARKERS)],
-        "linestyle": DASHES[index % len(DASHES)] if line else "none",
-    }
+    return Look(
+        colour=COLOURS[index % len(COLOURS)],
+        marker=MARKERS[(index + rounds) % len(MARKERS)],
+        dash=DASHES[index % len(DASHES)],
+    )
 
 
-def log_log(axes: Axes, xlabel: str, ylabel: str) -> None:
-    """Make both axes logarithmic, with labels that leave each other room."""
-    axes.loglog()
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.grid(visible=True, which="major", color="#8a93a0", alpha=0.3, linewidth=0.4)
-    axes.set_axisbelow(True)
-    for axis in (axes.xaxis, axes.yaxis):
-        log_ticks(axis)
+def log(label: str) -> Axis:
+    """Make a logarithmic axis."""
+    return Axis(label=label, log=True)
 
 
-def log_ticks(axis: Axis) -> None:
-    """Label a logarithmic axis so that labels leave each other room."""
-    low, high = axis.get_view_interval()
-    decades = np.log10(high / low)
-    axis.set_minor_formatter(NullFormatter())
-    if decades < 1.8:
-        few = LogLocator(subs=(1, 2, 5)) if decades > 0.5 else MaxNLocator(4)
-        axis.set_major_locator(few)
-        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+def solver_keys(names: Iterable[str], solvers: Sequence[str]) -> tuple[Key, ...]:
+    """Make the keys of some solvers.
+
+    solvers : of the whole report, which their looks go by
+    """
+    return tuple(
+        Key(label=legible(s), look=look(solvers.index(s)), solver=s) for s in names
+    )
+
+
+def below(keys: Sequence[Key], columns: int, title: str = "") -> Legend:
+    """Put keys below a figure or a row."""
+    return Legend(keys=tuple(keys), columns=columns, title=title)
+
+
+def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
+    """Name the measurements behind a point."""
+    return tuple(r.run_id for r in records)

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
-
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from dataclasses import replace
+from typing import NamedTuple
 
 from harness import Verdict
 from reports.data.evidence import Evidence, Outcome
+from reports.document.figure import (
+    INK,
+    Axis,
+    Figure,
+    Intervals,
+    Key,
+    Look,
+    Panel,
+    Row,
+    Series,
+    categories,
+)
 from reports.document.formatting import (
     TIMED,
     clean,
@@ -21,7 +29,15 @@ from reports.document.formatting import (
     tolerance,
 )
 from reports.document.layout import Cell, Table
-from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
+from reports.figures.style import (
+    LEGEND_LINE,
+    below,
+    legible,
+    log,
+    look,
+    run_ids,
+    solver_keys,
+)
 from reports.sections.cells import source, verdict_cell
 from reports.statistics.intervals import Interval, power_law
 
@@ -89,26 +105,40 @@ def _figure(
         s for s in evidence.solvers if any(_tried(f.get(s)) for f in found.values())
     ]
     failing = [s for s in drawn if any(_failed(f.get(s, ())) for f in found.values())]
-    strip = 0.17 * len(failing) + 0.04
-    lines = -(-(len(drawn) + bool(failing)) // COLUMNS)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 2.9 + strip + LEGEND_LINE * lines))
-        grid = figure.subplots(
-            1 + bool(failing), len(titles), sharex="all" if dofs else "col",
-            sharey="row", squeeze=False, height_ratios=[2.6, strip] if failing else [1],
-        )  # fmt: skip
-        for i, (form, title) in enumerate(titles.items()):
-            axes = grid[0, i]
-            for solver, mine in found[form].items():
-                _curve(axes, mine, look(evidence.solvers.index(solver)), dofs=dofs)
-            log_log(axes, "" if failing else size, "" if i else "time in s")
-            axes.set_title(f"({'abc'[i]}) {title}", loc="left", fontsize=9)
-            if failing:
-                axes.tick_params(axis="x", which="both", bottom=False)
-                _strip(grid[1, i], found[form], failing, evidence)
-                grid[1, i].set_xlabel(size)
-        _legend(figure, evidence, drawn, bool(failing))
-    return figure
+    above, strips = [], []
+    for i, (form, title) in enumerate(titles.items()):
+        axis = Axis(label=size, log=True, shared=size if dofs else form)
+        marks = [
+            _curve(mine, look(evidence.solvers.index(solver)), dofs=dofs)
+            for solver, mine in found[form].items()
+        ]
+        top = replace(axis, label="", numbered=False, marked=False)
+        times = Axis(label="time in s", log=True, shared="time")
+        above.append(
+            Panel(
+                x=top if failing else axis,
+                y=times if i == 0 else replace(times, label="", numbered=False),
+                marks=tuple(mark for mark in marks if mark is not None),
+                title=f"({'abc'[i]}) {title}",
+            )
+        )
+        names = categories([legible(s) for s in failing], line=False, numbered=i == 0)
+        crosses = _crosses(found[form], failing, evidence)
+        strips.append(Panel(x=axis, y=names, marks=crosses, grid="none"))
+    height = 0.17 * len(failing) + 0.04
+    keys = list(solver_keys(drawn, evidence.solvers))
+    rows = [Row(panels=tuple(above), height=2.6)]
+    if failing:
+        rows.append(Row(panels=tuple(strips), height=height))
+        keys.append(
+            Key(label="not verified", look=Look(colour=INK, marker="x", dash=None))
+        )
+    lines = -(-len(keys) // COLUMNS)
+    return Figure(
+        rows=tuple(rows),
+        height=2.9 + height + LEGEND_LINE * lines,
+        legend=below(keys, COLUMNS),
+    )
 
 
 def _tried(mine: Sequence[Place] | None) -> bool:
@@ -122,52 +152,41 @@ def _failed(mine: Sequence[Place]) -> list[Place]:
     return [p for p in kept if not p.outcome.verified]
 
 
-def _curve(axes: Axes, mine: Sequence[Place], style: Any, *, dofs: bool) -> None:
-    """Draw the medians of verified answers with their intervals."""
+def _curve(mine: Sequence[Place], style: Look, *, dofs: bool) -> Series | None:
+    """Make the medians of verified answers with their intervals."""
     points = []
     for place in mine:
         time = place.time if dofs else place.outcome.seconds("total")
         if place.outcome.verified and time is not None:
-            points.append((place.size, time.value, time.low, time.high))
-    if points:
-        x, t, low, high = zip(*points, strict=True)
-        axes.plot(x, t, **style)
-        down = [a - b for a, b in zip(t, low, strict=True)]
-        up = [b - a for a, b in zip(t, high, strict=True)]
-        axes.errorbar(
-            x, t, yerr=[down, up], fmt="none", color=style["color"], capsize=2,
-            elinewidth=0.7,
-        )  # fmt: skip
+            points.append((float(place.size), time, run_ids(place.outcome.records)))
+    if not points:
+        return None
+    sizes, times, runs = zip(*points, strict=True)
+    low, high = tuple(t.low for t in times), tuple(t.high for t in times)
+    return Series(
+        x=sizes, y=tuple(t.value for t in times), look=style, runs=runs,
+        intervals=Intervals(low=low, high=high), solver=mine[0].outcome.solver,
+    )  # fmt: skip
 
 
-def _strip(
-    axes: Axes,
-    found: dict[str, list[Place]],
-    failing: Sequence[str],
-    evidence: Evidence,
-) -> None:
+def _crosses(
+    found: dict[str, list[Place]], failing: Sequence[str], evidence: Evidence
+) -> tuple[Series, ...]:
     """Put a cross where an answer was tried for and not verified, a row per solver."""
+    made = []
     for row, solver in enumerate(failing):
-        colour = look(evidence.solvers.index(solver))["color"]
-        at = [p.size for p in _failed(found.get(solver, ()))]
-        axes.plot(
-            at, [-row] * len(at), "x", color=colour, markersize=5, markeredgewidth=1.2
-        )
-    axes.set(ylim=(-len(failing) + 0.4, 0.6))
-    axes.set_yticks([-r for r in range(len(failing))], [legible(s) for s in failing])
-    axes.tick_params(axis="y", length=0, labelsize=8)
-    axes.spines["left"].set_visible(False)
-
-
-def _legend(
-    figure: Figure, evidence: Evidence, drawn: Sequence[str], failing: bool
-) -> None:
-    keys = [Line2D([], [], **look(evidence.solvers.index(s))) for s in drawn]
-    labels = [legible(s) for s in drawn]
-    if failing:
-        keys.append(Line2D([], [], color=INK, marker="x", linestyle="none"))
-        labels.append("not verified")
-    figure.legend(keys, labels, loc="outside lower center", ncols=COLUMNS)
+        colour = look(evidence.solvers.index(solver)).colour
+        if failed := _failed(found.get(solver, ())):
+            made.append(
+                Series(
+                    x=tuple(float(p.size) for p in failed),
+                    y=(-float(row),) * len(failed),
+                    look=Look(colour=colour, marker="x", dash=None, size=5, edge=1.2),
+                    solver=solver,
+                    runs=tuple(run_ids(p.outcome.records) for p in failed),
+                )
+            )
+    return tuple(made)
 
 
 def fleet_table(evidence: Evidence, form: str) -> Table:
@@ -248,20 +267,33 @@ def _total(place: Place | None) -> Cell:
 def certified_figure(evidence: Evidence) -> Figure:
     """Draw certified errors against times, a line through the tolerances."""
     forms = [f for f in DUALS if places(evidence, f, dofs=True)]
-    with rc_context(STYLE):
-        lines = -(-len(evidence.solvers) // COLUMNS)
-        figure = Figure(figsize=(6.9, 2.9 + LEGEND_LINE * lines))
-        panels = figure.subplots(1, len(forms), sharey=True, squeeze=False)[0]
-        for i, (axes, form) in enumerate(zip(panels, forms, strict=True)):
-            for solver, answers in swept(evidence, form).items():
-                style = look(evidence.solvers.index(solver))
-                points = [(t.value, e) for o, t, e in answers]
-                axes.plot(*zip(*points, strict=True), **style)
-            label = "certified relative error, energy norm"
-            log_log(axes, "median time in s", "" if i else label)
-            axes.set_title(f"({'ab'[i]}) {form}", loc="left")
-        _legend(figure, evidence, evidence.solvers, failing=False)
-    return figure
+    panels = []
+    for i, form in enumerate(forms):
+        marks = []
+        for solver, answers in swept(evidence, form).items():
+            outcomes, times, errors = zip(*answers, strict=True)
+            marks.append(
+                Series(
+                    x=tuple(t.value for t in times), y=errors, solver=solver,
+                    look=look(evidence.solvers.index(solver)),
+                    runs=tuple(run_ids(o.records) for o in outcomes),
+                )
+            )  # fmt: skip
+        error = replace(log("certified relative error, energy norm"), shared="error")
+        panels.append(
+            Panel(
+                x=log("median time in s"),
+                y=error if i == 0 else replace(error, label="", numbered=False),
+                marks=tuple(marks),
+                title=f"({'ab'[i]}) {form}",
+            )
+        )
+    keys = solver_keys(evidence.solvers, evidence.solvers)
+    return Figure(
+        rows=(Row(panels=tuple(panels)),),
+        height=2.9 + LEGEND_LINE * -(-len(keys) // COLUMNS),
+        legend=below(keys, COLUMNS),
+    )
 
 
 def swept(

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import to_rgba
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle, Wedge
-from numpy.typing import NDArray
 
 from harness import Fields
-from reports.figures.deformed import SCALE, edges, outlines
-from reports.figures.style import COLOURS, INK, STYLE
+from reports.document.fields import (
+    Arrow,
+    FieldFigure,
+    FieldMark,
+    FieldPanel,
+    Label,
+    Path,
+    Points,
+    Polygons,
+    Strokes,
+    box,
+)
+from reports.document.figure import INK, Look, Numbers
+from reports.figures.deformed import SCALE, edges, moved, outlines
+from reports.figures.style import COLOURS
 
 #: of beam and ring: transparent, so that ink stays readable on any page
-FILLS = (to_rgba(COLOURS[0], 0.18), to_rgba(COLOURS[1], 0.22))
+FILLS = ((COLOURS[0], 0.18), (COLOURS[1], 0.22))
 _SOFT = "#5c6470"
+
+Place = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -51,139 +58,165 @@ def dimensions(fields: Fields) -> Dimensions:
     )
 
 
-def geometry_figure(fields: Fields, load: float) -> Figure:
-    """Draw Figure 1: bodies, supports, load and dimensions."""
+def geometry_figure(fields: Fields, load: float) -> FieldFigure:
+    """Show Figure 1: bodies, supports, load and dimensions."""
     d = dimensions(fields)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.45))
-        axes = figure.subplots()
-        axes.set(aspect="equal", xlim=(-0.1, 2.5), ylim=(-0.25, 1.07))
-        axes.axis("off")
-        style: Any = {"edgecolor": INK, "linewidth": 0.9}
-        axes.add_patch(Rectangle((0, d.a), d.l, d.h, facecolor=FILLS[0], **style))
-        axes.add_patch(
-            Wedge(d.centre, d.r2, 0, 180, width=d.r2 - d.r1, facecolor=FILLS[1],
-                  **style)
-        )  # fmt: skip
-        _support(axes, (-0.05, d.a - 0.03), 0.05, d.h + 0.06)
-        for foot in (d.centre[0] - d.r2, d.centre[0] + d.r1):
-            _support(axes, (foot - 0.03, -0.05), d.r2 - d.r1 + 0.06, 0.05)
-        axes.plot(
-            (0.1, d.l + 0.45), (0, 0), color=_SOFT, lw=0.5, ls=(0, (6, 4)), zorder=0
-        )
-        _lengths(axes, d)
-        _load(axes, d, load)
-        _names(axes, d)
-    return figure
+    axis = _line((0.1, 0), (d.l + 0.45, 0), dash=(6, 4))
+    feet = (d.centre[0] - d.r2, d.centre[0] + d.r1)
+    supports = [_support((-0.05, d.a - 0.03), 0.05, d.h + 0.06)]
+    supports += [_support((x - 0.03, -0.05), d.r2 - d.r1 + 0.06, 0.05) for x in feet]
+    panel = FieldPanel(
+        low=(-0.1, -0.25), high=(2.5, 1.07), axes="none",
+        marks=(
+            axis, _body(_rectangle((0, d.a), d.l, d.h), 0), _body(_half_ring(d), 1),
+            *supports, *_lengths(d), *_load(d, load), *_names(d),
+        ),
+    )  # fmt: skip
+    return FieldFigure(panels=(panel,), height=3.45)
 
 
-def _support(axes: Axes, corner: tuple[float, float], w: float, h: float) -> None:
-    axes.add_patch(
-        Rectangle(corner, w, h, facecolor="none", edgecolor=_SOFT, hatch="//////", lw=0)
+def _body(corners: Points, body: int) -> Polygons:
+    fill, opacity = FILLS[body]
+    return Polygons(corners=(corners,), fill=fill, opacity=opacity, edge=INK, width=0.9)
+
+
+def _rectangle(corner: tuple[float, float], width: float, height: float) -> Points:
+    x, y = corner
+    return np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
+
+
+def _half_ring(d: Dimensions) -> Points:
+    angles = np.linspace(0, 180, 181)
+    outer = [_on_circle(d, d.r2, angle) for angle in angles]
+    inner = [_on_circle(d, d.r1, angle) for angle in angles[::-1]]
+    return np.array(outer + inner)
+
+
+def _support(corner: tuple[float, float], width: float, height: float) -> Polygons:
+    area = _rectangle(corner, width, height)
+    return Polygons(corners=(area,), edge=_SOFT, hatch="//////")
+
+
+def _line(start: Place, end: Place, dash: Numbers = ()) -> Path:
+    return Path(
+        points=np.array([start, end]), look=Look(colour=_SOFT, width=0.5, dash=dash)
     )
 
 
-def _lengths(axes: Axes, d: Dimensions) -> None:
-    top, below = d.a + d.h, -0.19
-    _dimension(axes, (0, below), (d.l, below), f"$l={d.l:g}$ m", "above")
-    _dimension(axes, (d.l + 0.11, d.a), (d.l + 0.11, top), f"$h={d.h:g}$ m", "right")
-    _dimension(axes, (0.14, 0), (0.14, d.a), f"$a={d.a:g}$ m", "right")
-    thin: Any = {"color": _SOFT, "linewidth": 0.5}
-    for x, low in ((0, d.a - 0.06), (d.l, d.a - 0.02)):
-        axes.plot((x, x), (low, below - 0.03), **thin)
-    for y in (d.a, top):
-        axes.plot((d.l + 0.02, d.l + 0.14), (y, y), **thin)
-    for radius, angle in ((d.r1, 128.0), (d.r2, 32.0)):
-        axes.annotate("", _on_circle(d, radius, angle), d.centre, arrowprops=_ARROW)
+def _lengths(d: Dimensions) -> list[FieldMark]:
+    top, below, right = d.a + d.h, -0.19, d.l + 0.11
     x, y = d.centre
-    axes.text(x + 0.03, y + 0.17, f"$r_1={d.r1:g}$ m", ha="center", va="bottom")
-    x, y = _on_circle(d, d.r2 + 0.03, 32.0)
-    axes.text(x, y, f"$r_2={d.r2:g}$ m", ha="left", va="bottom")
-    axes.plot(*d.centre, "o", color=INK, markersize=3)
-    axes.text(
-        d.centre[0], -0.02, f"$S=[{d.centre[0]:g},\\,{d.centre[1]:g}]$ m",
-        ha="center", va="top",
-    )  # fmt: skip
+    edge = _on_circle(d, d.r2 + 0.03, 32.0)
+    return [
+        *_dimension((0, below), (d.l, below), f"$l={d.l:g}$ m", "above"),
+        *_dimension((right, d.a), (right, top), f"$h={d.h:g}$ m", "right"),
+        *_dimension((0.14, 0), (0.14, d.a), f"$a={d.a:g}$ m", "right"),
+        *(
+            _line((at, low), (at, below - 0.03))
+            for at, low in ((0, d.a - 0.06), (d.l, d.a - 0.02))
+        ),
+        *(_line((d.l + 0.02, at), (d.l + 0.14, at)) for at in (d.a, top)),
+        Arrow(start=d.centre, end=_on_circle(d, d.r1, 128.0)),
+        Arrow(start=d.centre, end=_on_circle(d, d.r2, 32.0)),
+        Label(
+            text=f"$r_1={d.r1:g}$ m", place=(x + 0.03, y + 0.17),
+            align=("center", "bottom"),
+        ),
+        Label(text=f"$r_2={d.r2:g}$ m", place=edge, align=("left", "bottom")),
+        Path(
+            points=np.array([d.centre]),
+            look=Look(colour=INK, marker="o", size=3, dash=None),
+        ),
+        Label(
+            text=f"$S=[{x:g},\\,{y:g}]$ m", place=(x, -0.02), align=("center", "top")
+        ),
+    ]  # fmt: skip
 
 
-def _on_circle(d: Dimensions, radius: float, degrees: float) -> tuple[float, float]:
+def _on_circle(d: Dimensions, radius: float, degrees: float) -> Place:
     """Find the point at an angle on a circle around the ring's centre."""
     angle = np.radians(degrees)
     x, y = d.centre
     return float(x + radius * np.cos(angle)), float(y + radius * np.sin(angle))
 
 
-_ARROW = {"arrowstyle": "->", "lw": 0.7, "color": INK, "shrinkA": 0, "shrinkB": 0}
-
-
-def _dimension(
-    axes: Axes,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    text: str,
-    side: str,
-) -> None:
-    axes.annotate("", end, start, arrowprops={**_ARROW, "arrowstyle": "<->"})
+def _dimension(start: Place, end: Place, text: str, side: str) -> list[FieldMark]:
+    """Make an arrow with two heads, and its text above it or to its right."""
     x, y = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
-    if side == "above":
-        axes.text(x, y + 0.015, text, ha="center", va="bottom")
-    else:
-        axes.text(x + 0.03, y, text, ha="left", va="center")
+    label = (
+        Label(text=text, place=(x, y + 0.015), align=("center", "bottom"))
+        if side == "above"
+        else Label(text=text, place=(x + 0.03, y))
+    )
+    return [Arrow(start=start, end=end, head="<->"), label]
 
 
-def _load(axes: Axes, d: Dimensions, load: float) -> None:
-    tip = (d.l, d.a + d.h)
-    arrow = {"arrowstyle": "-|>", "lw": 1.6, "color": COLOURS[1], "shrinkA": 0,
-             "shrinkB": 0, "mutation_scale": 12}  # fmt: skip
-    axes.annotate("", tip, (tip[0], tip[1] + 0.28), arrowprops=arrow)
-    text = f"$F={load / 1e9:g}$ GN/m"
-    axes.text(tip[0] + 0.04, tip[1] + 0.27, text, color=COLOURS[1], va="top")
+def _load(d: Dimensions, load: float) -> list[FieldMark]:
+    x, y = d.l, d.a + d.h
+    text, colour = f"$F={load / 1e9:g}$ GN/m", COLOURS[1]
+    return [
+        Arrow(
+            start=(x, y + 0.28), end=(x, y), head="-|>", width=1.6, colour=colour,
+            size=12,
+        ),
+        Label(
+            text=text, place=(x + 0.04, y + 0.27), align=("left", "top"), colour=colour
+        ),
+    ]  # fmt: skip
 
 
-def _names(axes: Axes, d: Dimensions) -> None:
-    axes.text(d.l / 2, d.a + d.h / 2, "A", ha="center", va="center")
-    middle = _on_circle(d, (d.r1 + d.r2) / 2, 90)
-    axes.text(*middle, "B", ha="center", va="center")
+def _names(d: Dimensions) -> list[FieldMark]:
+    middle = ("center", "center")
     x, y = d.centre[0], (d.a + d.centre[1] + d.r2) / 2
-    axes.annotate(
-        f"gap {d.a - d.r2 - d.centre[1]:.2g} m", (x - 0.03, y), (x - 0.38, y - 0.07),
-        ha="right", va="center",
-        arrowprops={"arrowstyle": "-", "lw": 0.5, "color": _SOFT, "shrinkB": 0},
-    )  # fmt: skip
+    outside = (x - 0.38, y - 0.07)
+    return [
+        Label(text="A", place=(d.l / 2, d.a + d.h / 2), align=middle),
+        Label(text="B", place=_on_circle(d, (d.r1 + d.r2) / 2, 90), align=middle),
+        Arrow(
+            start=outside, end=(x - 0.03, y), head="-", width=0.5, colour=_SOFT, gap=2
+        ),
+        Label(
+            text=f"gap {d.a - d.r2 - d.centre[1]:.2g} m", place=outside,
+            align=("right", "center"),
+        ),
+    ]  # fmt: skip
 
 
-def mesh_figure(examples: dict[str, Fields]) -> Figure:
-    """Draw Figure 2: a row for each mesh, by title, before and after deformation."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 1.62 * len(examples) + 0.25))
-        grid = figure.subplots(
-            len(examples), 2, sharex=True, sharey=True, squeeze=False
-        )
-        letters = iter("abcdefgh")
-        for row, (title, fields) in zip(grid, examples.items(), strict=True):
-            moved = fields.points + SCALE * fields.displacement
-            for axes, points, what in (
-                (row[0], fields.points, title),
-                (row[1], moved, f"deformed, displacement × {SCALE:g}"),
-            ):
-                _mesh(axes, fields, points)
-                axes.set(aspect="equal")
-                axes.set_title(f"({next(letters)}) {what}", loc="left")
-            row[0].set_ylabel("$y$ in m")
-        for axes in grid[-1]:
-            axes.set_xlabel("$x$ in m")
-    return figure
+def mesh_figure(examples: dict[str, Fields]) -> FieldFigure:
+    """Show Figure 2: a row for each mesh, by title, before and after deformation."""
+    low, high = box(*(p for f in examples.values() for p in (f.points, moved(f))))
+    panels: list[FieldPanel] = []
+    for title, fields in examples.items():
+        lowest = len(panels) + 2 == 2 * len(examples)
+        for points, what in (
+            (fields.points, title),
+            (moved(fields), f"deformed, displacement × {SCALE:g}"),
+        ):
+            left = len(panels) % 2 == 0
+            panels.append(
+                FieldPanel(
+                    low=low, high=high, marks=mesh(fields, points, 0.8),
+                    title=f"({'abcdefgh'[len(panels)]}) {what}",
+                    xlabel="$x$ in m" * lowest, ylabel="$y$ in m" * left,
+                    numbered=(lowest, left),
+                )
+            )  # fmt: skip
+    rows = len(examples)
+    return FieldFigure(
+        panels=tuple(panels), height=1.62 * rows + 0.25, columns=2, heights=(1,) * rows
+    )
 
 
-def _mesh(axes: Axes, fields: Fields, points: NDArray[np.float64]) -> None:
+def mesh(fields: Fields, points: Points, width: float) -> tuple[FieldMark, ...]:
+    """Show the cells of every body in its colour; `width` is that of the outlines."""
+    marks: list[FieldMark] = []
     for body in np.unique(fields.bodies):
         cells = fields.cells[fields.bodies == body]
-        fill = FILLS[int(body) % len(FILLS)]
-        axes.add_collection(
-            PolyCollection(list(points[cells]), facecolor=fill, edgecolor="none")
-        )
-        axes.add_collection(
-            LineCollection(list(points[edges(cells)]), color=_SOFT, linewidth=0.35)
-        )
-    for loop in outlines(fields.cells):
-        axes.plot(*points[loop].T, color=INK, linewidth=0.8)
+        fill, opacity = FILLS[int(body) % len(FILLS)]
+        marks += [
+            Polygons(corners=tuple(points[cells]), fill=fill, opacity=opacity),
+            Strokes(ends=points[edges(cells)], colour=_SOFT, width=0.35),
+        ]
+    look = Look(colour=INK, width=width)
+    loops = outlines(fields.cells)
+    return (*marks, *(Path(points=points[loop], look=look) for loop in loops))

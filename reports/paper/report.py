@@ -7,12 +7,11 @@ from pathlib import Path
 from harness.files.experiment import load_experiment
 from reports.data.evidence import read_evidence
 from reports.export.csv_tables import csv_tables as report_tables
-from reports.figures.saving import save_all
 from reports.paper.csv_tables import csv_tables
 from reports.paper.page import BEYOND, compose
 from reports.render.html_page import html
 from reports.render.latex import latex
-from reports.render.writing import ENDINGS, write_text
+from reports.render.writing import write_figures, write_text
 
 
 def write_paper(folder: Path) -> list[Path]:
@@ -34,16 +33,14 @@ def write_paper(folder: Path) -> list[Path]:
         if (folder / "data" / name).is_dir()
     }
     page = compose(experiment, suites)
-    written = [write_text(folder / "index.html", html(page))]
-    figures, tables = folder / "figures", folder / "tables"
-    figures.mkdir(exist_ok=True)
-    for section in page.sections:
-        for picture in section.pictures:
-            files = [figures / f"{picture.name}{e}" for e in ENDINGS]
-            written += save_all(picture.figure, files)
-        if section.tables:
-            path = tables / f"{section.name}.tex"
-            written.append(write_text(path, latex(section.tables)))
+    figures, drawings = write_figures(page, folder)
+    tables = folder / "tables"
+    written = [write_text(folder / "index.html", html(page, drawings)), *figures]
+    written += [
+        write_text(tables / f"{section.name}.tex", latex(section.tables))
+        for section in page.sections
+        if section.tables
+    ]
     frames = csv_tables(experiment)
     frames |= {name: report_tables(e)["outcomes"] for name, e in suites.items()}
     written += [

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import sqrt
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from harness.files.experiment import Row
+from reports.document import figure
+from reports.document.figure import Figure, Key, Panel, Series, Text, limits
 from reports.document.formatting import exponent, significant
 from reports.document.layout import Cell, Table
-from reports.figures.style import INK, STYLE, log_log, look
+from reports.figures.scaling import along
+from reports.figures.style import GUIDE, below, log, look
 from reports.statistics.intervals import PowerLaw, power_law
 
 QUANTITIES = {  #: of the figure → the columns that make a vector
@@ -53,35 +55,41 @@ def linearisations(rows: Sequence[Row]) -> list[int]:
 
 def stepping_figure(rows: Sequence[Row]) -> Figure:
     """Draw the errors of both quantities against the number of steps."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.1))
-        panels = figure.subplots(1, 2)
-        for letter, axes, quantity in zip("ab", panels, QUANTITIES, strict=True):
-            for i, relin in enumerate(linearisations(rows)):
-                points = [p for p in errors(rows, relin, quantity) if p[1] > 0]
-                axes.plot(*zip(*points, strict=True), label=f"{relin}", **look(i))
-            log_log(axes, "load steps", "relative error")
-            _first_order(axes)
-            axes.set_title(f"({letter}) {quantity}", loc="left")
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=len(labels),
-            title="linearisations per step",
+    tried = linearisations(rows)
+    panels = []
+    for letter, quantity in zip("ab", QUANTITIES, strict=True):
+        marks = []
+        for i, relin in enumerate(tried):
+            points = [p for p in errors(rows, relin, quantity) if p[1] > 0]
+            steps, sizes = zip(*points, strict=True)
+            marks.append(Series(x=steps, y=sizes, look=look(i)))
+        panel = Panel(
+            x=log("load steps"), y=log("relative error"), marks=tuple(marks),
+            title=f"({letter}) {quantity}",
         )  # fmt: skip
-    return figure
+        panels.append(_with_first_order(panel))
+    keys = [Key(label=f"{relin}", look=look(i)) for i, relin in enumerate(tried)]
+    return Figure(
+        rows=(figure.Row(panels=tuple(panels)),),
+        height=3.1,
+        legend=below(keys, len(keys), "linearisations per step"),
+    )
 
 
-def _first_order(axes: Axes) -> None:
-    """Draw a guide of slope −1 above the curves."""
-    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    start, stop = x0 * (x1 / x0) ** 0.55, x0 * (x1 / x0) ** 0.85
-    top = y0 * (y1 / y0) ** 0.93
-    axes.plot([start, stop], [top, top * start / stop], color=INK, linewidth=0.6)
-    axes.annotate(
-        "first order", (np.sqrt(start * stop), top * np.sqrt(start / stop)),
-        xytext=(4, 3), textcoords="offset points", fontsize=8.5,
+def _with_first_order(panel: Panel) -> Panel:
+    """Add a guide of slope −1 above the curves."""
+    (x0, x1), (y0, y1) = limits([panel], "x"), limits([panel], "y")
+    start, stop = along((x0, x1), 0.55), along((x0, x1), 0.85)
+    top = along((y0, y1), 0.93)
+    guide = Series(x=(start, stop), y=(top, top * start / stop), look=GUIDE)
+    name = Text(
+        text="first order", place=(sqrt(start * stop), top * sqrt(start / stop)),
+        offset=(4, 3), align=("left", "bottom"),
     )  # fmt: skip
-    axes.set(xlim=(x0, x1), ylim=(y0, y1))
+    return replace(
+        panel, x=replace(panel.x, low=x0, high=x1), y=replace(panel.y, low=y0, high=y1),
+        marks=(*panel.marks, guide), texts=(name,),
+    )  # fmt: skip
 
 
 def orders(rows: Sequence[Row]) -> Table:

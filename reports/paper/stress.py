@@ -5,16 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps, rc_context
-from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
 
 from harness import Fields
-from reports.figures.deformed import PERCENTILE, SCALE, outlines
-from reports.figures.style import INK, STYLE
+from reports.document.fields import (
+    ColourField,
+    ColourScale,
+    FieldFigure,
+    FieldMark,
+    FieldPanel,
+    Path,
+    box,
+)
+from reports.document.figure import INK, Look
+from reports.figures.deformed import PERCENTILE, moved, outlines, triangles
 
 STRESSES = {
     "sxx": r"normal stress $\sigma_x$",
@@ -37,43 +40,41 @@ def extent(fields: Fields, name: str) -> Extent:
     return Extent(float(np.percentile(size, PERCENTILE)), float(size.max()))
 
 
-def stress_figure(fields: Fields) -> Figure:
-    """Draw the four components, one colour scale for both bodies in each."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 4.05))
-        panels = figure.subplots(2, 2, sharex=True, sharey=True)
-        for letter, axes, (name, title) in zip(
-            "abcd", panels.flat, STRESSES.items(), strict=True
-        ):
-            _panel(figure, axes, fields, name)
-            axes.set_title(f"({letter}) {title} in GPa", loc="left")
-        for axes in panels[1]:
-            axes.set_xlabel("$x$ in m")
-        for axes in panels[:, 0]:
-            axes.set_ylabel("$y$ in m")
-    return figure
+def stress_figure(fields: Fields) -> FieldFigure:
+    """Show the four components, one colour scale for both bodies in each."""
+    low, high = box(moved(fields))
+    panels = []
+    for i, (name, title) in enumerate(STRESSES.items()):
+        lower, left = i // 2 == 1, i % 2 == 0
+        panels.append(
+            FieldPanel(
+                low=low, high=high, marks=_marks(fields, name),
+                scale=_scale(fields, name),
+                title=f"({'abcd'[i]}) {title} in GPa", numbered=(lower, left),
+                xlabel="$x$ in m" * lower, ylabel="$y$ in m" * left,
+            )
+        )  # fmt: skip
+    return FieldFigure(panels=tuple(panels), height=4.05, columns=2, heights=(1, 1))
 
 
-def _panel(figure: Figure, axes: Axes, fields: Fields, name: str) -> None:
-    limit = extent(fields, name).clipped / 1e9
+def _scale(fields: Fields, name: str) -> ColourScale:
+    limit = extent(fields, name).clipped
     signed = name != "von_mises"
-    norm = Normalize(-limit if signed else 0, limit)
-    colours = colormaps["RdBu_r" if signed else "viridis"]
-    moved = fields.points + SCALE * fields.displacement
-    for body in np.unique(fields.bodies):
-        cells = fields.cells[fields.bodies == body]
-        triangles = np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
-        mesh = Triangulation(moved[:, 0], moved[:, 1], triangles)
-        values = fields.nodal[name] / 1e9
-        axes.tripcolor(
-            mesh, values, cmap=colours, norm=norm, shading="gouraud", rasterized=True
-        )
-    for loop in outlines(fields.cells):
-        axes.plot(*moved[loop].T, color=INK, linewidth=0.6)
-    axes.set(aspect="equal")
-    bar = figure.colorbar(
-        ScalarMappable(norm=norm, cmap=colours), ax=axes,
-        orientation="horizontal", extend="both" if signed else "max", aspect=30,
-        fraction=0.06, pad=0.02,
+    return ColourScale(
+        colours="RdBu_r" if signed else "viridis", low=-limit if signed else 0,
+        high=limit, unit=1e9, beyond="both" if signed else "max",
     )  # fmt: skip
-    bar.outline.set_linewidth(0.5)
+
+
+def _marks(fields: Fields, name: str) -> tuple[FieldMark, ...]:
+    points, scale = moved(fields), _scale(fields, name)
+    colours = [
+        ColourField(
+            points=points, triangles=triangles(fields.cells[fields.bodies == body]),
+            values=fields.nodal[name], scale=scale,
+        )
+        for body in np.unique(fields.bodies)
+    ]  # fmt: skip
+    style = Look(colour=INK, width=0.6)
+    loops = outlines(fields.cells)
+    return (*colours, *(Path(points=points[loop], look=style) for loop in loops))

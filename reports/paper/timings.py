@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
+from harness import Vector
 from harness.files.experiment import Row
-from reports.figures.style import COLOURS, INK, STYLE, log_log, look
+from reports.document import figure
+from reports.document.figure import (
+    INK,
+    Area,
+    Axis,
+    Figure,
+    Intervals,
+    Key,
+    Legend,
+    Look,
+    Panel,
+    Series,
+    Text,
+    limits,
+    numbers,
+)
+from reports.figures.style import COLOURS, below, log, look
 from reports.paper import published
 from reports.paper.samples import Fit, Point, curve, fit
 
@@ -27,91 +40,112 @@ METHODS = {  #: of the tables → as the figures and tables of the report call t
     "per-row": "one solve per row (the paper's way)",
     "condensed": "condensed",
 }
-_PUBLISHED: dict[str, Any] = {
-    "color": INK, "marker": "*", "markersize": 10, "linestyle": "none",
-    "markerfacecolor": "white", "markeredgewidth": 0.9, "zorder": 5,
-}  # fmt: skip
+_PUBLISHED = Look(colour=INK, marker="*", size=10, edge=0.9, dash=None, fill="white")
+_FITTED = Look(colour=COLOURS[2], dash=(1, 1.5))
 
 
-def _times(axes: Axes, points: Sequence[Point], label: str, style: Any) -> None:
-    """Draw medians and their intervals."""
-    x, t, low, high = np.array([(p.x, *p.time[:3]) for p in points]).T
-    axes.plot(x, t, label=label, **style)
-    bars = {"color": style["color"], "capsize": 2, "elinewidth": 0.7}
-    axes.errorbar(x, t, yerr=[t - low, high - t], fmt="none", **bars)
+def _times(points: Sequence[Point], style: Look) -> Series:
+    """Make medians and their intervals."""
+    times = [p.time for p in points]
+    low, high = tuple(t.low for t in times), tuple(t.high for t in times)
+    return Series(
+        x=tuple(p.x for p in points), y=tuple(t.value for t in times), look=style,
+        intervals=Intervals(low=low, high=high),
+    )  # fmt: skip
 
 
-def _titles(figure: Figure, titles: Sequence[str]) -> None:
-    for letter, axes, title in zip("abcdef", figure.axes, titles, strict=False):
-        axes.set_title(f"({letter}) {title}", loc="left")
+def _star(x: float, y: float, style: Look = _PUBLISHED) -> Series:
+    """Make the mark of a published number."""
+    return Series(x=(float(x),), y=(float(y),), look=style)
+
+
+def _row(panels: Sequence[Panel]) -> figure.Row:
+    return figure.Row(panels=tuple(panels))
+
+
+def _titled(panels: Sequence[Panel], titles: Sequence[str]) -> tuple[Panel, ...]:
+    return tuple(
+        replace(panel, title=f"({letter}) {title}")
+        for letter, panel, title in zip("abcdef", panels, titles, strict=False)
+    )
 
 
 def assembly_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 3: linear and logarithmic."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.4))
-        left, right = figure.subplots(1, 2)
-        for axes in (left, right):
-            for i, method in enumerate(("triplets", "compiled", "compiled-reused")):
-                points = curve(rows, "n", method=method)
-                _times(axes, points, METHODS[method], look(i))
-            axes.plot(
-                published.DOFS, published.SECONDS["assembly"],
-                label=f"published, both bodies ({published.MACHINE})", **_PUBLISHED,
-            )  # fmt: skip
-        left.set(
-            xlabel=DOFS, ylabel="assembly time in s", xlim=(0, None), ylim=(0, None)
-        )
-        left.xaxis.set_major_locator(MaxNLocator(4))
-        log_log(right, DOFS, "assembly time in s")
-        _titles(figure, ("linear scale", "logarithmic scale"))
-        _legend(figure, left)
-    return figure
+    methods = ("triplets", "compiled", "compiled-reused")
+    curves = [
+        _times(curve(rows, "n", method=m), look(i)) for i, m in enumerate(methods)
+    ]
+    marks = (*curves, _star(published.DOFS, published.SECONDS["assembly"]))
+    keys = [Key(label=METHODS[m], look=look(i)) for i, m in enumerate(methods)]
+    words = f"published, both bodies ({published.MACHINE})"
+    time = "assembly time in s"
+    left = Panel(
+        x=Axis(label=DOFS, low=0, most=4), y=Axis(label=time, low=0), marks=marks,
+        grid="none",
+    )  # fmt: skip
+    right = Panel(x=log(DOFS), y=log(time), marks=marks)
+    return Figure(
+        rows=(_row(_titled((left, right), ("linear scale", "logarithmic scale"))),),
+        height=3.4,
+        legend=below((*keys, Key(label=words, look=_PUBLISHED)), 2),
+    )
 
 
 def contact_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 4: node-to-segment and mortar, a line for each number of masters."""
     masters = sorted({row["master"] for row in rows})
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.6))
-        panels = figure.subplots(1, 2, sharey=True)
-        for axes, method in zip(panels, ("nts", "mortar"), strict=True):
-            for i, master in enumerate(masters):
-                points = curve(rows, "slave", method=method, master=master)
-                _times(axes, points, f"{master}", look(i))
-        left = panels[0]
-        at = published.SEGMENTS["slave"], published.SECONDS["contact"] / published.STEPS
-        left.plot(*at, **_PUBLISHED)
-        left.annotate(
-            f"published\n({published.SEGMENTS['master']} master segments)", at,
-            xytext=(9, 0), textcoords="offset points", va="center", fontsize=8.5,
+    place = published.SEGMENTS["slave"], published.SECONDS["contact"] / published.STEPS
+    name = f"published\n({published.SEGMENTS['master']} master segments)"
+    panels = []
+    for method in ("nts", "mortar"):
+        first = method == "nts"
+        curves = [
+            _times(curve(rows, "slave", method=method, master=master), look(i))
+            for i, master in enumerate(masters)
+        ]
+        panels.append(
+            Panel(
+                x=log("slave segments"),
+                y=Axis(
+                    label="time of one linearisation in s" * first, log=True, high=0.7,
+                    shared="time", numbered=first,
+                ),
+                marks=(*curves, _star(*place)) if first else tuple(curves),
+                texts=(Text(text=name, place=place, offset=(9, 0)),) if first else (),
+            )
         )  # fmt: skip
-        log_log(left, "slave segments", "time of one linearisation in s")
-        left.set_ylim(top=0.7)
-        log_log(panels[1], "slave segments", "")
-        _titles(figure, ("node-to-segment, as in the paper", "mortar, dual basis"))
-        handles, labels = left.get_legend_handles_labels()
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=len(masters),
-            title="master segments",
-        )  # fmt: skip
-    return figure
+    titles = ("node-to-segment, as in the paper", "mortar, dual basis")
+    keys = [Key(label=f"{master}", look=look(i)) for i, master in enumerate(masters)]
+    return Figure(
+        rows=(_row(_titled(panels, titles)),),
+        height=3.6,
+        legend=below(keys, len(masters), "master segments"),
+    )
 
 
 def inverse_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 5: building K⁺ and multiplying with it."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 3.6))
-        left, right = figure.subplots(1, 2)
-        for axes, part in ((left, "build"), (right, "multiply")):
-            for i, method in enumerate(("pinv", "geometric", "spectral")):
-                points = curve(rows, "n", method=method, part=part)
-                _times(axes, points, METHODS[method], look((2, 0, 1)[i]))
-            _extrapolation(axes, pinv_fit(rows, part), max(r["n"] for r in rows))
-            log_log(axes, DOFS, "time in s")
-        _titles(figure, ("building", "multiplication with a random vector"))
-        _legend(figure, left)
-    return figure
+    looks = {"pinv": look(2), "geometric": look(0), "spectral": look(1)}
+    until = float(max(r["n"] for r in rows))
+    panels = []
+    for part in ("build", "multiply"):
+        curves = [
+            _times(curve(rows, "n", method=method, part=part), style)
+            for method, style in looks.items()
+        ]
+        band, law = _extrapolation(pinv_fit(rows, part), until)
+        panels.append(
+            Panel(x=log(DOFS), y=log("time in s"), marks=(*curves, band, law))
+        )
+    words = "dense pinv, not measured: fitted $c\\,n^3$ (a), $c\\,n^2$ (b)"
+    keys = [Key(label=METHODS[m], look=style) for m, style in looks.items()]
+    titles = ("building", "multiplication with a random vector")
+    return Figure(
+        rows=(_row(_titled(panels, titles)),),
+        height=3.6,
+        legend=below((*keys, Key(label=words, look=_FITTED)), 2),
+    )
 
 
 def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
@@ -120,87 +154,94 @@ def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
     return fit(points, 3 if part == "build" else 2)
 
 
-def _extrapolation(axes: Axes, law: Fit, until: Any) -> None:
-    """Draw the fit where nothing was measured, with its band."""
-    x = np.geomspace(law.until, float(until), 40)
-    axes.fill_between(
-        x, law.low * x**law.power, law.high * x**law.power, color=COLOURS[2], alpha=0.2,
-        linewidth=0,
-    )  # fmt: skip
-    axes.plot(
-        x, law.c * x**law.power, color=COLOURS[2], linestyle=(0, (1, 1.5)),
-        label="dense pinv, not measured: fitted $c\\,n^3$ (a), $c\\,n^2$ (b)",
-    )  # fmt: skip
+def _extrapolation(law: Fit, until: float) -> tuple[Area, Series]:
+    """Continue the fit where nothing was measured, with its band."""
+    x = np.geomspace(law.until, until, 40)
+    at, low, middle, high = (
+        numbers(v) for v in (x, *(c * x**law.power for c in (law.low, law.c, law.high)))
+    )
+    band = Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2)
+    return band, Series(x=at, y=middle, look=_FITTED)
 
 
 def scaling_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 6: sizes, constraints, dualisation and QPs, the whole."""
-    with rc_context(STYLE):
-        figure = Figure(figsize=(6.9, 6.3))
-        (sizes, constraints), (dual, total) = figure.subplots(2, 2)
-        _sizes(sizes, constraints, rows)
-        _dual(dual, rows)
-        _total(total, rows)
-        _titles(
-            figure,
-            ("size of the problems", "constraints", "dualisation and QPs, all steps",
-             "the whole analysis"),
-        )  # fmt: skip
-    return figure
+    panels = _titled(
+        (*_sizes(rows), _dual(rows), _total(rows)),
+        ("size of the problems", "constraints", "dualisation and QPs, all steps",
+         "the whole analysis"),
+    )  # fmt: skip
+    return Figure(rows=figure.in_rows(panels, 2), height=6.3)
 
 
-def _sizes(sizes: Axes, constraints: Axes, rows: Sequence[Row]) -> None:
+def _sizes(rows: Sequence[Row]) -> tuple[Panel, Panel]:
     points = sorted({(r["Nr"], r["n"], r["m_E"], r["m_I"]) for r in rows})
     Nr, n, m_E, m_I = np.array(points, dtype=float).T
-    sizes.plot(Nr, n, label="primal, $n$", **look(0))
-    sizes.plot(Nr, m_E + m_I, label="dual, $m = m_E + m_I$", **look(1))
-    sizes.set(yscale="log", ylim=(100, 1e5), ylabel="unknowns")
-    constraints.plot(Nr, m_E, label="Dirichlet equalities $m_E$", **look(0))
-    constraints.plot(Nr, m_I, label="contact inequalities $m_I$", **look(1))
-    constraints.set(ylim=(0, 1.35 * max(m_E.max(), m_I.max())), ylabel="rows")
-    for axes in (sizes, constraints):
-        axes.set_xlabel("$N_r$")
-        axes.grid(visible=True, color="#8a93a0", alpha=0.3, linewidth=0.4)
-        axes.legend(loc="upper left")
+
+    def panel(y: Axis, curves: Mapping[str, Vector]) -> Panel:
+        looks = {name: look(i) for i, name in enumerate(curves)}
+        marks = tuple(
+            Series(x=numbers(Nr), y=numbers(values), look=looks[name])
+            for name, values in curves.items()
+        )
+        keys = tuple(Key(label=name, look=style) for name, style in looks.items())
+        legend = Legend(keys=keys, place="upper left")
+        return Panel(x=Axis(label="$N_r$"), y=y, marks=marks, legend=legend)
+
+    most = float(max(m_E.max(), m_I.max()))
+    return (
+        panel(
+            Axis(label="unknowns", log=True, low=100, high=1e5),
+            {"primal, $n$": n, "dual, $m = m_E + m_I$": m_E + m_I},
+        ),
+        panel(
+            Axis(label="rows", low=0, high=1.35 * most),
+            {"Dirichlet equalities $m_E$": m_E, "contact inequalities $m_I$": m_I},
+        ),
+    )
 
 
-def _dual(axes: Axes, rows: Sequence[Row]) -> None:
+def _dual(rows: Sequence[Row]) -> Panel:
     rows = [{**row, "m": int(row["m_E"]) + int(row["m_I"])} for row in rows]
+    marks, keys = [], []
     for i, (method, parts, label) in enumerate((
         ("per-row", ("dualisation",), "dualisation, one solve per row"),
         ("condensed", ("factor", "dualisation"), "the same, condensed, with factor"),
         ("per-row", ("qp",), "dual QPs, the textbook's SMALBE"),
         ("condensed", ("qp",), "dual QPs, our SMALBE"),
     )):  # fmt: skip
-        _times(axes, curve(rows, "m", method=method, part=parts), label, look(i))
-    stars = (("dualisation", "*", 9, "dualisation"), ("qp", "P", 7, "QPs"))
+        points = curve(rows, "m", method=method, part=parts)
+        marks.append(_times(points, look(i)))
+        keys.append(Key(label=label, look=look(i)))
+    stars = (("dualisation", "*", 9.0, "dualisation"), ("qp", "P", 7.0, "QPs"))
     for part, marker, size, name in stars:
-        style = _PUBLISHED | {"marker": marker, "markersize": size}
-        seconds = published.SECONDS[part]
-        axes.plot(published.ROWS, seconds, label=f"published: {name}", **style)
-    axes.set(yscale="log", xlabel="size of the dual $m$", ylabel="time in s")
-    _head_room(axes, 3.8)
-    axes.legend(loc="upper left", fontsize=8)
+        style = replace(_PUBLISHED, marker=marker, size=size)
+        marks.append(_star(published.ROWS, published.SECONDS[part], style))
+        keys.append(Key(label=f"published: {name}", look=style))
+    return _with_head_room("size of the dual $m$", marks, keys, 3.8)
 
 
-def _total(axes: Axes, rows: Sequence[Row]) -> None:
+def _total(rows: Sequence[Row]) -> Panel:
+    marks, keys = [], []
     for i, method in enumerate(("per-row", "condensed")):
-        points = curve(rows, "n", method=method)
-        _times(axes, points, METHODS[method], look(i))
-    axes.plot(published.DOFS, published.TOTAL, label="published", **_PUBLISHED)
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.set(yscale="log", xlabel="size of the primal $n$", ylabel="time in s")
-    _head_room(axes, 2.2)
-    axes.legend(loc="upper left", fontsize=8)
+        marks.append(_times(curve(rows, "n", method=method), look(i)))
+        keys.append(Key(label=METHODS[method], look=look(i)))
+    marks.append(_star(published.DOFS, published.TOTAL))
+    keys.append(Key(label="published", look=_PUBLISHED))
+    return _with_head_room("size of the primal $n$", marks, keys, 2.2)
 
 
-def _head_room(axes: Axes, decades: float) -> None:
-    """Leave room for the legend above the curves, and a grid."""
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high * 10 ** (0.35 * decades))
-    axes.grid(visible=True, color="#8a93a0", alpha=0.3, linewidth=0.4)
-
-
-def _legend(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+def _with_head_room(
+    size: str, marks: Sequence[Series], keys: Sequence[Key], decades: float
+) -> Panel:
+    """Make a panel with room for its legend above the curves."""
+    legend = Legend(keys=tuple(keys), place="upper left", size=8)
+    panel = Panel(
+        x=Axis(label=size, most=4),
+        y=log("time in s"),
+        marks=tuple(marks),
+        legend=legend,
+    )
+    low, high = limits([panel], "y")
+    head = high * 10 ** (0.35 * decades)
+    return replace(panel, y=replace(panel.y, low=low, high=head))

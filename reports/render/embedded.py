@@ -12,11 +12,11 @@ from typing import Any
 
 from harness import Record
 from harness.record import finite
+from reports.document.figure import Figure
 from reports.document.formatting import VERDICTS, clean, tolerance
 from reports.document.layout import Cell, Page, Table, named, short
-from reports.figures.style import legible, look
-from reports.render.artists import Data
-from reports.render.plots import read_back
+from reports.figures.style import look
+from reports.render.plots import Data, panels
 
 Rows = Mapping[str, int]  #: run_id, as titles have it → position among the records
 
@@ -72,14 +72,14 @@ def strict(content: Any) -> str:
 
 
 def plots(page: Page, rows: Rows) -> dict[str, list[Data]]:
-    """Read back every figure that can be drawn anew, by its name."""
-    labels = {s: legible(s) for s in page.solvers}
-    found = {}
-    for picture in (p for s in page.sections for p in s.pictures):
-        panels = read_back(picture.figure, labels)
-        if panels is not None:
-            found[picture.name] = [_numbered(panel, rows) for panel in panels]
-    return found
+    """Describe every figure of curves, by its name."""
+    solvers = {s: i for i, s in enumerate(page.solvers)}
+    return {
+        picture.name: [_numbered(one, rows) for one in panels(picture.figure, solvers)]
+        for section in page.sections
+        for picture in section.pictures
+        if isinstance(picture.figure, Figure)
+    }
 
 
 def _numbered(panel: Data, rows: Rows) -> Data:
@@ -95,8 +95,8 @@ def _solver(name: str, index: int) -> Data:
     style = look(index)
     return {
         "names": [clean(name, 40), clean(name)],
-        "colour": style["color"],
-        "marker": style["marker"],
+        "colour": style.colour,
+        "marker": style.marker,
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
+from collections.abc import Mapping
 from functools import partial
 from hashlib import sha256
 from importlib.resources import files
@@ -13,8 +14,8 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from reports.document.layout import Cell, Page, Picture, short
-from reports.figures.saving import inline_svg
 from reports.render.embedded import Rows, data, details, plots, rows_of, runs_of
+from reports.render.svg import Svg, inline
 
 FIRST = 50  #: rows of a table that are in the page as written; its script has all
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
@@ -23,11 +24,13 @@ _LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
 _RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
 
 
-def html(page: Page) -> str:
+def html(page: Page, drawings: Mapping[str, Svg]) -> str:
     """Render the whole report; all text is escaped, figures are inline.
 
     The policy in its head lets a browser run the one script that we wrote, known by
     its hash, and fetch nothing.
+
+    drawings : of the figures, by name
     """
     rows = rows_of(page.records)
     found = plots(page, rows)
@@ -40,7 +43,7 @@ def html(page: Page) -> str:
     )
     environment.filters["breakable"] = breakable
     environment.filters["told"] = partial(told, rows=rows)
-    environment.filters["drawn"] = drawn
+    environment.filters["drawn"] = partial(drawn, drawings=drawings)
     environment.filters["link"] = partial(link, page=page, rows=rows)
     return environment.from_string(_asset("page.html.j2")).render(
         page=page,
@@ -95,6 +98,6 @@ def link(cell: Cell, page: Page, rows: Rows) -> Markup:
     return Markup(f'href="#run-{target}" data-runs="{",".join(map(str, runs))}"')
 
 
-def drawn(picture: Picture) -> Markup:
+def drawn(picture: Picture, drawings: Mapping[str, Svg]) -> Markup:
     """Embed a figure; its text was made by us from names that `legible` has cleaned."""
-    return Markup(inline_svg(picture.figure, picture.name))
+    return Markup(inline(drawings[picture.name], picture.name))

@@ -1,187 +1,235 @@
-"""What a figure shows, read back as plain data, so that a page can draw it anew.
-
-The figure stays the only source: whatever draws curves with matplotlib, in this package
-or in another, gets a plot that one can zoom in, and the same picture in print. What is
-understood: straight and stepped lines, marks, segments (error bars), filled areas,
-rectangles, lines across the axes, texts and legends. A figure with anything else
-(meshes, colour bars, images) is shown as it is.
-"""
+"""Figures of curves as the page's script draws them: plain data for JSON."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from math import isfinite
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.figure import Figure, SubFigure
-from matplotlib.legend import Legend
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
-from matplotlib.text import Text
-from matplotlib.ticker import FixedLocator
 
-from reports.figures.provenance import measured
-from reports.render.artists import (
-    Data,
-    colour_of,
-    look_of,
-    numbers,
-    rules,
-    texts,
-    traces,
+from reports.document.figure import (
+    INK,
+    Area,
+    Axis,
+    Figure,
+    Key,
+    Legend,
+    Look,
+    Mark,
+    Numbers,
+    Panel,
+    Rule,
+    Runs,
+    Segments,
+    Series,
+    Text,
+    fitted,
 )
 from reports.render.mathtext import plain
 
+Data = dict[str, Any]
 
-def read_back(figure: Figure, labels: Mapping[str, str]) -> list[Data] | None:
-    """List the panels of a figure; None if it holds what cannot be read back.
+MOST = 4000  #: points of a line; of more, each stretch shows its least and largest
 
-    labels : of solvers, as legends have them; traces and keys name their positions
+
+def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
+    """List the panels of a figure.
+
+    solvers : name → position on the page
     """
-    panels = [a for a in figure.axes if a.axison]
-    if not panels or not all(map(_readable, panels)):
-        return None
-    common = _legend(_legends(figure), labels)
-    rows = [a.get_subplotspec() for a in panels]
-    columns = len({None if spec is None else spec.colspan.start for spec in rows})
-    groups = [tuple(sorted(map(id, _sharing(a)))) for a in panels]
-    return [
-        _panel(a, labels, common["keys"])
-        | {"share": groups.index(group), "columns": columns}
-        | ({"common": common} if i == 0 else {})
-        for i, (a, group) in enumerate(zip(panels, groups, strict=True))
-    ]
+    whole = fitted(figure)
+    heights = [row.height for row in whole.rows]
+    legends = [row.legend for row in whole.rows if row.legend]
+    common = _legend([whole.legend, *legends] if whole.legend else legends, solvers)
+    made: list[Data] = []
+    groups: dict[str, int] = {}
+    for row in whole.rows:
+        for panel in row.panels:
+            own = panel.x.shared or f"\0{len(made)}"  # alone
+            made.append({
+                **_panel(panel, solvers),
+                "height": round(whole.height * row.height / sum(heights), 2),
+                "share": groups.setdefault(own, len(groups)),
+                "columns": whole.columns,
+            })  # fmt: skip
+    made[0]["common"] = common
+    return made
 
 
-def _sharing(axes: Axes) -> list[Axes]:
-    return list(axes.get_shared_x_axes().get_siblings(axes))
-
-
-def _readable(axes: Axes) -> bool:
-    known = (Line2D, LineCollection, PolyCollection, Rectangle, Text, Legend)
-    mine = [*axes.lines, *axes.collections, *axes.patches, *axes.images, *axes.tables]
-    kinds = all(isinstance(artist, known) for artist in mine)
-    scales = {axes.get_xscale(), axes.get_yscale()}
-    curves = axes.name == "rectilinear" and axes.get_aspect() == "auto"
-    return kinds and curves and scales <= {"linear", "log"}
-
-
-def _panel(axes: Axes, labels: Mapping[str, str], common: Sequence[Data]) -> Data:
-    inner = axes.get_legend()
-    own = _legend([] if inner is None else [inner], labels)
-    keys = [*own["keys"], *common]
-    drawn = [{**t, "s": _solver(a, t, labels, keys)} for a, t in traces(axes)]
-    owners: dict[str, set[int]] = {}
-    for t in drawn:
-        owners.setdefault(t["colour"], set()).add(t["s"])
-    for t in drawn:  # bands and caps, which have no key, go with the line of a colour
-        others = owners[t["colour"]] - {-1}
-        t["s"] = others.pop() if t["s"] < 0 and len(others) == 1 else t["s"]
+def _panel(panel: Panel, solvers: Mapping[str, int]) -> Data:
     return {
-        "title": plain(axes.get_title() or axes.get_title(loc="left")),
-        "x": _axis(axes.xaxis),
-        "y": _axis(axes.yaxis),
-        "height": _height(axes),
-        "traces": drawn,
-        "rules": list(rules(axes)),
-        "texts": list(texts(axes)),
-        "own": own,
+        "title": plain(panel.title),
+        "x": _axis(panel.x),
+        "y": _axis(panel.y),
+        "traces": [t for mark in panel.marks for t in _traces(mark, solvers)],
+        "rules": [_rule(rule) for rule in panel.rules],
+        "texts": [_text(text) for text in panel.texts],
+        "own": _legend([*filter(None, [panel.legend]), *_steps(panel)], solvers),
     }
 
 
 def _axis(axis: Axis) -> Data:
-    """Describe an axis; its ticks only if set by hand, or if there is none."""
-    low, high = sorted(axis.get_view_interval())
-    at = axis.get_majorticklocs()
-    ticks: list[Any] | None = None
-    if isinstance(axis.get_major_locator(), FixedLocator):
-        names = [plain(n) for n in axis.get_major_formatter().format_ticks(list(at))]
-        if not any(map(_number, names)):
-            ticks = [[float(v), name] for v, name in zip(at, names, strict=True)]
-    elif not len(at):
-        ticks = []
+    named = axis.ticks is not None
     return {
-        "label": plain(axis.get_label_text()),
-        "log": axis.get_scale() == "log",
-        "limits": numbers((low, high), 9),
-        "ticks": ticks,
-        "numbered": bool(axis.get_tick_params().get("labelbottom", True)),
+        "label": plain(axis.label),
+        "log": axis.log,
+        "limits": rounded((axis.low or 0.0, axis.high or 0.0), 9),
+        "ticks": [[v, plain(name)] for v, name in axis.ticks or ()] if named else None,
+        "numbered": axis.numbered,
     }
 
 
-def _number(name: str) -> bool:
-    return re.fullmatch(r"[-−]?[\d.]+", name) is not None
+def _traces(mark: Mark, solvers: Mapping[str, int]) -> Iterator[Data]:
+    whose = {"s": solvers.get(mark.solver, -1)}
+    match mark:
+        case Series():
+            yield whose | _line(mark)
+            yield from (whose | part for part in _intervals(mark))
+        case Area():
+            yield whose | {
+                "kind": "area",
+                "colour": colour(mark.colour),
+                "opacity": mark.opacity,
+                "outlines": [rounded(_outline(mark))],
+            }
+        case Segments():
+            yield whose | _segments(mark.ends, mark.colour, mark.width, mark.runs)
 
 
-def _height(axes: Axes) -> float:
-    """Height in inches of the whole row that the axes are in."""
-    figure, spec = axes.get_figure(), axes.get_subplotspec()
-    total = float(figure.bbox.height / figure.dpi) if figure is not None else 3.0
-    if spec is None:
-        return total
-    given = spec.get_gridspec().get_height_ratios()
-    ratios = np.asarray(given, dtype=float)
-    rows = slice(spec.rowspan.start, spec.rowspan.stop)
-    return round(total * float(ratios[rows].sum() / ratios.sum()), 2)
+def _line(series: Series) -> Data:
+    traced = len(series.runs) == len(series.x)
+    kept = range(len(series.x)) if traced else _thinned(series.y)
+    return {
+        **look_of(series.look),
+        "kind": "line",
+        "step": series.step,
+        "few": series.few,
+        "x": rounded(series.x[i] for i in kept),
+        "y": rounded(series.y[i] for i in kept),
+        "runs": series.runs,
+    }
 
 
-def _legends(figure: Figure | SubFigure) -> list[Legend]:
-    """List the legends of a figure and its parts, not those inside of axes."""
-    parts = [legend for part in figure.subfigs for legend in _legends(part)]
-    return [*figure.legends, *parts]
+def _thinned(y: Numbers) -> list[int]:
+    """Choose the least and largest of every stretch of a long line, and its ends."""
+    count = len(y)
+    if count <= MOST:
+        return list(range(count))
+    size = -(-2 * count // MOST)
+    kept = {0, count - 1}
+    values = np.nan_to_num(y, nan=-np.inf)
+    for start in range(0, count, size):
+        stretch = values[start : start + size]
+        kept |= {start + int(stretch.argmin()), start + int(stretch.argmax())}
+    return sorted(kept)
 
 
-def _legend(legends: Sequence[Legend], labels: Mapping[str, str]) -> Data:
-    titles = dict.fromkeys(plain(one.get_title().get_text()) for one in legends)
+def _intervals(series: Series) -> Iterator[Data]:
+    """Yield error bars as segments, and the strokes at their ends as marks."""
+    bars = series.intervals
+    if bars is None:
+        return
+    x, y, vertical = series.x, series.y, bars.along == "y"
+    low, high = ((x, end) if vertical else (end, y) for end in (bars.low, bars.high))
+    ends = zip(*low, *high, strict=True)
+    yield _segments(tuple(ends), series.look.colour, bars.width, series.runs)
+    cap = Look(
+        colour=series.look.colour, marker="_" if vertical else "|", dash=None,
+        size=2 * bars.cap, opacity=bars.opacity,
+    )  # fmt: skip
+    for at in (low, high):
+        yield _line(Series(x=at[0], y=at[1], look=cap, runs=series.runs))
+
+
+def _segments(ends: Sequence[Numbers], name: str, width: float, runs: Runs) -> Data:
+    return {
+        "kind": "segments",
+        "colour": colour(name),
+        "width": width,
+        "ends": [rounded(one) for one in ends],
+        "runs": runs,
+    }
+
+
+def _outline(area: Area) -> Iterator[float]:
+    """Go around an area: along its upper end, and back along the lower."""
+    upper, lower = (
+        list(zip(area.x, end, strict=True)) for end in (area.high, area.low)
+    )
+    if area.step:
+        upper, lower = _stepped(upper), _stepped(lower)
+    for x, y in (*upper, *reversed(lower)):
+        yield from (x, y)
+
+
+def _stepped(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Hold each value until the next point."""
+    made = list(points[:1])
+    for (_, before), (x, y) in pairwise(points):
+        made += [(x, before), (x, y)]
+    return made
+
+
+def _rule(rule: Rule) -> Data:
+    return look_of(rule.look) | {"axis": rule.axis, "at": rule.at}
+
+
+def _text(text: Text) -> Data:
+    return {
+        "text": plain(text.text),
+        "place": list(text.place),
+        "inside": list(text.inside),
+        "align": list(text.align),
+    }
+
+
+def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
+    titles = dict.fromkeys(plain(one.title) for one in legends)
     return {
         "title": ", ".join(filter(None, titles)),
-        "keys": [key for one in legends for key in _keys(one, labels)],
+        "keys": [_key(key, solvers) for one in legends for key in one.keys],
     }
 
 
-def _keys(legend: Legend, labels: Mapping[str, str]) -> Iterator[Data]:
-    for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=False):
-        if isinstance(handle, Line2D):
-            look = look_of(handle)
-        elif isinstance(handle, Patch):
-            look = {"colour": colour_of(handle.get_facecolor()), "marker": "s",
-                    "hollow": False, "dash": None, "width": 1, "size": 6}  # fmt: skip
-        else:
-            continue
-        label = text.get_text()
-        yield look | {"label": plain(label), "s": _named(label, labels)}
+def _key(key: Key, solvers: Mapping[str, int]) -> Data:
+    label = {"label": plain(key.label), "s": solvers.get(key.solver, -1)}
+    return look_of(key.look) | label
 
 
-def _named(label: str, labels: Mapping[str, str]) -> int:
-    """Position of the solver that a label begins with; −1 if it names none."""
-    fits = [
-        (len(one), i)
-        for i, one in enumerate(labels.values())
-        if label == one
-        or re.match(r"[,:;]? ", label[len(one) :] * label.startswith(one))
-    ]
-    return max(fits)[1] if fits else -1
+def _steps(panel: Panel) -> list[Legend]:
+    """Make keys of the colours of a bar."""
+    if panel.bar is None:
+        return []
+    keys = tuple(
+        Key(label=str(k), look=Look(colour=name))
+        for k, name in enumerate(panel.bar.colours, 1)
+    )
+    return [Legend(keys=keys, title=panel.bar.label)]
 
 
-def _solver(
-    artist: Artist, trace: Data, labels: Mapping[str, str], keys: Sequence[Data]
-) -> int:
-    """Find whose a trace is: by its runs, its label, or the key that it looks like."""
-    owners = {r.solver for runs in measured(artist) for r in runs}
-    if len(owners) == 1:
-        return [*labels].index(owners.pop())
-    by_label = _named(str(artist.get_label()), labels)
-    if by_label >= 0:
-        return by_label
-    for alike in (("colour", "marker"), ("colour", "dash"), ("colour",)):
-        places = {
-            k["s"] for k in keys if all(k[name] == trace.get(name) for name in alike)
-        }
-        if len(places) == 1:
-            return int(places.pop())
-    return -1
+def look_of(look: Look) -> Data:
+    """Tell how a line and its marks look, lengths in px or points."""
+    dash = look.dash
+    return {
+        "colour": colour(look.colour),
+        "marker": look.marker,
+        "hollow": look.fill in ("none", "white"),
+        "dash": None
+        if dash is None
+        else " ".join(f"{v * look.width:.3g}" for v in dash),
+        "width": look.width,
+        "size": look.size,
+        "opacity": look.opacity,
+    }
+
+
+def colour(name: str) -> str:
+    """Name a colour as SVG does; ink is that of the text around."""
+    return "currentColor" if name == INK else name
+
+
+def rounded(values: Any, digits: int = 6) -> list[float | None]:
+    """Round for the page; what is not finite has no place in JSON."""
+    return [float(f"{v:.{digits}g}") if isfinite(v) else None for v in values]

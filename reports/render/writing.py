@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from harness.files.durable import replace_file
 from reports.document.layout import Page
-from reports.figures.saving import save_all
 from reports.render.html_page import html
 from reports.render.latex import latex
 from reports.render.markdown import markdown
+from reports.render.svg import Svg
 
-ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
 RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
 
 
@@ -21,9 +20,10 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
 
     html: index.html. md: report.md. tex: tables/SECTION.tex. Figures go to figures/.
     """
+    figures, drawings = write_figures(page, target)
     written: list[Path] = []
     if "html" in formats:
-        written.append(write_text(target / "index.html", html(page)))
+        written.append(write_text(target / "index.html", html(page, drawings)))
     if "md" in formats:
         written.append(write_text(target / "report.md", markdown(page)))
     if "tex" in formats:
@@ -32,7 +32,7 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
             for s in page.sections
             if s.tables
         ]
-    return written + write_figures(page, target)
+    return written + figures
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -41,13 +41,24 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
-def write_figures(page: Page, target: Path) -> list[Path]:
-    """Write the figures of a page to the folder figures/ in `target`."""
+def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Svg]]:
+    """Write the figures of a page to the folder figures/ in `target`.
+
+    Returns
+    -------
+    paths : list
+        The files.
+    drawings : mapping
+        Name → what is in the SVG file.
+
+    """
+    from reports.render.saving import save_all  # late: it loads matplotlib
+
     folder = target / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = [p for section in page.sections for p in section.pictures]
-    return [
-        path
-        for p in pictures
-        for path in save_all(p.figure, [folder / f"{p.name}{e}" for e in ENDINGS])
-    ]
+    written: list[Path] = []
+    drawings: dict[str, Svg] = {}
+    for picture in (p for section in page.sections for p in section.pictures):
+        paths, drawings[picture.name] = save_all(picture.figure, folder, picture.name)
+        written += paths
+    return written, drawings

@@ -3,35 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-import numpy as np
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from harness import Verdict
 from harness.crossval.discretisation import Discretisation
 from reports.data.evidence import Evidence, Outcome
 from reports.data.time_at_accuracy import (
-    SMALLEST,
     TimeAtAccuracy,
     counts,
     time_at_accuracy,
 )
 from reports.document.formatting import ABSENT, TIMED, clean, power, seconds, tolerance
 from reports.document.layout import Cell, Picture, Table, name_cell
-from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
+from reports.figures.sweeps import certified_figure
 from reports.statistics.intervals import COVERAGE
 
 ERRORS = (1e-2, 1e-4, 1e-6)  #: at which times are compared
 LEAST = 3  #: tolerances that make a sweep
-SHARE = 0.1  #: of the discretisation error that a solver may add
 _PANELS = 4  #: cases that are drawn; all are tabulated
-_COLUMNS = 4  #: of the legend
-_MESH: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": "--"}
-_TENTH: dict[str, Any] = {**_MESH, "linestyle": ":"}
 
 Sweeps = Mapping[str, Mapping[str, Sequence[Outcome]]]  #: case → solver → by tolerance
 
@@ -128,73 +116,24 @@ def certified_picture(
     """Draw certified error against time for the first few cases."""
     drawn = dict([*swept.items()][:_PANELS])
     rest = f" The first {len(drawn)} of {len(swept)} cases." * (len(swept) > len(drawn))
+    errors = {
+        physical: mesh.error
+        for physical, mesh in meshes.items()
+        if mesh.kind in ("limit", "change") and mesh.error
+    }
     lines = (
         " Below a tenth of the discretisation error, more digits say no more about the "
         "bodies; where refinement has no limit, it is the change to the next mesh."
-    ) * any(_mesh_error(row, meshes) for row in drawn.values())
+    ) * any(_physical(row) in errors for row in drawn.values())
     return Picture(
         name="certified",
         caption="Certified relative error in the energy norm against the median total "
         "time, a line per solver through the tolerances asked for. Bars: interval of "
         "the median. Filled: the solver's own test ended the solve; hollow: a limit "
         f"did, or it gave up.{lines}{rest}",
-        figure=_figure(drawn, solvers, meshes),
+        figure=certified_figure([*drawn.items()], solvers, errors),
     )
 
 
-def _mesh_error(
-    row: Mapping[str, Sequence[Outcome]], meshes: Mapping[str, Discretisation]
-) -> float | None:
-    physical = next(iter(row.values()))[0].physical
-    mesh = meshes.get(physical)
-    return mesh.error if mesh and mesh.kind in ("limit", "change") else None
-
-
-def _figure(
-    swept: Sweeps, solvers: Sequence[str], meshes: Mapping[str, Discretisation]
-) -> Figure:
-    columns = min(len(swept), 2)
-    lines = -(-len(swept) // columns)
-    names = [s for s in solvers if any(s in row for row in swept.values())]
-    with rc_context(STYLE):
-        legend = LEGEND_LINE * -(-(len(names) + 2) // _COLUMNS)
-        figure = Figure(figsize=(6.9, 0.3 + legend + 2.6 * lines))
-        grid = figure.subplots(lines, columns, squeeze=False).ravel()
-        for axes, (case, row) in zip(grid, swept.items(), strict=False):
-            for solver in (s for s in names if s in row):
-                _curve(axes, row[solver], look(solvers.index(solver)))
-            if error := _mesh_error(row, meshes):
-                axes.axhline(error, **_MESH)
-                axes.axhline(SHARE * error, **_TENTH)
-            axes.set_title(legible(case))
-            log_log(axes, "median total time in s", "certified relative error")
-        for axes in grid[len(swept) :]:
-            axes.set_axis_off()
-        keys = [Line2D([], [], **look(solvers.index(s))) for s in names]
-        labels = [legible(s) for s in names]
-        if any(_mesh_error(row, meshes) for row in swept.values()):
-            keys += [Line2D([], [], **style) for style in (_MESH, _TENTH)]
-            labels += ["discretisation error", "a tenth of it"]
-        figure.legend(keys, labels, loc="outside lower center", ncols=_COLUMNS)
-    return figure
-
-
-def _curve(axes: Axes, outcomes: Sequence[Outcome], style: dict[str, object]) -> None:
-    """Join the points that count; mark the others hollow, on their own."""
-    shown = [
-        (t.value, t.low, t.high, max(e, SMALLEST), counts(o))
-        for o in outcomes
-        if (e := o.largest("energy_bound")) is not None and np.isfinite(e)
-        and (t := o.seconds("total")) is not None
-    ]  # fmt: skip
-    for counted in (True, False):
-        points = [p[:4] for p in shown if p[4] is counted]
-        if not points:
-            continue
-        t, low, high, error = np.array(points, dtype=float).T
-        other = {} if counted else {"markerfacecolor": "none", "linestyle": "none"}
-        axes.plot(t, error, **{**style, **other})  # type: ignore[arg-type]
-        axes.errorbar(
-            t, error, xerr=[t - low, high - t], fmt="none", color=style["color"],
-            capsize=1.5, elinewidth=0.6, capthick=0.6, alpha=0.55,
-        )  # fmt: skip
+def _physical(row: Mapping[str, Sequence[Outcome]]) -> str:
+    return next(iter(row.values()))[0].physical

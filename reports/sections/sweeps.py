@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-
 from harness import Verdict
 from harness.crossval.discretisation import read_discretisation
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, TIMED, clean, seconds, tolerance
 from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.provenance import behind
-from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
+from reports.figures.sweeps import sweep_figure
 from reports.sections.cells import source
 from reports.sections.certified import (
     certified_picture,
@@ -23,9 +17,7 @@ from reports.sections.certified import (
     time_at_accuracy_table,
 )
 
-LEGEND_COLUMNS = 4
 _PANELS = 4  #: cases that are drawn; all are tabulated
-_LEAST = 1e-17  #: residuals below, zero among them, are drawn there
 
 Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
 
@@ -75,7 +67,7 @@ def _picture(
         caption="Certified accuracy (the largest of the four residuals) against the "
         "median total time, a line per solver through the tolerances asked for. Below "
         f"the horizontal line an answer is verified (filled).{rest}",
-        figure=_figure(drawn, solvers),
+        figure=sweep_figure([(case, row) for (case, _), row in drawn.items()], solvers),
     )
 
 
@@ -130,44 +122,3 @@ def _cell(
         value=interval.value,
         title=source(outcome),
     )
-
-
-def _figure(
-    swept: Mapping[Key, Mapping[str, list[Outcome]]], solvers: Sequence[str]
-) -> Figure:
-    columns = min(len(swept), 2)
-    lines = -(-len(swept) // columns)
-    names = [s for s in solvers if any(s in row for row in swept.values())]
-    with rc_context(STYLE):
-        legend = LEGEND_LINE * -(-len(names) // LEGEND_COLUMNS)
-        figure = Figure(figsize=(6.9, 0.3 + legend + 2.6 * lines))
-        grid = figure.subplots(lines, columns, squeeze=False).ravel()
-        for axes, ((case, _), row) in zip(grid, swept.items(), strict=False):
-            for solver, outcomes in row.items():
-                _curve(axes, outcomes, look(solvers.index(solver)))
-            allowed = next(iter(row.values()))[0].allowed
-            axes.axhline(allowed, color=INK, linewidth=0.8)
-            axes.set_title(legible(case))
-            log_log(axes, "median total time in s", "worst residual")
-        for axes in grid[len(swept) :]:
-            axes.set_axis_off()
-        keys = [Line2D([], [], **look(solvers.index(s))) for s in names]
-        labels = [legible(s) for s in names]
-        figure.legend(keys, labels, loc="outside lower center", ncols=LEGEND_COLUMNS)
-    return figure
-
-
-def _curve(axes: Axes, outcomes: Sequence[Outcome], style: dict[str, object]) -> None:
-    """Join the answers of one solver; hollow where they are not verified."""
-    points = [
-        (t.value, max(o.worst, _LEAST), o.records, o.verified)
-        for o in outcomes
-        if o.worst is not None and (t := o.seconds("total")) is not None
-    ]
-    filled = [point for point in points if point[-1]]
-    hollow = {**style, "markerfacecolor": "none"}
-    for drawn, style_of in ((points, hollow), (filled, {**style, "linestyle": "none"})):
-        if drawn:
-            x, y, runs, _ = zip(*drawn, strict=True)
-            (line,) = axes.plot(x, y, **style_of)  # type: ignore[arg-type]
-            behind(line, runs)

@@ -20,8 +20,8 @@ from reports.document.formatting import (
     tolerance,
 )
 from reports.document.layout import Cell, Section, Table, name_cell
+from reports.figures.sweeps import SHARE
 from reports.sections.cells import source
-from reports.sections.certified import SHARE
 from reports.sections.meshes import mesh_table
 
 _KNOWN = ("limit", "change")  #: kinds with an error to compare with

@@ -66,9 +66,9 @@ def write_validation(
     meshes : what finer meshes told, where they were solved
     """
     page, target = compose(data, meshes), directory / "report"
-    write_figures(page, target)
+    _, drawings = write_figures(page, target)
     return [
-        write_text(target / "validation.html", html(page)),
+        write_text(target / "validation.html", html(page, drawings)),
         write_text(target / "validation.md", markdown(page)),
     ]
 

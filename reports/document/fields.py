@@ -1,0 +1,146 @@
+"""Figures of bodies, to scale, as data: meshes, colours of a field, arrows.
+
+They are drawn into files only; a page embeds the drawing as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Vector
+from reports.document.figure import INK, MARGIN, WIDTH, Look, Numbers
+
+Points = NDArray[np.float64]  #: (n, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColourScale:
+    """Values as colours, and the bar that explains them."""
+
+    colours: str  #: a colour map of matplotlib
+    low: float
+    high: float
+    label: str = ""
+    unit: float = 1.0  #: value that the bar numbers as 1
+    beyond: Literal["neither", "max", "both"] = "neither"  #: where values are clipped
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ColourField:
+    """Values at nodes, as colours, linear within triangles."""
+
+    points: Points
+    triangles: NDArray[np.int64]  #: (t, 3)
+    values: Vector  #: (n,)
+    scale: ColourScale
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Polygons:
+    """Filled outlines."""
+
+    corners: tuple[Points, ...]
+    fill: str = "none"
+    opacity: float = 1.0  #: of the fill
+    edge: str = "none"
+    width: float = 0.0  #: of the edge, points
+    hatch: str = ""
+    cased: bool = False  #: whether the edge is set off by white from what lies below
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Strokes:
+    """Straight lines."""
+
+    ends: NDArray[np.float64]  #: (k, 2, 2)
+    colour: str
+    width: float
+    opacity: float = 1.0
+    rasterised: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Path:
+    """A line or marks through points."""
+
+    points: Points
+    look: Look
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Vectors:
+    """Arrows of a vector field, lengths in units of the axes."""
+
+    feet: Points
+    vectors: Points
+    colour: str
+    width: float  #: as a part of that of the panel
+    cased: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arrow:
+    """One arrow with a head as matplotlib names it."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    head: Literal["->", "<->", "-|>", "-"] = "->"
+    colour: str = INK
+    width: float = 0.7
+    size: float = 9.5  #: of the head
+    gap: float = 0.0  #: between the start and the line, points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label:
+    """A text at a point."""
+
+    text: str
+    place: tuple[float, float]
+    align: tuple[str, str] = ("left", "center")
+    offset: tuple[float, float] = (0.0, 0.0)  #: points
+    colour: str = INK
+    cased: bool = False
+
+
+FieldMark = ColourField | Polygons | Strokes | Path | Vectors | Arrow | Label
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FieldPanel:
+    """Bodies to scale, back to front."""
+
+    low: tuple[float, float]  #: lower left corner
+    high: tuple[float, float]
+    marks: tuple[FieldMark, ...]
+    title: str = ""
+    xlabel: str = ""
+    ylabel: str = ""
+    numbered: tuple[bool, bool] = (True, True)  #: ticks of x and of y
+    axes: Literal["lines", "frame", "none"] = "lines"
+    scale: ColourScale | None = None  #: explained by a bar below the panel
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FieldFigure:
+    """Panels of bodies in a grid."""
+
+    panels: tuple[FieldPanel, ...]
+    height: float  #: inches
+    width: float = WIDTH
+    columns: int = 1
+    heights: Numbers = (1.0,)  #: of the rows, relative
+    scale: ColourScale | None = None  #: of all panels, explained by a bar beside them
+
+
+def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lower left and upper right corner around bodies, with a margin."""
+    points = np.vstack(bodies)
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = MARGIN * (high - low)
+    (x0, y0), (x1, y1) = (low - pad).tolist(), (high + pad).tolist()
+    return (x0, y0), (x1, y1)

@@ -1,0 +1,250 @@
+"""Figures of curves, drawn with matplotlib."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis as TickedAxis
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure as Canvas
+from matplotlib.figure import SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import (
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+)
+
+from reports.document.figure import (
+    INK,
+    Area,
+    Axis,
+    ColourBar,
+    Figure,
+    Legend,
+    Look,
+    Mark,
+    Panel,
+    Segments,
+    Series,
+    Text,
+    fitted,
+)
+
+STYLE: Any = {
+    "font.family": ["STIXGeneral", "DejaVu Sans"],
+    "mathtext.fontset": "stix",
+    "font.size": 9.5,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.facecolor": "none",
+    "axes.axisbelow": True,
+    "grid.color": "#8a93a0",
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.4,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.minor.width": 0.4,
+    "ytick.minor.width": 0.4,
+    "figure.facecolor": "none",
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 220,
+    "svg.hashsalt": "mortarbench",
+    "svg.fonttype": "path",
+    "pdf.fonttype": 42,
+}
+_FRONT = 2.0  #: height of the first mark; each next one lies a little higher
+_PLACES: dict[str, Any] = {
+    "below": "outside lower center",
+    "right": "outside right upper",
+    "upper left": "upper left",
+}
+
+
+def draw_curves(figure: Figure) -> Canvas:
+    """Draw a figure; it is laid out when it is printed."""
+    whole = fitted(figure)
+    heights = [row.height for row in whole.rows]
+    with rc_context(STYLE):
+        canvas = Canvas(figsize=(whole.width, whole.height))
+        if any(row.legend for row in whole.rows):  # each has a part of its own
+            parts = canvas.subfigures(
+                len(heights), 1, height_ratios=heights, squeeze=False
+            )[:, 0]
+            places = [(part, 0, part.add_gridspec(1, whole.columns)) for part in parts]
+        else:
+            grid = canvas.add_gridspec(
+                len(heights), whole.columns, height_ratios=heights
+            )
+            places = [(canvas, i, grid) for i in range(len(heights))]
+        for row, (part, line, grid) in zip(whole.rows, places, strict=True):
+            column = 0
+            for panel in row.panels:
+                cell = grid[line, column : column + panel.span]
+                draw_panel(part.add_subplot(cell), panel)
+                column += panel.span
+            if row.legend:
+                _legend(part, row.legend)
+        if whole.legend:
+            _legend(canvas, whole.legend)
+    return canvas
+
+
+def draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draw a panel, whose axes have both ends, into axes."""
+    axes.set(
+        xscale="log" if panel.x.log else "linear",
+        yscale="log" if panel.y.log else "linear",
+        xlim=(panel.x.low, panel.x.high),
+        ylim=(panel.y.low, panel.y.high),
+        title=panel.title,
+    )
+    _axis(panel.x, axes.xaxis, across=True)
+    _axis(panel.y, axes.yaxis, across=False)
+    axes.spines["left"].set_visible(panel.y.line)
+    if panel.grid != "none":
+        axes.grid(visible=True, which="major", axis=panel.grid)
+    for rule in panel.rules:
+        line = axes.axvline if rule.axis == "x" else axes.axhline
+        line(rule.at, zorder=1.5, **_line(rule.look))
+    for i, mark in enumerate(panel.marks):
+        _mark(axes, mark, _FRONT + i / (1 + len(panel.marks)))
+    for text in panel.texts:
+        _text(axes, text)
+    if panel.legend:
+        _legend(axes, panel.legend)
+    if panel.bar:
+        _bar(axes, panel.bar)
+    axes.set(xlim=(panel.x.low, panel.x.high), ylim=(panel.y.low, panel.y.high))
+
+
+def _axis(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
+    """Set label and ticks."""
+    if axis.bare:  # a strip, whose label stands beside it
+        ticked.set_label_text(axis.label, rotation=0, ha="right", va="center", size=8.5)
+    else:
+        ticked.set_label_text(axis.label)
+    if axis.ticks is not None:
+        ticked.set_ticks([v for v, _ in axis.ticks], [name for _, name in axis.ticks])
+        ticked.set_minor_locator(NullLocator())
+    elif axis.log:
+        _log_ticks(axis, ticked)
+    elif axis.most is not None:
+        ticked.set_major_locator(MaxNLocator(axis.most, integer=axis.integers))
+    strokes, names = ("bottom", "labelbottom") if across else ("left", "labelleft")
+    ticked.set_tick_params(which="both", **{strokes: axis.marked, names: axis.numbered})
+
+
+def _log_ticks(axis: Axis, ticked: TickedAxis) -> None:
+    """Choose ticks so that their labels leave each other room."""
+    assert axis.low is not None
+    assert axis.high is not None
+    decades = np.log10(axis.high / axis.low)
+    ticked.set_minor_formatter(NullFormatter())
+    if axis.most is not None:
+        ticked.set_major_locator(LogLocator(numticks=axis.most))
+        ticked.set_minor_locator(NullLocator())
+    elif decades < 1.8:
+        few = MaxNLocator(4, steps=[1, 2, 2.5, 5, 10])
+        ticked.set_major_locator(few if decades < 0.5 else LogLocator(subs=(1, 2, 5)))
+        if axis.plain or decades < 0.5:
+            ticked.set_minor_locator(NullLocator())
+    if axis.plain or decades < 1.8:
+        ticked.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _line(look: Look) -> dict[str, Any]:
+    """Say how a line looks."""
+    style: Any = "none" if look.dash is None else (0, look.dash) if look.dash else "-"
+    return {
+        "color": look.colour, "linestyle": style, "linewidth": look.width,
+        "alpha": look.opacity if look.opacity < 1 else None,
+    }  # fmt: skip
+
+
+def look_of(look: Look) -> dict[str, Any]:
+    """Say how a line and its marks look."""
+    return {
+        **_line(look), "marker": look.marker or "none", "markersize": look.size,
+        "markerfacecolor": look.fill or look.colour, "markeredgewidth": look.edge,
+    }  # fmt: skip
+
+
+def _mark(axes: Axes, mark: Mark, height: float) -> None:
+    match mark:
+        case Series():
+            _series(axes, mark, height)
+        case Area():
+            axes.fill_between(
+                mark.x, mark.low, mark.high, step="post" if mark.step else None,
+                color=mark.colour, alpha=mark.opacity, linewidth=0, zorder=height,
+            )  # fmt: skip
+        case Segments():
+            ends = np.reshape(mark.ends, (-1, 2, 2))
+            lines = LineCollection(
+                list(ends), color=mark.colour, linewidth=mark.width, zorder=height
+            )
+            axes.add_collection(lines)
+
+
+def _series(axes: Axes, series: Series, height: float) -> None:
+    axes.plot(
+        series.x, series.y, drawstyle="steps-post" if series.step else "default",
+        markevery=(0.07, 0.19) if series.few else None, clip_on=series.clipped,
+        zorder=height, **look_of(series.look),
+    )  # fmt: skip
+    if (bars := series.intervals) is not None:
+        middle = np.array(series.y if bars.along == "y" else series.x)
+        down, up = middle - bars.low, np.array(bars.high) - middle
+        ends = np.maximum([down, up], 0)
+        x, y = (None, ends) if bars.along == "y" else (ends, None)
+        axes.errorbar(
+            series.x, series.y, y, x, "none", color=series.look.colour, zorder=height,
+            capsize=bars.cap,
+            elinewidth=bars.width, capthick=bars.width, alpha=bars.opacity,
+        )  # fmt: skip
+
+
+def _text(axes: Axes, text: Text) -> None:
+    x, y = ("axes fraction" if part else "data" for part in text.inside)
+    axes.annotate(
+        text.text, text.place, xycoords=(x, y), xytext=text.offset,
+        textcoords="offset points", ha=text.align[0], va=text.align[1],
+        fontsize=text.size,
+    )  # fmt: skip
+
+
+def _legend(where: Axes | Canvas | SubFigure, legend: Legend) -> None:
+    keys = [Line2D([], [], **look_of(key.look)) for key in legend.keys]
+    where.legend(
+        keys, [key.label for key in legend.keys], loc=_PLACES[legend.place],
+        ncols=legend.columns, title=legend.title or None, fontsize=legend.size,
+    )  # fmt: skip
+
+
+def _bar(axes: Axes, bar: ColourBar) -> None:
+    count = len(bar.colours)
+    norm = BoundaryNorm(np.arange(0.5, count + 1), count)
+    colours = ScalarMappable(norm=norm, cmap=ListedColormap(bar.colours))
+    assert isinstance(axes.figure, Canvas)
+    drawn = axes.figure.colorbar(colours, ax=axes, aspect=28, pad=0.02)
+    drawn.set_label(bar.label)
+    drawn.set_ticks(list(range(1, count + 1, max(count // 5, 1))))
+    drawn.ax.tick_params(which="minor", size=0)
+    drawn.outline.set_linewidth(0.5)

@@ -1,0 +1,117 @@
+"""Figures as files, the same bytes every time: what loads matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context, rcParams
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Canvas
+from matplotlib.transforms import Bbox
+
+from harness import Fields, InputError
+from reports.document.fields import FieldFigure
+from reports.document.figure import Figure
+from reports.figures.deformed import deformed_figure
+from reports.render.drawing import STYLE, draw_curves
+from reports.render.field_drawing import draw_fields
+from reports.render.svg import PAPER, Svg
+
+ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
+_METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}
+#: The style once all is in place: no figure gets a layout engine again.
+_LAID_OUT: Any = STYLE | {"figure.constrained_layout.use": False}
+
+
+def draw(figure: Figure | FieldFigure) -> Canvas:
+    """Draw a figure with matplotlib; it is laid out when it is printed."""
+    if isinstance(figure, Figure):
+        return draw_curves(figure)
+    return draw_fields(figure)
+
+
+def draw_deformed(fields: Fields, path: Path) -> None:
+    """Draw the deformed bodies with their von Mises stress to a png, pdf or svg file.
+
+    Raises
+    ------
+    InputError
+        When the ending is none of these, or the displacement is not finite.
+
+    """
+    if path.suffix not in ENDINGS:
+        known = ", ".join(sorted(ENDINGS))
+        raise InputError(
+            f"{path}: unknown kind of picture {path.suffix!r}; known: {known}"
+        )
+    canvas = draw(deformed_figure(fields))
+    _save(canvas, _placed(canvas), [path])
+
+
+def draw_svg(figure: Figure | FieldFigure) -> Svg:
+    """Draw a figure as the text of an SVG file."""
+    canvas = draw(figure)
+    return _svg(canvas, _placed(canvas))
+
+
+def save_all(
+    figure: Figure | FieldFigure, folder: Path, name: str
+) -> tuple[list[Path], Svg]:
+    """Write a figure in every format; it is drawn and laid out once.
+
+    Returns
+    -------
+    paths : list
+        The files, in the order of `ENDINGS`.
+    svg : Svg
+        What is in the SVG file.
+
+    """
+    canvas = draw(figure)
+    box = _placed(canvas)
+    paths = [folder / f"{name}{ending}" for ending in ENDINGS]
+    return paths, _save(canvas, box, paths)
+
+
+def _save(canvas: Canvas, box: Bbox, paths: Sequence[Path]) -> Svg:
+    """Write files in the formats of their endings."""
+    svg = _svg(canvas, box)
+    for path in paths:
+        if path.suffix == ".svg":
+            path.write_text(svg.text, "utf-8", newline="\n")
+        else:
+            _print(canvas, box, path, metadata=_METADATA.get(path.suffix, {}))
+    return svg
+
+
+def _svg(canvas: Canvas, box: Bbox) -> Svg:
+    text = StringIO()
+    _print(canvas, box, text, format="svg", metadata={"Date": None})
+    width, height = (72 * float(inches) for inches in canvas.get_size_inches())
+    frame = (-72 * box.x0, 72 * box.y1 - height, width, height)
+    return Svg(text.getvalue(), frame)
+
+
+def _print(canvas: Canvas, box: Bbox, target: Path | StringIO, **how: Any) -> None:
+    """Print on paper, cut to the box."""
+    with rc_context(_LAID_OUT):
+        canvas.savefig(target, bbox_inches=box, facecolor=PAPER, **how)
+
+
+def _placed(canvas: Canvas) -> Bbox:
+    """Place axes and legends, once for every format, and bound what is drawn, inches.
+
+    Without a layout engine, which matplotlib would run again before each format, a
+    format costs one drawing instead of two.
+    """
+    with rc_context(STYLE):
+        if (engine := canvas.get_layout_engine()) is not None:
+            engine.execute(canvas)
+            with rc_context(_LAID_OUT):
+                canvas.set_layout_engine(None)
+        pad = float(rcParams["savefig.pad_inches"])
+        renderer = FigureCanvasAgg(canvas).get_renderer()  # type: ignore[no-untyped-call]
+        return canvas.get_tightbbox(renderer).padded(pad)
