@@ -144,14 +144,14 @@ def _axis(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
         ticked.set_ticks([v for v, _ in axis.ticks], [name for _, name in axis.ticks])
         ticked.set_minor_locator(NullLocator())
     elif axis.log:
-        _log_ticks(axis, ticked)
+        _log_ticks(axis, ticked, across=across)
     elif axis.most is not None:
         ticked.set_major_locator(MaxNLocator(axis.most, integer=axis.integers))
     strokes, names = ("bottom", "labelbottom") if across else ("left", "labelleft")
     ticked.set_tick_params(which="both", **{strokes: axis.marked, names: axis.numbered})
 
 
-def _log_ticks(axis: Axis, ticked: TickedAxis) -> None:
+def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     """Choose ticks so that their labels leave each other room."""
     assert axis.low is not None
     assert axis.high is not None
@@ -161,7 +161,8 @@ def _log_ticks(axis: Axis, ticked: TickedAxis) -> None:
         ticked.set_major_locator(LogLocator(numticks=axis.most))
         ticked.set_minor_locator(NullLocator())
     elif decades < 1.8:
-        few = MaxNLocator(4, steps=[1, 2, 2.5, 5, 10])
+        most = 4 if across and not axis.plain else 6
+        few = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10])
         ticked.set_major_locator(few if decades < 0.5 else LogLocator(subs=(1, 2, 5)))
         if axis.plain or decades < 0.5:
             ticked.set_minor_locator(NullLocator())

@@ -24,13 +24,13 @@ _LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
 _RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
 
 
-def html(page: Page, drawings: Mapping[str, Svg]) -> str:
+def html(page: Page, drawings: Mapping[str, Svg] | None = None) -> str:
     """Render the whole report; all text is escaped, figures are inline.
 
     The policy in its head lets a browser run the one script that we wrote, known by
     its hash, and fetch nothing.
 
-    drawings : of the figures, by name
+    drawings : of the figures, by name, where they are drawn already
     """
     rows = rows_of(page.records)
     found = plots(page, rows)
@@ -43,7 +43,7 @@ def html(page: Page, drawings: Mapping[str, Svg]) -> str:
     )
     environment.filters["breakable"] = breakable
     environment.filters["told"] = partial(told, rows=rows)
-    environment.filters["drawn"] = partial(drawn, drawings=drawings)
+    environment.filters["drawn"] = partial(drawn, drawings=drawings or {})
     environment.filters["link"] = partial(link, page=page, rows=rows)
     return environment.from_string(_asset("page.html.j2")).render(
         page=page,
@@ -100,4 +100,9 @@ def link(cell: Cell, page: Page, rows: Rows) -> Markup:
 
 def drawn(picture: Picture, drawings: Mapping[str, Svg]) -> Markup:
     """Embed a figure; its text was made by us from names that `legible` has cleaned."""
-    return Markup(inline(drawings[picture.name], picture.name))
+    svg = drawings.get(picture.name)
+    if svg is None:
+        from reports.render.saving import draw_svg  # late: it loads matplotlib
+
+        svg = draw_svg(picture.figure)
+    return Markup(inline(svg, picture.name))

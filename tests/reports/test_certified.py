@@ -246,7 +246,7 @@ def test_cases_without_certificates_keep_their_residuals(page):
     (section,) = (s for s in both.sections if s.name == "accuracy")
 
     assert [p.name for p in section.pictures] == ["certified", "sweep"]
-    assert len(section.pictures[1].figure.axes) == 1
+    assert len(section.pictures[1].figure.panels) == 1
     assert len(section.tables) == 2
 
 
@@ -263,16 +263,15 @@ def test_the_curve_joins_what_counts_and_the_rest_is_hollow():
     ]  # fmt: skip
     evidence = Evidence(directory=Path(), records=arrange(records))
     picture = certified_picture(certified_sweeps(evidence), ("a",), {"box": MESH})
-    (axes,) = picture.figure.axes
-    joined, hollow = (line for line in axes.lines if line.get_marker() == "o")
-    mesh = [line.get_ydata()[0] for line in axes.lines if len(line.get_xdata()) == 2
-            and line.get_marker() == "None"]  # fmt: skip
+    (panel,) = picture.figure.panels
+    joined, hollow = panel.marks
+    mesh = [rule.at for rule in panel.rules]
 
-    assert joined.get_ydata().tolist() == [1e-2, 1e-4, 1e-6]
-    assert hollow.get_ydata().tolist() == [1e-8]
-    assert hollow.get_markerfacecolor() == "none"
-    assert MESH.error in mesh
-    assert MESH.error / 10 == pytest.approx(min(mesh))
+    assert joined.y == (1e-2, 1e-4, 1e-6)
+    assert joined.look.dash is not None
+    assert hollow.y == (1e-8,)
+    assert (hollow.look.dash, hollow.look.fill) == (None, "none")
+    assert mesh == pytest.approx([MESH.error, MESH.error / 10])
 
 
 MESH = Discretisation(

@@ -15,6 +15,7 @@ from reports.figures.scaling import scaling_figure
 from reports.folder import compose
 from reports.render.latex import latex
 from reports.render.markdown import markdown
+from reports.render.saving import draw
 from reports.statistics.intervals import PowerLaw, median_interval
 
 ELASTIC = {
@@ -363,7 +364,7 @@ def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
         records = [r for name in names for r in grown(measured, solver=name)]
         evidence = Evidence(directory=tmp_path, records=arrange(records))
         (series,) = size_series(evidence)
-        figure = scaling_figure(series, evidence.solvers)
+        figure = draw(scaling_figure(series, evidence.solvers))
         figure.draw_without_rendering()
         return figure.axes[0].get_position().height * figure.get_figheight()
 

@@ -15,8 +15,9 @@ from harness.results.journal import Journal
 from reports import write_report
 from reports.data.evidence import read_evidence
 from reports.data.histories import MOST, chosen
-from reports.figures.convergence import active_set_figure, convergence_figure
+from reports.figures import convergence
 from reports.folder import compose
+from reports.render.saving import draw
 
 KNOWN = {
     "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],
@@ -65,6 +66,10 @@ def _record(out, i, solver, history, changes):
 def comparison(folder):
     (only,) = chosen(read_evidence(folder))
     return only
+
+
+def convergence_figure(c):
+    return draw(convergence.convergence_figure(c))
 
 
 def section(folder):
@@ -145,7 +150,7 @@ def test_one_outer_iteration_makes_no_ticks(folder):
 
 
 def test_the_active_set_is_drawn_as_steps_over_products(folder):
-    figure = active_set_figure(comparison(folder(("a", KNOWN, {}))))
+    figure = draw(convergence.active_set_figure(comparison(folder(("a", KNOWN, {})))))
     (line,) = figure.axes[0].lines
 
     assert line.get_xydata().tolist() == [[2, 9], [4, 4], [6, 6], [7, 6]]

@@ -6,14 +6,15 @@ One Chromium for all tests, one page of a small campaign; hostile names have the
 import os
 import shutil
 
+import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from harness import Record, Verdict
 from harness.results.journal import Journal
 from reports.compare.changes import compare
 from reports.compare.page import compose as comparison
 from reports.data.evidence import read_evidence
+from reports.document.fields import FieldFigure, FieldPanel, Polygons
 from reports.document.layout import Page, Picture, Section
 from reports.folder import compose
 from reports.render.html_page import html
@@ -465,9 +466,10 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(visit, folder):
 def test_a_printed_figure_says_when_there_is_more_of_it_beside_the_screen(
     visit, tmp_path, width, wider
 ):
-    figure = Figure(figsize=(6.9, 2))
-    figure.subplots().imshow([[0.0, 1.0]])
-    picture = Picture(name="still", caption="Two cells.", figure=figure)
+    cell = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)])
+    panel = FieldPanel(low=(0, 0), high=(2, 1), marks=(Polygons(corners=(cell,)),))
+    figure = FieldFigure(panels=(panel,), height=2)
+    picture = Picture(name="still", caption="A cell.", figure=figure)
     section = Section(name="still", title="A still", pictures=(picture,))
     (tmp_path / "report").mkdir()
     text = html(Page(title="One figure", dateline="", sections=(section,)))

@@ -16,6 +16,7 @@ from reports.figures.profiles import ROW, pairwise_figure, profile_figure, rows_
 from reports.figures.style import look
 from reports.folder import compose
 from reports.render.markdown import markdown
+from reports.render.saving import draw
 
 LIMIT = 20.0
 
@@ -287,9 +288,9 @@ def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
     shown = [i for row in groups for i in row]
     assert sorted(shown) == sorted(int(i) for i in one.order[:16])
     for row in groups:
-        colours = {look(i)["color"] for i in row}
+        colours = {look(i).colour for i in row}
         assert len(colours) == len(row) <= ROW
-    figure = profile_figure(one, found.solvers)
+    figure = draw(profile_figure(one, found.solvers))
     named = [
         text.get_text()
         for part in figure.subfigs
@@ -302,7 +303,7 @@ def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
 def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
     found = evidence(some_records(record, 5))
     (one,) = map(ranking_of, comparison_groups(found))
-    figure = pairwise_figure(one, found.solvers)
+    figure = draw(pairwise_figure(one, found.solvers))
     drawn = [axes for axes in figure.axes if axes.axison]
     assert len(drawn) == 4
     for axes in drawn:
@@ -320,10 +321,10 @@ def test_bands_are_drawn_where_they_do_not_hide_each_other(
 ):
     found = evidence(some_records(record, solvers, cases=cases))
     (one,) = map(ranking_of, comparison_groups(found))
-    for axes in profile_figure(one, found.solvers).subfigs[0].axes:
+    for axes in draw(profile_figure(one, found.solvers)).subfigs[0].axes:
         assert len(axes.collections) == bands
     if solvers > 2:
-        assert len(pairwise_figure(one, found.solvers).axes[0].collections) == 2
+        assert len(draw(pairwise_figure(one, found.solvers)).axes[0].collections) == 2
 
 
 def test_two_solvers_need_no_pictures_of_pairs(record, evidence):

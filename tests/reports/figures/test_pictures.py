@@ -6,15 +6,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from matplotlib.collections import TriMesh
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Canvas
 from matplotlib.quiver import Quiver
 
 from harness import Fields, InputError
+from reports.document.fields import FieldFigure, FieldPanel, Polygons
+from reports.document.figure import Axis, Figure, Panel, Row, Series
 from reports.document.layout import Page, Picture, Section
-from reports.figures.deformed import deformed_figure, draw_deformed, outlines
-from reports.figures.saving import inline_svg, save_all
+from reports.figures.deformed import deformed_figure, outlines
 from reports.figures.style import look
-from reports.render.writing import ENDINGS, write_page
+from reports.render.saving import ENDINGS, draw, draw_deformed, save_all
+from reports.render.svg import inline
+from reports.render.writing import write_page
 
 LOWER, UPPER = 3, 6  # columns of cells
 
@@ -80,7 +83,7 @@ def test_cells_that_meet_in_one_node_only_keep_their_sides():
 
 
 def test_bodies_are_drawn_where_the_displacement_puts_them(bodies):
-    axes = deformed_figure(bodies).axes[0]
+    axes = draw(deformed_figure(bodies)).axes[0]
     moved = bodies.points + bodies.displacement
     for mesh, nodes in zip(artists(axes, TriMesh), (8, 14), strict=True):
         drawn = mesh._triangulation
@@ -96,7 +99,7 @@ def test_bodies_are_drawn_where_the_displacement_puts_them(bodies):
 
 
 def test_two_triangles_cover_each_quadrilateral(bodies):
-    meshes = artists(deformed_figure(bodies).axes[0], TriMesh)
+    meshes = artists(draw(deformed_figure(bodies)).axes[0], TriMesh)
     # The shear by −0.05 x keeps areas and takes the centre (1, y) to (1, y − 0.05).
     for mesh, area, middle in zip(meshes, (0.8, 0.6), (0.15, 0.55), strict=True):
         t = mesh._triangulation
@@ -117,7 +120,7 @@ def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
         points=points, cells=bodies.cells, bodies=bodies.bodies,
         displacement=np.zeros_like(points), nodal={"von_mises": many},
     )  # fmt: skip
-    meshes = artists(deformed_figure(fields).axes[0], TriMesh)
+    meshes = artists(draw(deformed_figure(fields)).axes[0], TriMesh)
     limits = {mesh.get_clim() for mesh in meshes}
     assert len(limits) == 1
     low, high = limits.pop()
@@ -127,31 +130,32 @@ def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
 
 
 def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
-    overview, zoom = deformed_figure(bodies).axes[:2]
+    overview, zoom = draw(deformed_figure(bodies)).axes[:2]
     assert not artists(overview, Quiver)
     (arrows,) = artists(zoom, Quiver)
     moved = bodies.points + bodies.displacement
-    np.testing.assert_allclose(arrows.XY, moved[bodies.contact_nodes[1:3]])
-    assert arrows.pivot == "tip"
     drawn = np.column_stack([arrows.U, arrows.V])
+    tips = moved[bodies.contact_nodes[1:3]]
+    np.testing.assert_allclose(arrows.XY + drawn, tips)
+    assert arrows.pivot == "tail"
     forces = bodies.contact_forces[1:3]
     np.testing.assert_allclose(drawn / drawn[0, 1], forces / forces[0, 1])
     assert "2.24 MN/m" in zoom.get_title(loc="left")
     (x0, x1), (y0, y1) = zoom.get_xlim(), zoom.get_ylim()
-    tails = arrows.XY - drawn
+    tails = arrows.XY
     assert ((x0 < tails[:, 0]) & (tails[:, 0] < x1)).all()
     assert ((y0 < tails[:, 1]) & (tails[:, 1] < y1)).all()
 
 
 def test_without_contact_forces_there_is_one_panel(bodies):
-    figure = deformed_figure(unloaded(bodies))
+    figure = draw(deformed_figure(unloaded(bodies)))
     assert len(figure.axes) == 2  # bodies and colour bar
     assert "displacement × 1" in figure.axes[0].get_title(loc="left")
 
 
 def test_without_stress_the_bodies_are_drawn_plain(bodies):
     fields = Fields(**{**vars(unloaded(bodies)), "nodal": {}})
-    figure = deformed_figure(fields)
+    figure = draw(deformed_figure(fields))
     assert len(figure.axes) == 1
     assert len(artists(figure.axes[0], TriMesh)) == 2
 
@@ -187,20 +191,24 @@ def test_bodies_without_extent_are_not_drawn(bodies, tmp_path):
 
 
 def test_fifty_solvers_look_different_from_each_other():
-    looks = {(look(i)["color"], look(i)["marker"]) for i in range(50)}
+    looks = {(look(i).colour, look(i).marker) for i in range(50)}
 
     assert len(looks) == 50
+
+
+def a_line():
+    series = Series(x=(1, 2), y=(3, 4), look=look(0))
+    panel = Panel(x=Axis(), y=Axis(), marks=(series,))
+    return Figure(rows=(Row(panels=(panel,)),), height=3)
 
 
 def test_a_figure_is_drawn_once_per_format_and_never_to_be_laid_out(
     tmp_path, monkeypatch
 ):
     drawings = []
-    draw = Figure.draw
-    monkeypatch.setattr(Figure, "draw", lambda *a: (drawings.append(1), draw(*a)))
-    figure = Figure(figsize=(6, 3), layout="constrained")
-    figure.subplots().plot([1, 2], [3, 4])
-    picture = Picture(name="line", caption="A line.", figure=figure)
+    draw = Canvas.draw
+    monkeypatch.setattr(Canvas, "draw", lambda *a: (drawings.append(1), draw(*a)))
+    picture = Picture(name="line", caption="A line.", figure=a_line())
     section = Section(name="line", title="A line", pictures=(picture,))
     page = Page(title="One figure", dateline="", sections=(section,))
     write_page(page, tmp_path, {"html", "md"})
@@ -210,18 +218,21 @@ def test_a_figure_is_drawn_once_per_format_and_never_to_be_laid_out(
 def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure(
     tmp_path,
 ):
-    figure = Figure(figsize=(6, 3))
-    axes = figure.add_axes((0.25, 0.5, 0.5, 0.25))
-    axes.set(xticks=[], yticks=[])
-    axes.patch.set_facecolor("#123456")
-    (file,) = save_all(figure, [tmp_path / "frame.svg"])
-    svg = inline_svg(figure, "frame")
-    left, top, width, height = map(float, re.search('viewBox="(.*?)"', svg)[1].split())
-    body = svg[: svg.index("#123456")].rpartition('d="')[2]
-    corners = np.array(re.findall(r"[ML] (\S+) (\S+)", body), dtype=float)
+    square = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * [2.0, 1.0]
+    panel = FieldPanel(
+        low=(-1, -1), high=(3, 2), axes="none",
+        marks=(Polygons(corners=(square,), fill="#123456"),),
+    )  # fmt: skip
+    figure = FieldFigure(panels=(panel,), width=6, height=3)
+    paths, svg = save_all(figure, tmp_path, "frame")
+    page = inline(svg, "frame")
+    box = re.search('viewBox="(.*?)"', page)[1].split()
+    left, top, width, height = map(float, box)
+    body = page[page.index('d="', page.rindex("<g", 0, page.index("#123456"))) :]
+    corners = np.array(re.findall(r"[ML] (\S+) (\S+)", body), dtype=float)[:4]
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2 - (left, top)
     assert (width, height) == (6 * 72, 3 * 72)
-    expected = [0.25 * width, 0.25 * height], [0.75 * width, 0.5 * height]
-    assert corners.min(axis=0) - (left, top) == pytest.approx(expected[0], abs=1e-3)
-    assert corners.max(axis=0) - (left, top) == pytest.approx(expected[1], abs=1e-3)
-    assert "#ffffff" in file.read_text()
-    assert "#ffffff" not in svg
+    assert middle == pytest.approx([width / 2, height / 2], abs=1)
+    assert paths[ENDINGS.index(".svg")].read_text() == svg.text
+    assert "#ffffff" in svg.text
+    assert "#ffffff" not in page

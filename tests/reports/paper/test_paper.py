@@ -25,7 +25,6 @@ from problems.fem.mesh import half_ring
 from problems.fem.triplets import stiffness_by_triplets
 from problems.models.beam_ring import BEAM
 from reports.data.evidence import Evidence, arrange, read_evidence
-from reports.figures.saving import save_all
 from reports.paper.contact import active
 from reports.paper.fleet import certified_table, fleet_figure, fleet_table, totals_table
 from reports.paper.geometry import dimensions
@@ -35,6 +34,7 @@ from reports.paper.samples import curve, fit, medians
 from reports.paper.stepping import errors, order
 from reports.paper.stress import extent
 from reports.paper.tables import PARTS
+from reports.render.saving import save_all
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import PAPER, SMALBE
 
@@ -166,11 +166,8 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, tmp_path):
     }  # fmt: skip
     files = [*(tmp_path / "data").glob("*.csv")]
     for name in ("figure1", "verification", "fleet"):
-        figures = [
-            tmp_path / f"figures/{name}{end}" for end in (".svg", ".pdf", ".png")
-        ]
-        figures[0].parent.mkdir(exist_ok=True)
-        files += save_all(pictures[name].figure, figures)
+        (tmp_path / "figures").mkdir(exist_ok=True)
+        files += save_all(pictures[name].figure, tmp_path / "figures", name)[0]
 
     assert len(files) > 9
     for path in files:
@@ -392,12 +389,13 @@ def evidence(name):
 def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
     """`lazy` took 1 ns to be wrong: below every axis, and a cross instead."""
     figure = fleet_figure(evidence("paper-fleet"))
-    times, strips = figure.axes[:2], figure.axes[2:]
+    times, strips = (row.panels for row in figure.rows)
 
-    for axes in times:
-        drawn = np.concatenate([line.get_ydata() for line in axes.lines])
-        assert drawn.min() >= 2.5e-3
-    assert all(line.get_xdata() == [200] for axes in strips for line in axes.lines)
+    for panel in times:
+        assert min(y for series in panel.marks for y in series.y) >= 2.5e-3
+    for panel in strips:
+        assert [series.x for series in panel.marks] == [(200,)]
+        assert [series.solver for series in panel.marks] == ["lazy"]
     assert len(strips) == 2
 
 
@@ -435,9 +433,7 @@ def test_no_panel_is_empty(experiment):
     suites = {name: evidence(name) for name in planted()}
     for section in compose(experiment, suites).sections:
         for picture in section.pictures:
-            for axes in picture.figure.axes:
-                drawn = axes.lines, axes.collections, axes.patches, axes.images
-                assert any(drawn), picture.name
+            assert all(panel.marks for panel in picture.figure.panels), picture.name
 
 
 def test_colours_end_at_the_quantile_of_the_size(experiment):

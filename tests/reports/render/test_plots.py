@@ -1,22 +1,45 @@
-"""What the page draws is what the figure shows: curves, axes, runs and solvers."""
+"""What files and the page draw is what the figure's value says, point by point."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 
 from harness import Record, Verdict
+from reports.document.figure import (
+    Area,
+    Axis,
+    ColourBar,
+    Figure,
+    Intervals,
+    Key,
+    Legend,
+    Look,
+    Panel,
+    Row,
+    Rule,
+    Segments,
+    Series,
+    Text,
+    categories,
+    fitted,
+    in_rows,
+)
 from reports.document.layout import Cell, Table, named
-from reports.figures.provenance import behind
-from reports.figures.style import legible, look
-from reports.render.artists import MOST
+from reports.figures.style import COLOURS, legible, look
 from reports.render.embedded import cell, rows_of, script, spans, table
 from reports.render.mathtext import plain
-from reports.render.plots import read_back
+from reports.render.plots import MOST, panels
+from reports.render.saving import draw
 
-LABELS = {"a $b": legible("a $b"), "b": "b", "b2": "b2"}
+SOLVERS = {"a $b": 0, "b": 1, "b2": 2}
+LOG = Axis(log=True)
+TIMES = Series(
+    x=(1, 10, 100), y=(3, 2, 1), look=look(1), solver="b",
+    intervals=Intervals(low=(2.5, 1.5, 0.5), high=(4, 3, 2)),
+    runs=(("r0", "r1"), ("r2",), ("r3",)),
+)  # fmt: skip
 
 
 def record(run_id, solver="b"):
@@ -27,24 +50,30 @@ def record(run_id, solver="b"):
     )  # fmt: skip
 
 
-@pytest.fixture
-def axes():
-    return Figure().subplots()
+def figure(*marks, **panel):
+    given = {"x": Axis(), "y": Axis(), **panel}
+    return Figure(rows=(Row(panels=(Panel(marks=marks, **given),)),), height=3)
 
 
-def read(axes):
-    (panel,) = read_back(axes.get_figure(), LABELS)
-    return panel
+def shown(*marks, **panel):
+    """Describe a figure of one panel for the page."""
+    (one,) = panels(figure(*marks, **panel), SOLVERS)
+    return one
 
 
-def test_a_line_is_read_back_with_its_look_its_axes_and_its_runs(axes):
-    (line,) = axes.plot([1, 10, 100], [3, 2, 1], **look(1))
-    axes.set(xscale="log", xlabel="size $n$", ylabel="time in s", xlim=(1, 100))
-    behind(line, [[record("r0"), record("r1")], [record("r2")], [record("r3")]])
-    panel = read(axes)
-    (trace,) = panel["traces"]
+def drawn(*marks, **panel):
+    """Draw a figure of one panel with matplotlib."""
+    (axes,) = draw(figure(*marks, **panel)).axes
+    return axes
+
+
+def test_a_line_has_its_look_its_axes_its_solver_and_its_runs():
+    size = Axis(label="size $n$", log=True, low=1, high=100)
+    panel = shown(TIMES, x=size, y=Axis(label="time in s"))
+    trace, *_ = panel["traces"]
+
     assert (trace["x"], trace["y"]) == ([1, 10, 100], [3, 2, 1])
-    assert trace["runs"] == [["r0", "r1"], ["r2"], ["r3"]]
+    assert trace["runs"] == (("r0", "r1"), ("r2",), ("r3",))
     assert (trace["colour"], trace["marker"]) == ("#d55e00", "s")
     assert (trace["s"], trace["step"], trace["hollow"]) == (1, False, False)
     assert len(trace["dash"].split()) == 2
@@ -55,108 +84,214 @@ def test_a_line_is_read_back_with_its_look_its_axes_and_its_runs(axes):
     assert panel["y"]["log"] is False
 
 
-def test_a_line_without_runs_belongs_to_whom_its_label_names(axes):
-    axes.plot([1, 2], [1, 2], label=legible("a $b") + ",  p = 1.0")
-    axes.plot([1, 2], [1, 2], label="b2")
-    axes.plot([1, 2], [1, 2], label="bound")
-    assert [t["s"] for t in read(axes)["traces"]] == [0, 2, -1]
+@pytest.mark.parametrize("log", [False, True])
+def test_files_and_the_page_show_the_same_points_error_bars_and_ends_of_axes(log):
+    axis = LOG if log else Axis()
+    axes, panel = drawn(TIMES, x=axis, y=axis), shown(TIMES, x=axis, y=axis)
+    (line,) = (one for one in axes.lines if one.get_marker() == "s")
+    trace, bars, *caps = panel["traces"]
+
+    np.testing.assert_allclose(line.get_xydata().T, (trace["x"], trace["y"]))
+    (segments,) = axes.collections
+    ends = np.reshape(segments.get_segments(), (-1, 4))
+    np.testing.assert_allclose(ends, bars["ends"])
+    assert bars["ends"] == [[1, 2.5, 1, 4], [10, 1.5, 10, 3], [100, 0.5, 100, 2]]
+    assert [cap["y"] for cap in caps] == [[2.5, 1.5, 0.5], [4, 3, 2]]
+    assert all(part["s"] == 1 for part in (bars, *caps))
+    assert all(part["runs"] == TIMES.runs for part in (bars, *caps))
+    for direction in "xy":
+        limits = getattr(axes, f"get_{direction}lim")()
+        assert limits == pytest.approx(panel[direction]["limits"])
+        assert getattr(axes, f"get_{direction}scale")() == ("log" if log else "linear")
+        assert panel[direction]["log"] is log
 
 
-def test_a_line_without_a_label_belongs_to_the_key_that_looks_like_it(axes):
-    handles = [axes.plot([1, 2], [i, i + 1], **look(i))[0] for i in range(3)]
-    axes.get_figure().legend(handles, list(LABELS.values()))
-    panel = read(axes)
-    assert [t["s"] for t in panel["traces"]] == [0, 1, 2]
-    assert [k["label"] for k in panel["common"]["keys"]] == ["a $b", "b", "b2"]
+def test_error_bars_along_x_lie_along_x():
+    series = Series(
+        x=(1,), y=(5,), look=look(0),
+        intervals=Intervals(low=(0.5,), high=(3,), along="x"),
+    )  # fmt: skip
+    _, bars, left, right = shown(series)["traces"]
+
+    assert bars["ends"] == [[0.5, 5, 3, 5]]
+    assert (left["x"], right["x"], left["y"], left["marker"]) == ([0.5], [3], [5], "|")
+    (segments,) = drawn(series).collections
+    np.testing.assert_allclose(segments.get_segments(), [[(0.5, 5), (3, 5)]])
 
 
-def test_bands_and_error_bars_belong_to_the_line_of_their_colour(axes):
-    for i, label in enumerate(LABELS.values()):
-        axes.plot([1, 2], [1, 2], label=label, **look(i))
-        axes.fill_between([1, 2], [0, 1], [2, 3], color=look(i)["color"], alpha=0.1)
-        axes.errorbar([1], [1], yerr=[1], fmt="none", color=look(i)["color"], capsize=2)
-    assert sorted(t["s"] for t in read(axes)["traces"]) == sorted([0, 1, 2] * 5)
+def test_axes_hold_all_points_and_the_ends_of_their_error_bars_with_a_margin():
+    """On a logarithmic axis from 0.5 to 4 a margin is a twentieth of that."""
+    (panel,) = fitted(figure(TIMES, x=LOG, y=LOG)).panels
+
+    assert panel.y.low == pytest.approx(0.5 * 8**-0.05)
+    assert panel.y.high == pytest.approx(4 * 8**0.05)
+    (panel,) = fitted(figure(TIMES)).panels
+    assert (panel.x.low, panel.x.high) == pytest.approx((1 - 4.95, 100 + 4.95))
 
 
-def test_legends_of_parts_of_a_figure_are_keys_of_the_whole():
-    figure = Figure()
-    for part, label in zip(figure.subfigures(2, 1), ("b", "b2"), strict=True):
-        lines = part.subplots().plot([1, 2], [1, 2], **look(1))
-        part.legend(lines, [label])
-    first, _ = read_back(figure, LABELS)
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize("values", [(), (3.0,), (0.0, 0.0), (np.nan, np.inf), (-1.0,)])
+def test_any_points_make_an_axis_that_has_two_ends(values, log):
+    series = Series(x=values, y=values, look=look(0))
+    (panel,) = fitted(figure(series, x=Axis(log=log), y=Axis(log=log))).panels
+
+    assert panel.x.low < panel.x.high
+    assert np.isfinite([panel.x.low, panel.x.high]).all()
+    assert panel.x.low > 0 or not log
+    drawn(series, x=Axis(log=log), y=Axis(log=log))
+
+
+def test_axes_of_one_name_have_the_same_ends_and_others_their_own():
+    shared, own = Axis(shared="n"), Axis()
+    near, far = (Series(x=(0, at), y=(0, at), look=look(0)) for at in (1, 9))
+    both = [Panel(x=shared, y=own, marks=(one,)) for one in (near, far)]
+    left, right = panels(Figure(rows=in_rows(both, 2), height=3), SOLVERS)
+
+    assert left["x"]["limits"] == right["x"]["limits"] == [-0.45, 9.45]
+    assert left["y"]["limits"] == [-0.05, 1.05]
+    assert left["share"] == right["share"]
+    assert left["columns"] == 2
+
+
+def test_an_axis_of_categories_has_their_names_from_top_to_bottom():
+    names = categories(["first", "second"])
+    series = Series(x=(1, 2), y=(0, -1), look=look(0))
+
+    assert shown(series, y=names)["y"]["ticks"] == [[0, "first"], [-1, "second"]]
+    axes = drawn(series, y=names)
+    assert [t.get_text() for t in axes.get_yticklabels()] == ["first", "second"]
+    assert list(axes.get_yticks()) == [0, -1]
+    assert axes.get_ylim() == (-1.6, 0.6)
+
+
+def test_a_key_acts_for_the_solver_that_it_names():
+    keys = tuple(Key(label=legible(s), look=look(i), solver=s)
+                 for s, i in SOLVERS.items())  # fmt: skip
+    bound = Key(label="bound", look=Look(colour="#000000"))
+    whole = Figure(
+        rows=figure(TIMES).rows, height=3, legend=Legend(keys=(*keys, bound))
+    )
+    (panel,) = panels(whole, SOLVERS)
+
+    assert [(k["label"], k["s"]) for k in panel["common"]["keys"]] == [
+        ("a $b", 0), ("b", 1), ("b2", 2), ("bound", -1),
+    ]  # fmt: skip
+    (legend,) = draw(whole).legends
+    assert [t.get_text() for t in legend.get_texts()] == [
+        k.label for k in (*keys, bound)
+    ]
+
+
+def test_legends_of_rows_are_keys_of_the_whole():
+    rows = tuple(
+        Row(
+            panels=figure(TIMES).panels,
+            legend=Legend(keys=(Key(label=name, look=look(0), solver=name),)),
+        )
+        for name in ("b", "b2")
+    )
+    first, _ = panels(Figure(rows=rows, height=3), SOLVERS)
+
     assert [key["label"] for key in first["common"]["keys"]] == ["b", "b2"]
 
 
 def test_a_legend_within_axes_is_that_of_their_panel_only():
-    figure = Figure()
-    for axes, label in zip(figure.subplots(1, 2), ("b", "bound"), strict=True):
-        axes.plot([1, 2], [1, 2], label=label, **look(0))
-        axes.legend(title=f"of {label}")
-    panels = read_back(figure, LABELS)
-    assert [p["own"]["title"] for p in panels] == ["of b", "of bound"]
-    assert [[k["label"] for k in p["own"]["keys"]] for p in panels] == [
-        ["b"],
-        ["bound"],
+    legend = Legend(keys=(Key(label="b", look=look(0)),), title="of b")
+    panel = shown(TIMES, legend=legend)
+
+    assert panel["own"]["title"] == "of b"
+    assert [k["label"] for k in panel["own"]["keys"]] == ["b"]
+    assert panel["common"]["keys"] == []
+
+
+def test_the_colours_of_a_bar_are_keys_on_the_page():
+    bar = ColourBar(label="load step", colours=COLOURS[:2])
+    own = shown(TIMES, bar=bar)["own"]
+
+    assert own["title"] == "load step"
+    assert [(k["label"], k["colour"]) for k in own["keys"]] == [
+        ("1", COLOURS[0]), ("2", COLOURS[1]),
+    ]  # fmt: skip
+
+
+def test_a_band_of_steps_goes_around_what_lies_between():
+    """1 to 2 until x = 1, 0 to 3 until x = 2: area 1 + 3."""
+    band = Area(
+        x=(0, 1, 2), low=(1, 0, 0), high=(2, 3, 3), colour="#112233", opacity=0.25,
+        step=True, solver="b2",
+    )  # fmt: skip
+    (trace,) = shown(band)["traces"]
+    x, y = np.reshape(trace["outlines"][0], (-1, 2)).T
+
+    assert abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 == 4
+    assert (trace["s"], trace["opacity"], trace["colour"]) == (2, 0.25, "#112233")
+    (polygon,) = drawn(band).collections
+    u, v = polygon.get_paths()[0].vertices.T
+    assert abs(u @ np.roll(v, 1) - v @ np.roll(u, 1)) / 2 == pytest.approx(4)
+
+
+def test_segments_rules_and_texts_are_where_they_are():
+    strokes = Segments(ends=((1, 0, 1, 2),), colour="#112233", runs=(("r1",),))
+    rule = Rule(axis="y", at=10.0, look=Look(colour="#112233", dash=(4, 2), width=0.5))
+    text = Text(
+        text="$n^2$", place=(1, 10), inside=(True, False), align=("right", "top")
+    )
+    panel = shown(strokes, rules=(rule,), texts=(text,))
+
+    assert panel["traces"][0]["ends"] == [[1, 0, 1, 2]]
+    assert panel["traces"][0]["runs"] == (("r1",),)
+    assert [(r["axis"], r["at"], r["dash"]) for r in panel["rules"]] == [
+        ("y", 10, "2 1")
     ]
-    assert [p["traces"][0]["s"] for p in panels] == [1, -1]
+    assert panel["texts"] == [
+        {"text": "n²", "place": [1, 10], "inside": [True, False],
+         "align": ["right", "top"]},
+    ]  # fmt: skip
+    axes = drawn(strokes, rules=(rule,), texts=(text,))
+    assert [list(one.get_ydata()) for one in axes.lines] == [[10, 10]]
+    assert axes.get_ylim()[1] > 10  # a rule is seen
 
 
-def test_numbers_under_an_axis_are_left_out_where_the_figure_leaves_them_out():
-    figure = Figure()
-    for axes in figure.subplots(2, 1, sharex=True):
-        axes.plot([1, 2], [1, 2])
-    panels = read_back(figure, LABELS)
-    assert [p["x"]["numbered"] for p in panels] == [False, True]
-    assert panels[0]["share"] == panels[1]["share"]
-
-
-def test_bars_bands_and_rules_are_read_back(axes):
-    axes.errorbar([1, 2], [1, 2], yerr=[0.5, 0.5], fmt="o", capsize=2)
-    axes.fill_between([0, 1], [0, 0], [1, 2], alpha=0.25)
-    axes.axhline(10.0)
-    axes.axvline(0.5)
-    axes.bar([3], [4], width=1)
-    panel = read(axes)
-    kinds = [t["kind"] for t in panel["traces"]]
-    assert sorted(kinds) == ["area"] * 2 + ["line"] * 3 + ["segments"]
-    (bars,) = (t for t in panel["traces"] if t["kind"] == "segments")
-    assert bars["ends"] == [[1, 0.5, 1, 1.5], [2, 1.5, 2, 2.5]]
-    areas = [t for t in panel["traces"] if t["kind"] == "area"]
-    corners = next(t["outlines"][0] for t in areas if t["opacity"] == 1)
-    assert set(zip(corners[::2], corners[1::2], strict=True)) == {
-        (2.5, 0), (3.5, 0), (3.5, 4), (2.5, 4),
-    }  # fmt: skip
-    assert [(r["axis"], r["at"]) for r in panel["rules"]] == [("y", 10), ("x", 0.5)]
-
-
-def test_ticks_that_have_names_keep_them(axes):
-    axes.plot([1, 2], [0, 1])
-    axes.set_yticks([0, 1], ["first", "second"])
-    assert read(axes)["y"]["ticks"] == [[0, "first"], [1, "second"]]
-
-
-def test_a_long_line_keeps_its_ends_and_its_extremes(axes):
+def test_a_long_line_keeps_its_ends_and_its_extremes_on_the_page_and_all_in_files():
     y = np.sin(np.arange(50_000.0))
     y[31_415], y[27_182] = 7.0, -7.0
-    axes.plot(y)
-    (trace,) = read(axes)["traces"]
+    line = Series(x=tuple(range(50_000)), y=tuple(y), look=look(0), runs=(("r1",),))
+    (trace,) = shown(line)["traces"]
+
     assert len(trace["x"]) <= MOST + 2
     assert (trace["x"][0], trace["x"][-1]) == (0, 49_999)
     assert (max(trace["y"]), min(trace["y"])) == (7, -7)
+    assert len(drawn(line).lines[0].get_xdata()) == 50_000
 
 
-@pytest.mark.parametrize("what", ["mesh", "picture", "cloud", "equal"])
-def test_a_figure_with_more_than_curves_is_left_as_it_is(axes, what):
-    match what:
-        case "mesh":
-            axes.pcolormesh(np.eye(3))
-        case "picture":
-            axes.imshow(np.eye(3), cmap=colormaps["viridis"], aspect="auto")
-        case "cloud":
-            axes.scatter([1, 2], [1, 2])
-        case "equal":
-            axes.set_aspect("equal")
-    assert read_back(axes.get_figure(), LABELS) is None
+def test_a_line_whose_points_have_runs_of_their_own_keeps_all_of_them():
+    n = MOST + 100
+    runs = tuple((f"r{i}",) for i in range(n))
+    line = Series(x=tuple(range(n)), y=(1.0,) * n, look=look(0), runs=runs)
+    (trace,) = shown(line)["traces"]
+
+    assert len(trace["x"]) == len(trace["runs"]) == n
+
+
+def test_a_figure_is_plain_data_that_can_be_compared_and_sent_to_a_process():
+    one = figure(TIMES, x=LOG, y=categories(["a"]))
+
+    assert pickle.loads(pickle.dumps(one)) == one
+    assert hash(one) == hash(figure(TIMES, x=LOG, y=categories(["a"])))
+    assert one != figure(TIMES, x=Axis(), y=categories(["a"]))
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"y": (1.0,)},
+        {"runs": (("r0",), ("r1",))},
+        {"intervals": Intervals(low=(1,), high=(2,))},
+    ],
+)
+def test_points_whose_numbers_do_not_fit_are_refused(broken):
+    with pytest.raises(ValueError, match=r"differ in number|lists of runs"):
+        Series(**{"x": (1, 2, 3), "y": (1, 2, 3), "look": look(0), **broken})
 
 
 def test_formulas_read_as_text():
