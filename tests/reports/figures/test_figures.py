@@ -1,0 +1,185 @@
+"""What figures of reports say: whose points they show, and the measurements behind."""
+
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness import Verdict
+from reports.compare.changes import compare
+from reports.compare.figure import ratios_figure
+from reports.data.evidence import Evidence, arrange
+from reports.data.size_series import size_series
+from reports.document.figure import Figure, Series
+from reports.figures.accuracy import accuracy_figure
+from reports.figures.scaling import scaling_figure
+from reports.figures.style import GUIDE
+from reports.figures.sweeps import certified_figure, sweep_figure
+from reports.folder import compose
+from reports.validation.error_figure import error_figure
+from tests.support.synthetic_results import records
+
+SOLVERS, CASES, REPEATS = 3, 60, 2
+TOLS = (1e-2, 1e-4, 1e-6)
+
+
+def evidence(given):
+    return Evidence(directory=Path(), records=arrange(list(given)))
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    return evidence(records(SOLVERS, CASES, REPEATS))
+
+
+def series(figure):
+    return [
+        mark
+        for panel in figure.panels
+        for mark in panel.marks
+        if isinstance(mark, Series)
+    ]
+
+
+def told(figure):
+    """Map every point (solver, x, y) that has measurements to these."""
+    return {
+        (one.solver, x, y): runs
+        for one in series(figure)
+        for x, y, runs in zip(one.x, one.y, one.runs, strict=bool(one.runs))
+    }
+
+
+def swept():
+    """Every solver once per tolerance, with residual and certified error 2·tol."""
+    first = {r.solver: r for r in reversed([*records(SOLVERS, 1, 1)])}
+    return [
+        r.but(
+            run_id=f"{solver} {tol}", tol=tol, accuracy=1e-3, energy_bound=2 * tol,
+            primal=2 * tol, dual=0.0, complementarity=0.0, gap=0.0,
+            status=Verdict.VERIFIED, claimed="solved",
+        )
+        for solver, r in first.items()
+        for tol in TOLS
+    ]  # fmt: skip
+
+
+def test_every_mark_of_accuracy_names_the_measurements_of_its_cell(campaign):
+    points = told(accuracy_figure(campaign))
+    expected = {
+        (o.solver, o.seconds("total").value, o.worst / o.tol): o.run_ids
+        for o in campaign.flat
+        if o.seconds("total")
+    }
+
+    assert len(points) == SOLVERS * CASES
+    assert {key: list(runs) for key, runs in points.items()} == {
+        key: list(runs) for key, runs in expected.items()
+    }
+
+
+def test_verified_marks_are_filled_and_the_others_hollow(campaign):
+    verified = {i for o in campaign.flat if o.verified for i in o.run_ids}
+    for one in series(accuracy_figure(campaign)):
+        filled = one.look.fill == ""
+        assert all((i in verified) is filled for runs in one.runs for i in runs)
+
+
+def test_times_and_iterations_over_size_name_the_measurements_of_their_size(campaign):
+    grown = [
+        r.but(run_id=f"{solver} {n} {i}", solver=solver, case=f"box/n={n}/dual",
+              family="box", form="dual", params={"n": n}, iterations=n,
+              sizes={"variables": n}, quantities={"dofs": n}, total_seconds=1e-6 * n,
+              status=Verdict.VERIFIED)
+        for solver in ("a", "b")
+        for n, r in zip((10, 20, 40, 80), records(1, 4, 1), strict=True)
+        for i in range(3)
+    ]  # fmt: skip
+    found = evidence(grown)
+    (one,) = size_series(found)
+    times, counts = scaling_figure(one, found.solvers).panels
+    for panel, values in ((times, 1e-6), (counts, 1)):
+        curves = [m for m in panel.marks if m.solver]
+        assert [m.solver for m in curves] == ["a", "b"]
+        for curve in curves:
+            assert curve.x == (10, 20, 40, 80)
+            assert curve.y == pytest.approx([values * n for n in curve.x])
+            assert curve.runs == tuple(
+                tuple(f"{curve.solver} {n:g} {i}" for i in range(3)) for n in curve.x
+            )
+
+
+@pytest.mark.parametrize("certified", [False, True])
+def test_points_of_a_sweep_name_the_measurement_at_their_tolerance(certified):
+    found = evidence(swept())
+    row = {}
+    for o in found.flat:
+        row.setdefault(o.solver, []).append(o)
+    if certified:
+        figure = certified_figure([("c", row)], found.solvers, {})
+    else:
+        figure = sweep_figure([("c", row)], found.solvers)
+
+    points = {(solver, y): runs for (solver, _, y), runs in told(figure).items()}
+    assert points == {
+        (solver, 2 * tol): (f"{solver} {tol}",) for solver in row for tol in TOLS
+    }
+
+
+def test_ratios_name_the_measurements_after():
+    before = [*records(2, 8, 3)]
+    after = [r.but(run_id=f"after {r.run_id}") for r in before]
+    made = compare(evidence(before), evidence(after))
+    runs = [i for ids in told(ratios_figure(made)).values() for i in ids]
+
+    assert runs
+    assert set(runs) <= {r.run_id for r in after}
+
+
+def test_every_certified_error_names_its_answer():
+    answers = [
+        {"solver": s, "form": "primal", "refuted": False, "tol": 1e-6, "error": e,
+         "run_id": f"{s}{e}", "energy_allowed": 1e-2}
+        for s in "ba" for e in (1e-8, 1e-7)
+    ]  # fmt: skip
+    figure = error_figure(answers, 1e-6)
+    points = {(solver, x): runs for (solver, x, _), runs in told(figure).items()}
+
+    assert points == {(a["solver"], a["error"]): (a["run_id"],) for a in answers}
+    (panel,) = figure.panels
+    rows = {one.solver: one.y for one in series(figure)}
+    names = {name: at for at, name in panel.y.ticks}
+    assert all(abs(y - names[s]) < 0.5 for s, ys in rows.items() for y in ys)
+
+
+def test_all_figures_of_a_report_are_plain_data(campaign):
+    again = compose(evidence(records(SOLVERS, CASES, REPEATS)))
+    figures, same = (
+        [p.figure for section in page.sections for p in section.pictures]
+        for page in (compose(campaign), again)
+    )
+
+    assert len(figures) > 2
+    assert all(isinstance(figure, Figure) for figure in figures)
+    assert figures == same == pickle.loads(pickle.dumps(figures))
+
+
+def test_what_is_drawn_of_a_solver_bears_its_name(campaign):
+    """A page hides a solver by its name: curves, bands and error bars alike."""
+    for section in compose(campaign).sections:
+        for picture in section.pictures:
+            for panel in picture.figure.panels:
+                for mark in panel.marks:
+                    guide = isinstance(mark, Series) and mark.look == GUIDE
+                    assert guide or mark.solver in campaign.solvers
+
+
+def test_putting_a_report_together_loads_no_matplotlib():
+    """It takes a second, which only those who draw should pay."""
+    code = (
+        "import sys, reports.folder, reports.paper.report, reports.validation.report;"
+        "sys.exit('matplotlib' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
