@@ -101,12 +101,12 @@ class Answer:
 
         """
         from reports.figures.deformed import deformed_figure
-        from reports.figures.saving import save
+        from reports.render.saving import draw, save
 
         figure = deformed_figure(self.fields())
         if path is not None:
             save(figure, writable(Path(path), PICTURES))
-        return figure
+        return draw(figure)
 
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.

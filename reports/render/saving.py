@@ -12,10 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 from matplotlib.transforms import Bbox
 
-from harness import Fields, InputError
+from harness import InputError
 from reports.document.fields import FieldFigure
 from reports.document.figure import Figure
-from reports.figures.deformed import deformed_figure
 from reports.render.drawing import STYLE, draw_curves
 from reports.render.field_drawing import draw_fields
 from reports.render.svg import PAPER, Svg
@@ -33,13 +32,13 @@ def draw(figure: Figure | FieldFigure) -> Canvas:
     return draw_fields(figure)
 
 
-def draw_deformed(fields: Fields, path: Path) -> None:
-    """Draw the deformed bodies with their von Mises stress to a png, pdf or svg file.
+def save(figure: Figure | FieldFigure, path: Path) -> None:
+    """Write a figure in the format of the file's ending, the same bytes every time.
 
     Raises
     ------
     InputError
-        When the ending is none of these, or the displacement is not finite.
+        When the ending is none of `ENDINGS`.
 
     """
     if path.suffix not in ENDINGS:
@@ -47,7 +46,7 @@ def draw_deformed(fields: Fields, path: Path) -> None:
         raise InputError(
             f"{path}: unknown kind of picture {path.suffix!r}; known: {known}"
         )
-    canvas = draw(deformed_figure(fields))
+    canvas = draw(figure)
     _save(canvas, _placed(canvas), [path])
 
 
