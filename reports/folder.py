@@ -10,6 +10,7 @@ from harness.errors import unknown
 from harness.record import VERIFIED_FACTOR
 from reports.data.aggregation import ranking_of
 from reports.data.comparison_groups import comparison_groups
+from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
 from reports.data.size_series import SizeSeries, size_series
 from reports.document.formatting import TIMED, clean
@@ -20,22 +21,16 @@ from reports.figures.accuracy import accuracy_figure
 from reports.figures.scaling import scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
 from reports.sections.cases import cases
-from reports.sections.claim_counts import claim_counts
 from reports.sections.convergence import convergence
-from reports.sections.deformed import deformed
-from reports.sections.growth import growth
-from reports.sections.means import means
 from reports.sections.performance import profiles
-from reports.sections.physics import agreement, physics
-from reports.sections.precision import precision
-from reports.sections.ranking import ranking
-from reports.sections.ratios import ratios
-from reports.sections.results import claims, errors, iterations
-from reports.sections.scaling import scaling
+from reports.sections.physics import agreement, deformed, physics
+from reports.sections.ranking import means, ranking
+from reports.sections.results import claim_counts, claims, errors, iterations
+from reports.sections.scaling import growth, scaling
 from reports.sections.settings import definitions, environment
-from reports.sections.summary import dateline, summary
+from reports.sections.summary import summary
 from reports.sections.sweeps import accuracy
-from reports.sections.times import times
+from reports.sections.times import precision, ratios, times
 from reports.sections.value_of_accuracy import value_of_accuracy
 
 MOST_SERIES = 6  #: that are drawn; all are tabulated

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from harness import Verdict
+from reports.data.cells import source, verdict_cell
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import (
     TIMED,
@@ -22,7 +23,6 @@ from reports.document.formatting import (
 )
 from reports.document.layout import Cell, Table
 from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
-from reports.sections.cells import source, verdict_cell
 from reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")

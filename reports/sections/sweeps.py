@@ -11,12 +11,12 @@ from matplotlib.lines import Line2D
 
 from harness import Verdict
 from harness.crossval.discretisation import read_discretisation
+from reports.data.cells import source
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, TIMED, clean, seconds, tolerance
 from reports.document.layout import Cell, Picture, Section, Table, name_cell
 from reports.figures.provenance import behind
 from reports.figures.style import INK, LEGEND_LINE, STYLE, legible, log_log, look
-from reports.sections.cells import source
 from reports.sections.certified import (
     certified_picture,
     certified_sweeps,

@@ -10,12 +10,13 @@ from reports.data.aggregation import (
     Convention,
     common_cases,
     geometric_means,
+    panel,
     ranking_of,
+    ranks,
 )
 from reports.data.comparison_groups import ComparisonGroup
-from reports.sections.growth import growth_of
-from reports.sections.ranking import panel, ranks
 from reports.statistics.censoring import restricted_mean
+from reports.statistics.growth import growth_of
 from reports.statistics.profiles import curve, performance_ratios, share, solved_within
 from reports.statistics.resampling import firsts, limits, told_apart, weights
 
