@@ -61,7 +61,7 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
             found = {
                 s: time_at_accuracy(outcomes, error) for s, outcomes in row.items()
             }
-            kinds = _kinds({s: m for s, m in found.items() if not row[s][0].first.arm})
+            kinds = places({s: m for s, m in found.items() if not row[s][0].first.arm})
             cells = [
                 _cell(found.get(s), row.get(s, ()), kinds.get(s, "")) for s in present
             ]
@@ -85,8 +85,11 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     )
 
 
-def _kinds(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
-    """Rank the times of a row; what is only bounded from above has no place in it."""
+def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
+    """Rank the times of a row: "best", "tied" or neither, by solver.
+
+    What is only bounded from above has no place in it, and then nothing is best.
+    """
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:
         return {}

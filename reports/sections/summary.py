@@ -1,4 +1,4 @@
-"""The first page: what was measured, and which solvers do not reach what was asked."""
+"""What was measured, and which solvers do not reach what was asked."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from harness.results.faults import in_words
 from reports.data.environment import QUIET_LOAD, busy_with
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import (
+    ENDINGS,
     VERDICTS,
     clean,
     listing,
@@ -29,17 +30,6 @@ _GROUPS: dict[str, tuple[Verdict, ...]] = {
     "limit": _LIMITS,
     "failed": (Verdict.CRASHED, Verdict.FAILED),
     "declined": (Verdict.DECLINED,),
-}
-
-_ENDINGS = {
-    Verdict.INACCURATE: "claimed solved but inaccurate",
-    Verdict.WRONG: "claimed solved but wrong",
-    Verdict.INFEASIBLE_CLAIM: "claimed infeasible",
-    Verdict.ITERATION_LIMIT: "ended at the iteration limit",
-    Verdict.TIME_LIMIT: "ended at the time limit",
-    Verdict.MEMORY_LIMIT: "ended at the memory limit",
-    Verdict.CRASHED: "crashed",
-    Verdict.FAILED: "failed",
 }
 
 
@@ -247,14 +237,14 @@ def _all(count: int) -> str:
 def _missed(tried: Sequence[Outcome], tol: float) -> list[str]:
     """Say how many cases ended in each verdict other than verified, and which."""
     said = []
-    for verdict in _ENDINGS:
+    for verdict in ENDINGS:
         those = [o for o in tried if o.verdict is verdict]
         if not those:
             continue
         known = [o.worst for o in those if o.worst is not None]
         worst = f"worst residual {power(max(known))}, " if known else ""
         said.append(
-            f"{len(those)} of {plural(len(tried), 'case')} {_ENDINGS[verdict]} at tol "
+            f"{len(those)} of {plural(len(tried), 'case')} {ENDINGS[verdict]} at tol "
             f"{tolerance(tol)} ({worst}on {listing([o.case for o in those])})"
         )
     return said
