@@ -50,6 +50,7 @@ class Competitor:
 
     solver: str
     outcomes: Mapping[str, Outcome]  #: by case
+    compared: tuple[str, ...] = ()  #: cases that it and the first solved
     slower: bool = False  #: told to be slower than the first
     ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
     by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
@@ -238,7 +239,7 @@ def _compared(c: Competitor, first: Competitor, ranking: Ranking | None) -> Comp
     names = ranking.group.solvers
     told = ranking.faster[names.index(first.solver), names.index(c.solver)]
     slower = ratio is not None and bool(told) and ratio.low > 1
-    return replace(c, ratio=ratio, slower=slower)
+    return replace(c, compared=tuple(both), ratio=ratio, slower=slower)
 
 
 def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
@@ -252,7 +253,7 @@ def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Compet
         ratio.low > 1 for ratio in by_case.values()
     )
     only = by_case.get(cases[0]) if len(cases) == len(c.outcomes) == 1 else None
-    return replace(c, by_case=by_case, ratio=only, slower=slower)
+    return replace(c, compared=tuple(cases), by_case=by_case, ratio=only, slower=slower)
 
 
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:

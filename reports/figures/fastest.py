@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
+from harness import Record
 from reports.data.fastest import Competitor, FastestSolver, Finding, time_of
-from reports.document.formatting import VERDICTS, plural
+from reports.document.formatting import VERDICTS, clean, plural
 from reports.figures.provenance import behind
 from reports.figures.style import INK, STYLE, legible, log_ticks, look
 
 PANELS = 4  #: forms that are drawn
 SOLVERS = 12  #: of a panel
+_NAME = 20  #: letters of a name beside an axis
 _ROW = 0.3  #: height of a solver, inches
-_APART = 0.3  #: from what is in the middle of a row to what is beside it, rows
+_BESIDE = 0.24  #: from a mean to the cases that it is of, rows
+_RAISED, _BELOW = 0.12, 0.3  #: of ratios above a verdict, and it below them, rows
 
 
 def fastest_figure(
@@ -61,15 +65,17 @@ def _panel(axes: Axes, f: FastestSolver, solvers: Sequence[str]) -> None:
     rows = _rows(f)
     for y, c in zip(range(len(rows) - 1, -1, -1), rows, strict=True):
         style = look(solvers.index(c.solver), line=False)
-        drawn = _draw(axes, y, c, f, style) if _has_reference(f) else False
-        if c in f.others:
-            beside = y + _APART if drawn else y
+        failed = c in f.others
+        below = _BELOW if failed and c.compared else 0.0
+        if _has_reference(f):
+            _draw(axes, y + _RAISED if below else y, c, f, style)
+        if failed:
             axes.annotate(
-                _failure(c), (0.995, beside), xycoords=("axes fraction", "data"),
+                _failure(c), (0.995, y - below), xycoords=("axes fraction", "data"),
                 ha="right", va="center", fontsize=8.5,
             )  # fmt: skip
     axes.set_title(f"{legible(f.kind.title)}, {plural(len(f.cases), 'case')}")
-    names = [legible(c.solver) for c in rows]
+    names = [_short(c.solver) for c in rows]
     axes.set_yticks(range(len(rows) - 1, -1, -1), names)
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.tick_params(axis="y", length=0)
@@ -84,6 +90,13 @@ def _panel(axes: Axes, f: FastestSolver, solvers: Sequence[str]) -> None:
     axes.set_axisbelow(True)
 
 
+def _short(name: str) -> str:
+    """Leave out the middle of a long name, in letters that the font has."""
+    text = clean(name)
+    half = _NAME // 2 - 1
+    return legible(text if len(text) <= _NAME else f"{text[:half]}..{text[-half:]}")
+
+
 def _scale(panels: Sequence[Axes]) -> None:
     """Give all ratios one scale."""
     if not panels:
@@ -92,6 +105,7 @@ def _scale(panels: Sequence[Axes]) -> None:
     for axes in panels:
         axes.set_xlim(min(0.8, *low), max(2.0, *high))
         log_ticks(axes.xaxis)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
 
 
 def _has_reference(f: FastestSolver) -> bool:
@@ -99,41 +113,34 @@ def _has_reference(f: FastestSolver) -> bool:
 
 
 def _draw(
-    axes: Axes, y: int, c: Competitor, f: FastestSolver, style: dict[str, Any]
-) -> bool:
-    """Draw the ratios of one solver to the first; tell whether there are any."""
-    both = [case for case in c.verified if case in c.outcomes]
-    if not both:
-        return False
+    axes: Axes, y: float, c: Competitor, f: FastestSolver, style: dict[str, Any]
+) -> None:
+    """Draw the ratios of one solver to the first, case by case and over the cases."""
     if c is f.first:
-        _points(
-            axes,
-            [1.0],
-            [y],
-            [[r for o in c.outcomes.values() for r in o.records]],
-            style,
-        )
-        return True
-    ratios = np.array([_ratio(c, f.first, case) for case in both])
+        _points(axes, [1.0], [y], [_behind(c, f.cases)], style)
+        return
+    count = len(c.compared)
     middle = c.ratio if f.over_cases else None
-    at = np.full(ratios.size, y - (_APART if middle else 0.0))
-    if not f.over_cases and ratios.size > 1:
-        at = at + np.linspace(0.25, -0.25, ratios.size)
+    spread = np.linspace(0.25, -0.25, count) if count > 1 else np.zeros(count)
+    places = np.full(count, y + (_BESIDE if middle else 0.0))
+    places += 0 if f.over_cases else spread
     small = {**style, "markersize": 2.8, "alpha": 0.6} if f.over_cases else style
-    _points(axes, ratios, at, [c.outcomes[case].records for case in both], small)
-    spans = [
-        (c.by_case[case].low, c.by_case[case].high, place)
-        for case, place in zip(both, at, strict=True)
+    ratios = [_ratio(c, f.first, case) for case in c.compared]
+    _points(axes, ratios, places, [_behind(c, [case]) for case in c.compared], small)
+    bars = [
+        (c.by_case[case], place)
+        for case, place in zip(c.compared, places, strict=True)
         if case in c.by_case
     ]
     if middle:
-        runs = [r for case in both for r in c.outcomes[case].records]
-        _points(axes, [middle.value], [y], [runs], style)
-        spans.append((middle.low, middle.high, y))
-    if spans:
-        low, high, places = np.array(spans).T
-        axes.hlines(places, low, high, color=style["color"], linewidth=1.1)
-    return True
+        _points(axes, [middle.value], [y], [_behind(c, c.compared)], style)
+        bars.append((middle, y))
+    for ratio, place in bars:
+        axes.hlines(place, ratio.low, ratio.high, color=style["color"], linewidth=1.1)
+
+
+def _behind(c: Competitor, cases: Iterable[str]) -> list[Record]:
+    return [r for case in cases for r in c.outcomes[case].records]
 
 
 def _ratio(c: Competitor, first: Competitor, case: str) -> float:

@@ -91,6 +91,7 @@ def _statement(
     cases = {case for f in found for case in answers[f.kind]}
     at_error = _at_error({c: row for c, row in certified.items() if c in cases})
     remarks = [
+        *_faster_elsewhere(found[-1]),
         *_failed(unverified(rows), one_accuracy=len(found) == 1),
         *_declined(unverified(rows)),
         *_reservations(found),
@@ -206,6 +207,20 @@ def _tied(c: Competitor, f: FastestSolver) -> str:
     if c.ratio and c.ratio.low > 1 and f.over_cases:
         return f"{text}, which does not outlast a test of all pairs at once"
     return text
+
+
+def _faster_elsewhere(f: FastestSolver) -> list[str]:
+    """Name who was faster than the first, but was not verified on every case."""
+    faster = [
+        f"{_name(c)} ({len(c.verified)} of {plural(len(f.cases), 'case')}, "
+        f"{bracketed(r.value, r.low, r.high)} times as long)"
+        for c in f.others
+        if (r := c.ratio) and r.high < 1
+    ]
+    if not faster:
+        return []
+    told = "; ".join(faster[:FAILURES])
+    return [f"Faster where verified, at {f.kind.accuracy}: {told}."]
 
 
 def _shared(f: FastestSolver) -> str:
