@@ -23,7 +23,8 @@ SOLVERS = 12  #: of a panel
 _NAME = 20  #: letters of a name beside an axis
 _ROW = 0.3  #: height of a solver, inches
 _BESIDE = 0.24  #: from a mean to the cases that it is of, rows
-_RAISED, _BELOW = 0.12, 0.3  #: of ratios above a verdict, and it below them, rows
+_TALL = 0.38  #: where ratios and a verdict share one, inches
+_RAISED, _BELOW = 0.16, 0.32  #: of ratios above a verdict, and it below them, rows
 
 
 def fastest_figure(
@@ -38,11 +39,10 @@ def fastest_figure(
         return None
     columns = min(len(panels), 2)
     lines = -(-len(panels) // columns)
-    rows = [
-        max(len(_rows(f)) for f in panels[i : i + columns])
+    heights = [
+        0.75 + max(map(_height, panels[i : i + columns]))
         for i in range(0, len(panels), columns)
     ]
-    heights = [0.75 + _ROW * max(n, 2) for n in rows]
     with rc_context(STYLE):
         figure = Figure(figsize=(6.9, sum(heights)))
         grid = figure.subplots(
@@ -58,6 +58,12 @@ def fastest_figure(
 
 def _rows(f: FastestSolver) -> tuple[Competitor, ...]:
     return (*f.competitors, *f.others)[:SOLVERS]
+
+
+def _height(f: FastestSolver) -> float:
+    """Height of all rows, inches."""
+    shared = _has_reference(f) and any(c.compared for c in f.others)
+    return max(len(_rows(f)), 2) * (_TALL if shared else _ROW)
 
 
 def _panel(axes: Axes, f: FastestSolver, solvers: Sequence[str]) -> None:
