@@ -9,8 +9,10 @@ from pathlib import Path
 from harness.errors import unknown
 from harness.record import VERIFIED_FACTOR
 from reports.data.aggregation import ranking_of
-from reports.data.comparison_groups import comparison_groups
+from reports.data.comparison_groups import all_groups
+from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
+from reports.data.fastest import answers_of, fastest_solvers
 from reports.data.size_series import SizeSeries, size_series
 from reports.document.formatting import TIMED, clean
 from reports.document.layout import Page, Picture, Section
@@ -19,23 +21,19 @@ from reports.export.parquet import write_records
 from reports.figures.accuracy import accuracy_figure
 from reports.figures.scaling import scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
+from reports.sections.answer import answer as fastest_section
+from reports.sections.answer import answer_statements
 from reports.sections.cases import cases
-from reports.sections.claim_counts import claim_counts
 from reports.sections.convergence import convergence
-from reports.sections.deformed import deformed
-from reports.sections.growth import growth
-from reports.sections.means import means
 from reports.sections.performance import profiles
-from reports.sections.physics import agreement, physics
-from reports.sections.precision import precision
-from reports.sections.ranking import ranking
-from reports.sections.ratios import ratios
-from reports.sections.results import claims, errors, iterations
-from reports.sections.scaling import scaling
+from reports.sections.physics import agreement, deformed, physics
+from reports.sections.ranking import means, ranking
+from reports.sections.results import claim_counts, claims, errors, iterations
+from reports.sections.scaling import growth, scaling
 from reports.sections.settings import definitions, environment
-from reports.sections.summary import dateline, summary
-from reports.sections.sweeps import accuracy
-from reports.sections.times import times
+from reports.sections.summary import summary
+from reports.sections.sweeps import accuracy, certified_sweeps
+from reports.sections.times import precision, ratios, times
 from reports.sections.value_of_accuracy import value_of_accuracy
 
 MOST_SERIES = 6  #: that are drawn; all are tabulated
@@ -75,11 +73,37 @@ def write_report(
     return written
 
 
+def answer(directory: Path, factor: float = VERIFIED_FACTOR) -> list[str]:
+    """Say per form who was fastest, by how much, and who failed: a line per sentence.
+
+    The sentences are those that the report of the folder opens with.
+
+    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
+
+    Raises
+    ------
+    InputError
+        For a folder that holds no measurements.
+
+    """
+    evidence = read_evidence(directory, factor)
+    groups = all_groups(evidence)
+    rankings = [ranking_of(group) for group in groups if group.comparable]
+    answers = answers_of(evidence)
+    found = fastest_solvers(answers, groups, rankings)
+    told = answer_statements(found, answers, certified_sweeps(evidence))
+    return [line for statement in told for line in statement.lines]
+
+
 def compose(evidence: Evidence) -> Page:
-    """Put the report together, summary first."""
+    """Put the report together: who was fastest, then what that rests on."""
     found = size_series(evidence)
-    rankings = [ranking_of(group) for group in comparison_groups(evidence)]
+    groups = all_groups(evidence)
+    rankings = [ranking_of(group) for group in groups if group.comparable]
+    answers = answers_of(evidence)
+    fastest = fastest_solvers(answers, groups, rankings)
     sections = (
+        fastest_section(evidence, fastest, answers, certified_sweeps(evidence)),
         summary(evidence),
         cases(evidence),
         claim_counts(evidence),

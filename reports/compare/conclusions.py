@@ -15,8 +15,8 @@ from reports.compare.changes import (
     side,
 )
 from reports.compare.conditions import environments, machines_differ
+from reports.data.environment import busy_with, dateline
 from reports.document.formatting import VERDICTS, clean, plural, power, tolerance
-from reports.sections.summary import busy_with, dateline
 from reports.statistics.intervals import COVERAGE
 
 NAMED = 8  #: changes that are named; tables have all

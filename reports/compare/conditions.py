@@ -8,8 +8,8 @@ from typing import Any
 
 from harness import InputError
 from harness.results.folder import differences, environment_of
+from reports.data.environment import flatten
 from reports.data.evidence import Evidence
-from reports.sections.summary import flatten
 
 #: parts of an environment that have to be equal for times to be comparable; the others
 #: (versions, source, plugins) are what a comparison is usually about

@@ -23,6 +23,7 @@ from reports.compare.conclusions import (
 )
 from reports.compare.conditions import Difference, environments, options, settings
 from reports.compare.figure import ratios_figure
+from reports.data.cells import case_cells, source, verdict_cell
 from reports.data.evidence import Outcome
 from reports.document.formatting import (
     ABSENT,
@@ -36,7 +37,6 @@ from reports.document.formatting import (
     span,
 )
 from reports.document.layout import Cell, Page, Picture, Section, Table, name_cell
-from reports.sections.cells import case_cells, source, verdict_cell
 from reports.statistics.intervals import COVERAGE
 
 

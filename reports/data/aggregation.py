@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,8 @@ SINGLE = {
     "claimed": replace(USUAL, gate="claimed"),
     "common": replace(USUAL, common=True),
 }
+
+_SAME = 1e-12  #: relative difference of means that are equal but for rounding
 
 #: Every combination of shift, penalty and gate.
 EVERY = tuple(
@@ -171,3 +174,52 @@ def ranking_of(group: ComparisonGroup) -> Ranking:
     logs, shift = _logs(group, USUAL)
     draws = np.exp(resampling.weights(group.cases) @ logs) - shift
     return Ranking(group=group, draws=draws)
+
+
+class Changed(NamedTuple):
+    """What becomes of the ranks under another convention."""
+
+    ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
+    turned: NDArray[np.bool_]  #: (solvers, solvers) whether it turns their order
+
+
+class Panel(NamedTuple):
+    """Ranks of the solvers of a group under every convention."""
+
+    usual: Array  #: (solvers,)
+    single: dict[str, Changed]  #: by the one thing that was changed
+    every: tuple[Changed, ...]
+
+    @property
+    def turned(self) -> NDArray[np.bool_]:
+        """(solvers, solvers) whether any convention turns the usual order."""
+        changes = (*self.every, *self.single.values())
+        return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
+
+
+def panel(group: ComparisonGroup) -> Panel:
+    """Rank under the usual convention, with one thing changed, and with all."""
+    usual = geometric_means(group, USUAL)
+
+    def changed(convention: Convention) -> Changed:
+        means = geometric_means(group, convention)
+        return Changed(ranks(means), order_of(usual) * order_of(means) < 0)
+
+    return Panel(
+        usual=ranks(usual),
+        single={name: changed(convention) for name, convention in SINGLE.items()},
+        every=tuple(map(changed, EVERY)),
+    )
+
+
+def ranks(means: Array) -> Array:
+    """Rank from 1; means that are equal but for rounding share the smaller rank."""
+    ahead = (order_of(means) > 0).sum(axis=1)  # of how many others one is behind
+    return np.where(np.isnan(means), np.nan, 1.0 + ahead)
+
+
+def order_of(means: Array) -> NDArray[np.int64]:
+    """(solvers, solvers) 1 where row is slower than column, −1 faster, else 0."""
+    logs = np.log(means)
+    gap = logs[:, None] - logs[None, :]
+    return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)

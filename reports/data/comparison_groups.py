@@ -25,13 +25,29 @@ Times = NDArray[np.float64]
 Name = TypeVar("Name")
 
 
-class _Kind(NamedTuple):
+class Kind(NamedTuple):
     """What the cases of one group share."""
 
-    sweep: bool
+    sweep: bool  #: of the tolerance asked for
     mode: str
     form: str
     at: float  #: accuracy that answers are judged at
+
+    @property
+    def accuracy(self) -> str:
+        """Name the accuracy that all answers have in common."""
+        return f"{'accuracy' if self.sweep else 'tol'} {tolerance(self.at)}"
+
+    @property
+    def subject(self) -> str:
+        """Name the form, and the mode where it is not cold; empty without a form."""
+        parts = [clean(self.form, 24)] * bool(self.form)
+        return ", ".join([*parts, *[clean(self.mode, 24)] * (self.mode != "cold")])
+
+    @property
+    def title(self) -> str:
+        """Name all of it."""
+        return ", ".join(filter(None, (self.subject, self.accuracy)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,14 +58,42 @@ class ComparisonGroup:
     sweep of tolerances, those of the cheapest answer that counts.
     """
 
-    title: str
+    kind: Kind
     cases: tuple[str, ...]
     solvers: tuple[str, ...]
     times: Times  #: (cases, solvers) s; inf unless every repeat was verified
     claimed: Times  #: the same; inf unless every repeat was claimed to be solved
     stopped: Times  #: s after which time ran out; NaN where that was not the end
     limit: float  #: s per measurement; the longest one, where the suite has no limit
-    notes: tuple[str, ...] = ()  #: what takes no part, and why
+    refused: tuple[str, ...] = ()  #: solvers that declined all cases
+    rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
+    incomplete: int = 0  #: cases left out, since some solver was not measured on them
+
+    @property
+    def title(self) -> str:
+        """Form and accuracy."""
+        return self.kind.title
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say what takes no part."""
+        refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
+        return refused * bool(self.refused) + self.unmeasured
+
+    @property
+    def unmeasured(self) -> tuple[str, ...]:
+        """Say what takes no part because it was not measured."""
+        rare = (f"Measured on fewer than half of them: {listing(self.rare, 6)}.",)
+        cases = plural(self.incomplete, "case")
+        return rare * bool(self.rare) + (
+            f"Not measured by all, left out: {cases}.",
+        ) * bool(self.incomplete)
+
+    @property
+    def comparable(self) -> bool:
+        """Whether cases, solvers and answers are enough for a statement over cases."""
+        shape = len(self.cases) >= CASES and len(self.solvers) > 1
+        return shape and bool(self.solved.any())
 
     @cached_property
     def solved(self) -> NDArray[np.bool_]:
@@ -72,34 +116,41 @@ class ComparisonGroup:
 def comparison_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
     """Group what was measured by form and accuracy; groups of few cases are left out.
 
+    At least `CASES` cases, two solvers and one verified answer make a group.
+    """
+    return tuple(group for group in all_groups(evidence) if group.comparable)
+
+
+def all_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
+    """Group what was measured by form and accuracy, whatever can be said of it.
+
     Forms are apart, since the primal and the dual QP of one problem are two problems to
-    a solver; so are cold solves and sequences. At least `CASES` cases, two solvers and
-    one verified answer make a group.
+    a solver; so are cold solves and sequences.
     """
     records = [r for r in evidence.records if not r.arm]
     if not records:
         return ()
-    kinds = _numbered(map(_kind, records))
+    kinds = _numbered(map(kind_of, records))
     cases = _numbered(r.case for r in records)
     solvers = _numbered(evidence.solvers)
     rows = [
-        {"kind": kinds[_kind(r)], "case": cases[r.case], "solver": solvers[r.solver]}
+        {"kind": kinds[kind_of(r)], "case": cases[r.case], "solver": solvers[r.solver]}
         | _row(r)
         for r in records
     ]
     outcomes = _outcomes(pd.DataFrame(rows))
     limit = _limit(evidence, outcomes)
     groups = zip(kinds, outcomes.groupby("kind"), strict=True)
-    found = [
-        _group(_title(kind), group, [*cases], evidence.solvers, limit)
+    return tuple(
+        _group(kind, group, [*cases], evidence.solvers, limit)
         for kind, (_, group) in groups
-    ]
-    return tuple(group for group in found if group is not None)
+    )
 
 
-def _kind(r: Record) -> _Kind:
+def kind_of(r: Record) -> Kind:
+    """Say what a record has in common with those that it is compared with."""
     swept = r.accuracy is not None
-    return _Kind(swept, r.mode, r.form, r.tol if r.accuracy is None else r.accuracy)
+    return Kind(swept, r.mode, r.form, r.tol if r.accuracy is None else r.accuracy)
 
 
 def _numbered(names: Iterable[Name]) -> dict[Name, int]:
@@ -164,12 +215,12 @@ def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
 
 
 def _group(
-    title: str,
+    kind: Kind,
     group: pd.DataFrame,
     cases: Sequence[str],
     solvers: Sequence[str],
     limit: float,
-) -> ComparisonGroup | None:
+) -> ComparisonGroup:
     """Keep the solvers with at least half of the cases, and cases that they all had."""
     wide = group.pivot(index="case", columns="solver")
     present = np.array([cases[i] for i in wide.index], dtype=object)
@@ -185,35 +236,16 @@ def _group(
     taken = ~(refused | rare)
     complete = seen[:, taken].all(axis=1)
     part = np.ix_(complete, taken)
-    if complete.sum() < CASES or taken.sum() < 2 or not np.isfinite(times[part]).any():
-        return None
     stopped = matrix("stopped")[part]
     return ComparisonGroup(
-        title=title,
+        kind=kind,
         cases=tuple(present[complete]),
         solvers=tuple(met[taken]),
         times=times[part],
         claimed=matrix("claimed")[part],
         stopped=np.where(np.isinf(stopped), limit, stopped),
         limit=limit,
-        notes=_left_out([*met[refused]], [*met[rare]], int((~complete).sum())),
+        refused=tuple(met[refused]),
+        rare=tuple(met[rare]),
+        incomplete=int((~complete).sum()),
     )
-
-
-def _left_out(refused: list[str], rare: list[str], cases: int) -> tuple[str, ...]:
-    """Say what takes no part."""
-    notes = []
-    if refused:
-        notes.append(f"Declined all of them: {listing(refused, 6)}.")
-    if rare:
-        notes.append(f"Measured on fewer than half of them: {listing(rare, 6)}.")
-    if cases:
-        notes.append(f"Not measured by all, left out: {plural(cases, 'case')}.")
-    return tuple(notes)
-
-
-def _title(kind: _Kind) -> str:
-    parts = [clean(kind.form, 24)] * bool(kind.form)
-    parts += [kind.mode] * (kind.mode != "cold")
-    accuracy = f"{'accuracy' if kind.sweep else 'tol'} {tolerance(kind.at)}"
-    return ", ".join([*parts, accuracy])

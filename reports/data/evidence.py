@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -110,6 +110,11 @@ class Outcome:
     def seconds(self, phase: str) -> Interval | None:
         """Median of prepare, solve or total time over the repeats that have one."""
         return self._intervals[phase]
+
+    @property
+    def by_repeat(self) -> dict[int, float]:
+        """Total seconds of each repeat that has them; repeats are of equal blocks."""
+        return {r.repeat: r.total_seconds for r in self.records if r.total_seconds}
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
@@ -281,8 +286,3 @@ def _label(entry: Any) -> str:
     if isinstance(entry, Mapping):
         return str(entry.get("label", entry.get("name", "")))
     return str(entry)
-
-
-def energies(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Keep the verified answers that have a potential energy."""
-    return [o for o in outcomes if o.verified and o.energy is not None]

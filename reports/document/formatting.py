@@ -33,6 +33,18 @@ VERDICTS = {
     Verdict.DECLINED: ("○", "declined"),
 }
 
+#: What a solver did that was not verified, after its name.
+ENDINGS = {
+    Verdict.INACCURATE: "claimed solved but inaccurate",
+    Verdict.WRONG: "claimed solved but wrong",
+    Verdict.INFEASIBLE_CLAIM: "claimed infeasible",
+    Verdict.ITERATION_LIMIT: "ended at the iteration limit",
+    Verdict.TIME_LIMIT: "ended at the time limit",
+    Verdict.MEMORY_LIMIT: "ended at the memory limit",
+    Verdict.CRASHED: "crashed",
+    Verdict.FAILED: "failed",
+}
+
 _ACCENT = (
     "[\u0300-\u036f\u0483-\u0489\u1ab0-\u1aff\u1dc0-\u1dff\u20d0-\u20ff\ufe20-\ufe2f]"
 )

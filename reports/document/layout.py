@@ -59,12 +59,28 @@ class Picture:
     figure: Figure | FieldFigure
 
 
+@dataclass(frozen=True, kw_only=True)
+class Statement:
+    """What is said of one subject before all evidence, in whole sentences."""
+
+    subject: str
+    claims: tuple[str, ...]
+    remarks: tuple[str, ...] = ()  #: what must be known besides
+    evidence: tuple[str, ...] = ()  #: names of the sections that the claims rest on
+
+    @property
+    def lines(self) -> list[str]:
+        """Subject and sentences as plain text, a line each."""
+        return [f"{self.subject}: {text}" for text in (*self.claims, *self.remarks)]
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Section:
     """One part of the report; `name` is its anchor and the stem of its files."""
 
     name: str
     title: str
+    statements: tuple[Statement, ...] = ()
     prose: tuple[str, ...] = ()
     points: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
@@ -73,7 +89,7 @@ class Section:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Page:
-    """The whole report, summary first."""
+    """The whole report, what a reader came for first."""
 
     title: str
     dateline: str
@@ -81,6 +97,10 @@ class Page:
     footer: str = ""  #: where the numbers are, if not in a result folder
     records: tuple[Record, ...] = ()  #: the measurements that its numbers come from
     solvers: tuple[str, ...] = ()  #: of these, in the order of their looks in figures
+
+    def sections_of(self, statement: Statement) -> list[Section]:
+        """List the sections that a statement rests on, as far as the page has them."""
+        return [s for s in self.sections if s.name in statement.evidence]
 
 
 def sources(records: Iterable[Record]) -> str:

@@ -10,14 +10,20 @@ import numpy as np
 import pandas as pd
 
 from harness import Record, Verdict
-from reports.data.aggregation import EVERY, USUAL, Convention, Ranking, ranking_of
+from reports.data.aggregation import (
+    EVERY,
+    USUAL,
+    Convention,
+    Ranking,
+    ranking_of,
+    ranks,
+)
 from reports.data.aggregation import geometric_means as means_by
 from reports.data.comparison_groups import ComparisonGroup, comparison_groups
 from reports.data.evidence import RESIDUALS, Evidence, Outcome
+from reports.data.quantities import spreads
 from reports.data.size_series import SizeSeries, size_series
 from reports.export.parquet import texts
-from reports.sections.physics import spreads
-from reports.sections.ranking import ranks
 from reports.statistics.intervals import PowerLaw
 from reports.statistics.profiles import performance_ratios
 

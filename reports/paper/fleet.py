@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from harness import Verdict
+from reports.data.cells import source, verdict_cell
 from reports.data.evidence import Evidence, Outcome
 from reports.document.figure import (
     INK,
@@ -38,7 +39,6 @@ from reports.figures.style import (
     run_ids,
     solver_keys,
 )
-from reports.sections.cells import source, verdict_cell
 from reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from reports.document.layout import Cell, Table
+from reports.document.layout import Cell, Statement, Table
 
 _NOT_IN_OT1 = "«»ÐðÞþ"
 
@@ -25,13 +25,23 @@ _SPECIAL = {
 _PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
 
 
-def latex(tables: tuple[Table, ...]) -> str:
-    r"""Render tables one after the other; they need \usepackage{booktabs} only.
+def latex(tables: tuple[Table, ...], statements: tuple[Statement, ...] = ()) -> str:
+    r"""Render statements as a list, then tables; they need \usepackage{booktabs} only.
 
     Times carry their unit and interval; all other numbers are plain (1.2e-09), as
     siunitx reads them.
     """
-    return "% \\usepackage{booktabs}\n" + "\n".join(map(_table, tables))
+    parts = [_statements(statements)] if statements else []
+    return "% \\usepackage{booktabs}\n" + "\n".join((*parts, *map(_table, tables)))
+
+
+def _statements(statements: tuple[Statement, ...]) -> str:
+    items = [
+        rf"  \item[{{{escaped(s.subject)}}}] "
+        + " ".join(map(escaped, (*s.claims, *s.remarks)))
+        for s in statements
+    ]
+    return "\n".join((r"\begin{description}", *items, r"\end{description}", ""))
 
 
 def _table(table: Table) -> str:

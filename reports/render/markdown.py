@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from reports.document.layout import Cell, Page, Section, Table
+from reports.document.layout import Cell, Page, Section, Statement, Table
 
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
@@ -17,12 +17,13 @@ def markdown(page: Page) -> str:
     """Render the whole report; figures are linked, tables are pipes."""
     parts = [f"# {escaped(page.title)}", escaped(page.dateline)]
     for section in page.sections:
-        parts += _section(section)
+        parts += _section(section, page)
     return "\n\n".join(parts) + "\n"
 
 
-def _section(section: Section) -> list[str]:
+def _section(section: Section, page: Page) -> list[str]:
     parts = [f"## {escaped(section.title)}"]
+    parts += [_statement(one, page) for one in section.statements]
     parts += [escaped(p) for p in section.prose]
     if section.points:
         parts.append("\n".join(f"- {escaped(p)}" for p in section.points))
@@ -32,6 +33,21 @@ def _section(section: Section) -> list[str]:
         caption = escaped(picture.caption)
         parts += [f"![{picture.name}](figures/{picture.name}.png)", f"*{caption}*"]
     return parts
+
+
+def _statement(statement: Statement, page: Page) -> str:
+    """Write a paragraph that ends in links to its evidence."""
+    links = [f"[{s.title}](#{_anchor(s.title)})" for s in page.sections_of(statement)]
+    told = map(escaped, (*statement.claims, *statement.remarks))
+    evidence = f"Evidence: {', '.join(links)}." if links else ""
+    return " ".join(
+        filter(None, (f"**{escaped(statement.subject)}.**", *told, evidence))
+    )
+
+
+def _anchor(title: str) -> str:
+    """Name the anchor that Markdown makes of a heading."""
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
 def _table(table: Table) -> str:

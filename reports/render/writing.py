@@ -28,9 +28,11 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
         written.append(write_text(target / "report.md", markdown(page)))
     if "tex" in formats:
         written += [
-            write_text(target / "tables" / f"{s.name}.tex", latex(s.tables))
+            write_text(
+                target / "tables" / f"{s.name}.tex", latex(s.tables, s.statements)
+            )
             for s in page.sections
-            if s.tables
+            if s.tables or s.statements
         ]
     return written + figures
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from reports.data.cells import source
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, clean, plural
 from reports.document.layout import Cell, Section, Table, name_cell
-from reports.sections.cells import source
 
 _SIZES = ("variables", "equalities", "inequalities", "bounds")
 

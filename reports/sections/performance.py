@@ -16,7 +16,7 @@ from reports.figures.profiles import (
     rivals,
     rows_of,
 )
-from reports.sections.means import described
+from reports.sections.ranking import described
 from reports.statistics.profiles import Array, performance_ratios, solved_within
 
 DRAWN = 4  #: groups that are drawn; all are tabulated

@@ -1,73 +1,27 @@
-"""Energies set against each other, and the physical results of verified answers."""
+"""Physical results of verified answers: energies, quantities, deformed bodies."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from itertools import combinations
-from typing import NamedTuple
+import os
+from collections.abc import Sequence
 
-from reports.data.evidence import Evidence, Outcome, energies
-from reports.document.formatting import clean, plural, power, significant, tolerance
-from reports.document.layout import Cell, Section, Table, name_cell
-from reports.sections.cells import source
-from reports.sections.quantities import (
-    MOST_DIGITS,
+from harness import Fields, InputError
+from harness.files.store import load_fields
+from reports.data.cells import source
+from reports.data.evidence import Evidence, Outcome
+from reports.data.quantities import (
+    Spread,
+    best_of,
     elastic,
     head,
-    known_digits,
     leaves,
     quantity,
+    spreads,
     unit,
 )
-
-
-class Spread(NamedTuple):
-    """How far the energies of verified answers to one physical case lie apart."""
-
-    answers: tuple[Outcome, ...]  #: of every solver and form; at least one
-    relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
-    pair: tuple[Outcome, Outcome] | None  #: where it occurs
-
-    @property
-    def best(self) -> Outcome:
-        """The answer with the smallest worst residual."""
-        return _best(self.answers)
-
-    @property
-    def digits(self) -> int:
-        """As many as the energies agree on and one more; alone, as tol promises."""
-        doubt = self.answers[0].tol if self.relative is None else self.relative
-        return known_digits(doubt, MOST_DIGITS["energy"])
-
-
-def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
-    """Compare energies pairwise per physical case and tolerance.
-
-    No answer serves as the reference of the others: each is set against each, across
-    solvers and across primal and dual forms.
-    """
-    groups: dict[tuple[str, float], list[Outcome]] = {}
-    for o in energies(tuple(outcomes)):
-        groups.setdefault((o.physical, o.tol), []).append(o)
-    return [_spread(tuple(group)) for group in groups.values()]
-
-
-def _spread(answers: tuple[Outcome, ...]) -> Spread:
-    pairs = list(combinations(answers, 2))
-    if not pairs:
-        return Spread(answers, None, None)
-    differences = [_difference(a, b) for a, b in pairs]
-    worst = max(range(len(pairs)), key=differences.__getitem__)
-    return Spread(answers, differences[worst], pairs[worst])
-
-
-def _difference(a: Outcome, b: Outcome) -> float:
-    e, f = a.energy or 0.0, b.energy or 0.0
-    return abs(e - f) / max(abs(e), abs(f)) if e != f else 0.0
-
-
-def _residual(outcome: Outcome) -> float:
-    return float("inf") if outcome.worst is None else outcome.worst
+from reports.document.formatting import clean, plural, power, significant, tolerance
+from reports.document.layout import Cell, Picture, Section, Table, name_cell
+from reports.figures.deformed import PERCENTILE, SCALE, clipped_at, deformed_figure
 
 
 def agreement(evidence: Evidence) -> Section | None:
@@ -139,7 +93,7 @@ def physics(evidence: Evidence) -> Section | None:
             groups.setdefault(o.physical, []).append(o)
     if not groups:
         return None
-    chosen = [(_best(answers), answers) for answers in groups.values()]
+    chosen = [(best_of(answers), answers) for answers in groups.values()]
     tables = []
     for family in dict.fromkeys(best.first.family for best, _ in chosen):
         mine = [(b, answers) for b, answers in chosen if b.first.family == family]
@@ -160,11 +114,6 @@ def physics(evidence: Evidence) -> Section | None:
         ),
         tables=tuple(t for t in tables if t is not None),
     )
-
-
-def _best(answers: Sequence[Outcome]) -> Outcome:
-    """Take the answer with the smallest worst residual; names break ties."""
-    return min(answers, key=lambda o: (_residual(o), o.case, o.solver))
 
 
 def _quantities(
@@ -215,3 +164,48 @@ def _caveats(names: set[str]) -> tuple[str, ...]:
             "grow without bound as the mesh is refined; compare them on one mesh only."
         )
     return tuple(found)
+
+
+def deformed(evidence: Evidence) -> Section | None:
+    """Draw the largest verified case; None where no deformed state was stored."""
+    drawable = [o for o in evidence.flat if o.verified and o.first.fields]
+    if not drawable:
+        return None
+    chosen = max(drawable, key=_importance)
+    try:
+        fields = load_fields(evidence.directory, chosen.first.fields or "")
+        figure = deformed_figure(fields)
+    except InputError as e:  # the journal alone must do
+        missing = str(e).removeprefix(f"{evidence.directory}{os.sep}")
+        why = f"There is no picture of {clean(chosen.case)}: {clean(missing, 200)}."
+        return Section(name="deformed", title="Deformed bodies", prose=(why,))
+    picture = Picture(
+        name="deformed", caption=_deformed_caption(chosen, fields), figure=figure
+    )
+    return Section(name="deformed", title="Deformed bodies", pictures=(picture,))
+
+
+def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
+    """Order by size, then load step, then accuracy; names break ties."""
+    step = outcome.first.params.get("step", 0)
+    size = outcome.size("dofs") or 0
+    last = float(step) if isinstance(step, int | float) else 0.0
+    return (size, last, -outcome.tol, outcome.first.form, outcome.solver)
+
+
+def _deformed_caption(outcome: Outcome, fields: Fields) -> str:
+    caption = (
+        f"{clean(outcome.case)}: the largest verified case, as answered by "
+        f"{clean(outcome.solver, 40)} at tol {tolerance(outcome.tol)} (run "
+        f"{clean(outcome.run_ids[0], 40)}). Displacements are drawn to scale "
+        f"(factor {SCALE:g})."
+    )
+    limits = clipped_at(fields)
+    if limits is None:
+        return caption
+    return (
+        f"{caption} Colours: patch-recovered von Mises stress, one scale for all "
+        f"bodies, clipped at the {PERCENTILE:g} % quantile of the nodal values "
+        f"({limits[0] / 1e9:.3g} GPa), since stresses may be singular at clamped and "
+        f"loaded corners; the largest nodal value is {limits[1] / 1e9:.3g} GPa."
+    )

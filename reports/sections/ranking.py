@@ -1,79 +1,173 @@
-"""How far ranks depend on conventions, and how far they are inside the noise."""
+"""Times over cases: means, ranks, and what they depend on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from harness.running.pairs import paired_ratio
 from reports.data.aggregation import (
     EVERY,
     PENALTIES,
     SHIFTS,
-    SINGLE,
     USUAL,
-    Array,
+    Changed,
     Convention,
+    Panel,
     Ranking,
-    geometric_means,
+    common_cases,
+    panel,
 )
-from reports.data.comparison_groups import ComparisonGroup
-from reports.document.formatting import ABSENT, plural
+from reports.data.aggregation import geometric_means as means_by
+from reports.data.comparison_groups import CASES, LARGEST_SHIFT, ComparisonGroup
+from reports.document.formatting import (
+    ABSENT,
+    TIMED,
+    bracketed,
+    plural,
+    seconds,
+    significant,
+)
 from reports.document.layout import Cell, Section, Table, name_cell
-from reports.sections.means import described
+from reports.statistics.censoring import restricted_mean
+from reports.statistics.intervals import COVERAGE, Interval
 
-_SAME = 1e-12  #: relative difference of means that are equal but for rounding
-
-
-class Changed(NamedTuple):
-    """What becomes of the ranks under another convention."""
-
-    ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) whether it turns their order
+_COLUMNS = (
+    "solver", "tier", "solved", "mean", "to the leader", "P(best)",
+    "both solved, to the leader", "common cases, to the leader", "mean up to the limit",
+)  # fmt: skip
 
 
-class Panel(NamedTuple):
-    """Ranks of the solvers of a group under every convention."""
-
-    usual: Array  #: (solvers,)
-    single: dict[str, Changed]  #: by the one thing that was changed
-    every: tuple[Changed, ...]
-
-    @property
-    def turned(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) whether any convention turns the usual order."""
-        changes = (*self.every, *self.single.values())
-        return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
-
-
-def panel(group: ComparisonGroup) -> Panel:
-    """Rank under the usual convention, with one thing changed, and with all."""
-    usual = geometric_means(group, USUAL)
-
-    def changed(convention: Convention) -> Changed:
-        means = geometric_means(group, convention)
-        return Changed(ranks(means), order_of(usual) * order_of(means) < 0)
-
-    return Panel(
-        usual=ranks(usual),
-        single={name: changed(convention) for name, convention in SINGLE.items()},
-        every=tuple(map(changed, EVERY)),
+def means(rankings: Sequence[Ranking]) -> Section | None:
+    """Tabulate the means of every group; None where there is none."""
+    if not rankings:
+        return None
+    return Section(
+        name="means",
+        title="Means over cases",
+        prose=(
+            "Shifted geometric means exp(mean log(t + s)) − s of the median times of "
+            "verified answers, one time per case. The shift s is the median over the "
+            f"cases of the best time (at most {LARGEST_SHIFT:g} s): a fixed one of "
+            "seconds would make the mean of milliseconds an arithmetic one. An "
+            f"unsolved case is charged {USUAL.penalty:g} limits; next to that stand "
+            "two comparisons that charge nothing, and the arithmetic mean of times cut "
+            "at the limit. Forms are compared apart, "
+            f"and only where there are at least {CASES} cases.",
+            "Intervals (95 %) are over the cases: they say what other cases of the "
+            "same kind might have given. A solver is in the first tier whose head "
+            "these cases do not tell to be faster: within a tier, ranks are inside the "
+            "noise. "
+            "What is told apart is so with 95 % for all pairs at once. P(best) is the "
+            "share of resampled sets of cases in which a solver has the least mean. "
+            "Formulas, sources and limits are in docs/statistics.md.",
+        ),
+        tables=tuple(map(_table, rankings)),
     )
 
 
-def ranks(means: Array) -> Array:
-    """Rank from 1; means that are equal but for rounding share the smaller rank."""
-    ahead = (order_of(means) > 0).sum(axis=1)  # of how many others one is behind
-    return np.where(np.isnan(means), np.nan, 1.0 + ahead)
+def described(group: ComparisonGroup) -> str:
+    """Name a group of cases with the numbers that its means depend on."""
+    return (
+        f"{group.title}: {plural(len(group.cases), 'case')}, shift "
+        f"{significant(group.shift)} s, limit {significant(group.limit)} s."
+    )
 
 
-def order_of(means: Array) -> NDArray[np.int64]:
-    """(solvers, solvers) 1 where row is slower than column, −1 faster, else 0."""
-    logs = np.log(means)
-    gap = logs[:, None] - logs[None, :]
-    return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)
+def _table(ranking: Ranking) -> Table:
+    group = ranking.group
+    rows, columns = common_cases(group)
+    left = [s for s, used in zip(group.solvers, columns, strict=True) if not used]
+    common = f"Common cases: {rows.sum()}, solved by all"
+    common += (
+        f" but {plural(len(left), 'solver')} with less than half solved."
+        if left
+        else "."
+    )
+    return Table(
+        caption=f"Times over cases, {described(group)} {common} Both solved: "
+        "geometric mean of the ratios on cases that the solver and the leader solved.",
+        notes=(*group.notes, TIMED),
+        columns=_COLUMNS,
+        rows=tuple(_row(ranking, int(i)) for i in ranking.order),
+    )
+
+
+def _row(ranking: Ranking, i: int) -> tuple[Cell, ...]:
+    group, leads = ranking.group, i == ranking.leader
+    solved = int(group.solved[:, i].sum())
+    tier = int(ranking.tiers[i])
+    return (
+        name_cell(group.solvers[i]),
+        Cell(text=str(tier), value=tier),
+        Cell(text=f"{solved} of {len(group.cases)}", value=solved),
+        _mean(ranking, i) if solved else Cell(text="none solved", kind="quiet"),
+        _ratio(ranking, i),
+        Cell(text=_share(float(ranking.first[i])), value=float(ranking.first[i])),
+        Cell(text="1") if leads else _pairs(group, i, ranking.leader),
+        _common(ranking, i),
+        _restricted(group, i) if solved else Cell(text="none solved", kind="quiet"),
+    )
+
+
+def _mean(ranking: Ranking, i: int) -> Cell:
+    value = float(ranking.means[i])
+    low, high = (float(end[i]) for end in ranking.intervals)
+    mean = Interval(value, low, high, COVERAGE, len(ranking.group.cases))
+    kind = "best" if i == ranking.leader else ""
+    return Cell(text=seconds(mean), value=value, kind=kind)
+
+
+def _ratio(ranking: Ranking, i: int) -> Cell:
+    value, low, high = (float(part[i]) for part in ranking.ratios)
+    if i == ranking.leader:
+        return Cell(text="1", value=1.0)
+    return Cell(text=bracketed(value, low, high), value=value)
+
+
+def _share(p: float) -> str:
+    """Print a share of the draws without claiming what they cannot show."""
+    return "0" if p == 0 else "< 0.01" if p < 0.01 else f"{p:.2f}"
+
+
+def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
+    """Compare with the leader on the cases that both solved; nothing is charged."""
+    mine, its = (
+        {p: float(t) for p, t in enumerate(group.times[:, s]) if np.isfinite(t)}
+        for s in (i, leader)
+    )
+    ratio = paired_ratio(mine, its)
+    if ratio is None or ratio.pairs < CASES:
+        return Cell(text=ABSENT, title=f"fewer than {CASES} cases that both solved")
+    return Cell(
+        text=bracketed(ratio.value, ratio.low, ratio.high),
+        after=f"n = {ratio.pairs}",
+        value=ratio.value,
+    )
+
+
+def _common(ranking: Ranking, i: int) -> Cell:
+    """Ratio to the leader where all solved."""
+    found = means_by(ranking.group, Convention(common=True))
+    value = float(found[i] / found[ranking.leader])
+    if np.isnan(value):
+        return Cell(text=ABSENT, title="too few cases that all solved")
+    return Cell(text=significant(value), value=value)
+
+
+def _restricted(group: ComparisonGroup, i: int) -> Cell:
+    """Mean of the times cut at the limit, with what is censored."""
+    found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
+    known = [
+        f"{count} {what}"
+        for count, what in ((found.stopped, "out of time"), (found.never, "never"))
+        if count
+    ]
+    return Cell(
+        text=seconds(found.mean), after=", ".join(known), value=found.mean.value
+    )
 
 
 def ranking(rankings: Sequence[Ranking]) -> Section | None:
@@ -96,8 +190,8 @@ def ranking(rankings: Sequence[Ranking]) -> Section | None:
             "ranks of all solvers with 95 %. Where a range is longer than one rank, "
             "the rank is inside the noise.",
         ),
-        points=tuple(_verdict(*each) for each in panels),
-        tables=tuple(_table(*each) for each in panels),
+        points=tuple(_worth(*each) for each in panels),
+        tables=tuple(_panel_table(*each) for each in panels),
     )
 
 
@@ -105,7 +199,7 @@ def _listed(values: Sequence[float]) -> str:
     return ", ".join(f"{v:g}" for v in values)
 
 
-def _verdict(ranking: Ranking, ranked: Panel) -> str:
+def _worth(ranking: Ranking, ranked: Panel) -> str:
     """Say in a sentence what the ranking of one group is worth."""
     upper = np.triu(np.ones_like(ranked.turned), 1)
     told = (ranking.faster | ranking.faster.T) & upper
@@ -124,7 +218,7 @@ def _verdict(ranking: Ranking, ranked: Panel) -> str:
     )
 
 
-def _table(ranking: Ranking, ranked: Panel) -> Table:
+def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     return Table(
         caption=f"Ranks under changed conventions, {described(ranking.group)} "
         f"Usual: {USUAL.penalty:g} limits for an unsolved case, verified answers.",
@@ -132,11 +226,11 @@ def _table(ranking: Ranking, ranked: Panel) -> Table:
             "solver", "tier", "rank", "inside the noise", *ranked.single, "all",
             "reading",
         ),
-        rows=tuple(_row(ranking, ranked, int(i)) for i in ranking.order),
+        rows=tuple(_panel_row(ranking, ranked, int(i)) for i in ranking.order),
     )  # fmt: skip
 
 
-def _row(ranking: Ranking, ranked: Panel, i: int) -> tuple[Cell, ...]:
+def _panel_row(ranking: Ranking, ranked: Panel, i: int) -> tuple[Cell, ...]:
     tier, rank = int(ranking.tiers[i]), int(ranked.usual[i])
     low, high = ranking.spans[i]
     every = [int(changed.ranks[i]) for changed in ranked.every]

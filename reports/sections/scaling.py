@@ -1,14 +1,15 @@
-"""Time and iterations against size, with fitted exponents."""
+"""Time and iterations against size: fitted exponents, and whether iterations grow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from reports.data.cells import source
 from reports.data.evidence import Outcome
 from reports.data.size_series import SizeSeries
 from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
 from reports.document.layout import Cell, Section, Table
-from reports.sections.cells import source
+from reports.statistics.growth import LEVEL, SIZES, Growth, growth_of
 from reports.statistics.intervals import PowerLaw
 
 #: What the sizes of a series count, wherever they are shown.
@@ -98,3 +99,84 @@ def _exponent(law: PowerLaw | None, runs: str) -> Cell:
     if law is None:
         return Cell(text=ABSENT, kind="total", title="fewer than three verified sizes")
     return Cell(text=exponent(law), kind="total", value=law.exponent, title=runs)
+
+
+def growth(found: Sequence[SizeSeries]) -> Section | None:
+    """Test every series of at least four sizes; None where there is none."""
+    tested = [series for series in found if len(series.sizes) >= SIZES]
+    if not tested:
+        return None
+    return Section(
+        name="growth",
+        title="Do iterations grow?",
+        prose=(
+            "Scalable methods need as many iterations on a large problem as on a small "
+            f"one. The hypothesis that they do not grow, p ≤ 0 in c·nᵖ, is tested at "
+            f"{LEVEL:.0%} by Student's one-sided test of the slope on logarithms. That "
+            "no growth is detected does not show that there is none: p may be as large "
+            "as its upper bound (95 %, one-sided). Fewer than four sizes on which a "
+            "solver is verified make no test.",
+            "The time at the largest size is what the fit t = c·nᵖ says, with the 95 % "
+            "interval of a further measurement; it is refused where the solver's own "
+            "verified sizes end earlier, since nothing supports the law beyond them.",
+        ),
+        tables=tuple(map(_growth_table, tested)),
+    )
+
+
+def _growth_table(series: SizeSeries) -> Table:
+    largest = series.sizes[-1][0]
+    return Table(
+        caption=f"Growth of iterations, and time at n = {largest}: {series.title}.",
+        columns=(
+            "solver", "sizes", "p of iterations", "p at most", "p-value",
+            "iterations", f"time at n = {largest}",
+        ),
+        rows=tuple(_growth_row(series, s, largest) for s in series.solvers),
+    )  # fmt: skip
+
+
+def _growth_row(series: SizeSeries, solver: str, largest: int) -> tuple[Cell, ...]:
+    curve = series.curve(solver)
+    counted = [(n, sum(o.iterations) / 2) for n, o in curve if o.iterations]
+    timed = [(n, t.value) for n, o in curve if (t := o.seconds("total"))]
+    return (
+        Cell(text=clean(solver, 40)),
+        Cell(text=str(len(curve)), value=len(curve)),
+        *_tested(_fit(counted)),
+        _predicted(_fit(timed), largest),
+    )
+
+
+def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
+    """Fit what is positive; None with too few sizes."""
+    kept = [(n, v) for n, v in points if n > 0 and v > 0]
+    if len({n for n, _ in kept}) < SIZES:
+        return None
+    return growth_of(*zip(*kept, strict=True))
+
+
+def _tested(fit: Growth | None) -> tuple[Cell, ...]:
+    if fit is None:
+        few = Cell(text="too few sizes", kind="quiet")
+        return (Cell(), Cell(), Cell(), few)
+    p = "< 0.001" if fit.p_value < 0.001 else f"{fit.p_value:.3f}"
+    return (
+        Cell(text=f"{fit.exponent + 0.0:.3f}", value=fit.exponent),
+        Cell(text=f"{fit.most + 0.0:.3f}", value=fit.most),
+        Cell(text=p, value=fit.p_value),
+        Cell(
+            text="grow" if fit.grows else "no growth detected",
+            kind="over" if fit.grows else "",
+        ),
+    )
+
+
+def _predicted(fit: Growth | None, n: int) -> Cell:
+    if fit is None:
+        return Cell(text=ABSENT, title="fewer than four verified sizes")
+    try:
+        time = fit.at(n)
+    except ValueError as e:
+        return Cell(text="refused", kind="quiet", title=f"{e}")
+    return Cell(text=seconds(time), value=time.value)

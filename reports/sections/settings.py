@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from reports.data.environment import flatten
 from reports.data.evidence import Evidence
 from reports.document.formatting import TIMED, clean, tolerance
 from reports.document.layout import Cell, Section, Table
-from reports.sections.summary import flatten
 
 
 def environment(evidence: Evidence) -> Section:

@@ -1,16 +1,17 @@
-"""The first page: what was measured, and which solvers do not reach what was asked."""
+"""What was measured, and which solvers do not reach what was asked."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from harness import Verdict
 from harness.record import SCHEMA, VERIFIED_FACTOR
 from harness.results.faults import in_words
+from reports.data.environment import QUIET_LOAD, busy_with
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import (
+    ENDINGS,
     VERDICTS,
     clean,
     listing,
@@ -20,7 +21,6 @@ from reports.document.formatting import (
 )
 from reports.document.layout import Cell, Section, Table, name_cell, sources
 
-QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 _LIMITS = (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
 _GROUPS: dict[str, tuple[Verdict, ...]] = {
     "verified": (Verdict.VERIFIED,),
@@ -30,17 +30,6 @@ _GROUPS: dict[str, tuple[Verdict, ...]] = {
     "limit": _LIMITS,
     "failed": (Verdict.CRASHED, Verdict.FAILED),
     "declined": (Verdict.DECLINED,),
-}
-
-_ENDINGS = {
-    Verdict.INACCURATE: "claimed solved but inaccurate",
-    Verdict.WRONG: "claimed solved but wrong",
-    Verdict.INFEASIBLE_CLAIM: "claimed infeasible",
-    Verdict.ITERATION_LIMIT: "ended at the iteration limit",
-    Verdict.TIME_LIMIT: "ended at the time limit",
-    Verdict.MEMORY_LIMIT: "ended at the memory limit",
-    Verdict.CRASHED: "crashed",
-    Verdict.FAILED: "failed",
 }
 
 
@@ -172,13 +161,6 @@ def _busy(evidence: Evidence) -> str:
     )
 
 
-def busy_with(evidence: Evidence) -> float | None:
-    """Load average when the measurements began; None if low, or not known."""
-    now = evidence.environment.get("now")
-    load = now.get("load") if isinstance(now, Mapping) else None
-    return load if isinstance(load, int | float) and load > QUIET_LOAD else None
-
-
 def _unequal(evidence: Evidence) -> str:
     """Say so if some cells were repeated more often than others."""
     tried = [o for o in evidence.flat if o.verdict is not Verdict.DECLINED]
@@ -255,14 +237,14 @@ def _all(count: int) -> str:
 def _missed(tried: Sequence[Outcome], tol: float) -> list[str]:
     """Say how many cases ended in each verdict other than verified, and which."""
     said = []
-    for verdict in _ENDINGS:
+    for verdict in ENDINGS:
         those = [o for o in tried if o.verdict is verdict]
         if not those:
             continue
         known = [o.worst for o in those if o.worst is not None]
         worst = f"worst residual {power(max(known))}, " if known else ""
         said.append(
-            f"{len(those)} of {plural(len(tried), 'case')} {_ENDINGS[verdict]} at tol "
+            f"{len(those)} of {plural(len(tried), 'case')} {ENDINGS[verdict]} at tol "
             f"{tolerance(tol)} ({worst}on {listing([o.case for o in those])})"
         )
     return said
@@ -280,41 +262,3 @@ def _declined(outcomes: Sequence[Outcome]) -> list[str]:
     reasons = list(dict.fromkeys(o.first.message for o in those if o.first.message))
     why = f": {listing(reasons, 2)}" if reasons else ""
     return [f"declined {plural(len(those), 'case')}{why}"] if those else []
-
-
-def dateline(evidence: Evidence) -> str:
-    """Say when and on which machine, in one line."""
-    days = sorted({r.started[:10] for r in evidence.records if r.started})
-    when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
-    return f"{clean(when)} · {machine(evidence.environment)}"
-
-
-def machine(environment: Mapping[str, Any]) -> str:
-    """Name the machine in one line, from what environment.json says of it."""
-    facts = environment.get("machine")
-    if not isinstance(facts, Mapping):
-        return "machine unknown"
-    parts = [str(facts["cpu"]) if facts.get("cpu") else "processor unknown"]
-    if facts.get("usable_cores"):
-        parts.append(plural(facts["usable_cores"], "usable core"))
-    if isinstance(facts.get("memory_mib"), int | float):
-        parts.append(f"{facts['memory_mib'] / 1024:.0f} GiB")
-    if facts.get("system"):
-        parts.append(f"{facts['system']} {facts.get('architecture') or ''}".strip())
-    return clean(", ".join(parts), 160)
-
-
-def flatten(data: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """List the leaves of nested plain data with dotted names."""
-    match data:
-        case Mapping():
-            items = [(str(k), v) for k, v in data.items()]
-        case list() | tuple() if any(isinstance(v, Mapping | list) for v in data):
-            items = [(str(i), v) for i, v in enumerate(data)]
-        case _:
-            return [(prefix, data)]
-    return [
-        leaf
-        for key, value in items
-        for leaf in flatten(value, f"{prefix}.{key}" if prefix else key)
-    ]

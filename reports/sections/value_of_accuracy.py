@@ -7,6 +7,7 @@ from statistics import median
 
 from harness.crossval.discretisation import Discretisation, read_discretisation
 from harness.running.pairs import paired_ratio
+from reports.data.cells import source
 from reports.data.evidence import Evidence, Outcome
 from reports.data.time_at_accuracy import counts
 from reports.document.formatting import (
@@ -20,9 +21,8 @@ from reports.document.formatting import (
     tolerance,
 )
 from reports.document.layout import Cell, Section, Table, name_cell
+from reports.document.mesh_errors import mesh_table
 from reports.figures.sweeps import SHARE
-from reports.sections.cells import source
-from reports.sections.meshes import mesh_table
 
 _KNOWN = ("limit", "change")  #: kinds with an error to compare with
 
@@ -179,13 +179,9 @@ def _price(outcomes: Sequence[Outcome], meshes: Mapping[str, Discretisation]) ->
 def _further(enough: Outcome, tightest: Outcome) -> str:
     if enough is tightest:
         return ", the tightest"
-    ratio = paired_ratio(_by_repeat(tightest), _by_repeat(enough))
+    ratio = paired_ratio(tightest.by_repeat, enough.by_repeat)
     at = f"times as long at {tolerance(tightest.tol)}"
     if ratio is not None:
         return f"; {ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}] {at}"
     a, b = tightest.seconds("total"), enough.seconds("total")
     return f"; {a.value / b.value:.2f} [1 run] {at}" if a and b else ""
-
-
-def _by_repeat(outcome: Outcome) -> dict[int, float]:
-    return {r.repeat: r.total_seconds for r in outcome.records if r.total_seconds}

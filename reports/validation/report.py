@@ -9,10 +9,10 @@ from harness import Verdict
 from harness.crossval.discretisation import Discretisation
 from reports.document.formatting import ABSENT, VERDICTS, clean, plural, tolerance
 from reports.document.layout import Cell, Page, Picture, Section, Table, name_cell
+from reports.document.mesh_errors import mesh_table
 from reports.render.html_page import html
 from reports.render.markdown import markdown
 from reports.render.writing import write_figures, write_text
-from reports.sections.meshes import mesh_table
 from reports.validation.compared import (
     Data,
     count_cell,

@@ -16,7 +16,7 @@ from reports.data.evidence import Evidence, arrange
 from reports.data.time_at_accuracy import time_at, time_at_accuracy
 from reports.folder import compose
 from reports.render.markdown import markdown
-from reports.sections.certified import certified_picture, certified_sweeps
+from reports.sections.sweeps import certified_picture, certified_sweeps
 
 TOLS = (1e-2, 1e-4, 1e-6, 1e-8)
 

@@ -127,6 +127,38 @@ def toggle(page, solver):
     page.locator("#solvers button", has_text=solver).click()
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_first_screen_shows_who_was_fastest_and_the_beginning_of_the_figure(
+    visit, folder, scheme
+):
+    page = visit(folder, width=1280, color_scheme=scheme)
+    page.set_viewport_size({"width": 1280, "height": 800})
+    for statement in page.locator("dl.answer > div").all():
+        box = statement.bounding_box()
+        assert box["y"] + box["height"] < 800
+    plot = page.locator("#answer .plot svg").first
+    assert plot.bounding_box()["y"] < 750
+    assert page.locator("#answer dt").all_inner_texts() == ["dual", "primal"]
+
+
+def test_a_sentence_of_the_answer_leads_to_its_evidence_by_keyboard(visit, folder):
+    page = visit(folder, reduced_motion="reduce")
+    link = page.locator("#answer dd a", has_text="Means over cases").first
+    link.focus()
+    page.keyboard.press("Enter")
+    assert page.url.endswith("#means")
+    top = "document.querySelector('#means h2').getBoundingClientRect().top"
+    page.wait_for_function(f"0 <= {top} && {top} < innerHeight")
+
+
+def test_on_a_phone_the_answer_is_no_wider_than_the_screen(visit, folder):
+    page = visit(folder, width=390)
+    for text in page.locator("#answer dt, #answer dd p").all():
+        box = text.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+
+
 def test_a_table_of_many_rows_shows_the_first_and_pages_through_all(
     visit, folder, records
 ):

@@ -12,6 +12,7 @@ from harness.files.store import save_fields
 from harness.results.journal import Journal
 from reports import write_report
 from reports.data.evidence import Evidence, arrange
+from reports.data.quantities import spreads
 from reports.data.size_series import size_series
 from reports.document.formatting import clean, exponent, seconds, significant
 from reports.folder import compose
@@ -19,7 +20,6 @@ from reports.render.html_page import breakable
 from reports.render.latex import escaped, latex
 from reports.render.markdown import escaped as md_escaped
 from reports.render.markdown import markdown
-from reports.sections.physics import spreads
 from reports.sections.summary import sentences
 from reports.statistics.intervals import power_law
 

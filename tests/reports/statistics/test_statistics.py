@@ -10,12 +10,13 @@ from reports.data.aggregation import (
     Convention,
     common_cases,
     geometric_means,
+    panel,
     ranking_of,
+    ranks,
 )
-from reports.data.comparison_groups import ComparisonGroup
-from reports.sections.growth import growth_of
-from reports.sections.ranking import panel, ranks
+from reports.data.comparison_groups import ComparisonGroup, Kind
 from reports.statistics.censoring import restricted_mean
+from reports.statistics.growth import growth_of
 from reports.statistics.profiles import curve, performance_ratios, share, solved_within
 from reports.statistics.resampling import firsts, limits, told_apart, weights
 
@@ -26,7 +27,7 @@ def group(times, *, claimed=None, limit=60.0, solvers=None):
     times = np.asarray(times, dtype=float)
     cases, count = times.shape
     return ComparisonGroup(
-        title="dual, tol 1e-6",
+        kind=Kind(sweep=False, mode="cold", form="dual", at=1e-6),
         cases=tuple(f"case {i}" for i in range(cases)),
         solvers=tuple(solvers or (f"s{i}" for i in range(count))),
         times=times,

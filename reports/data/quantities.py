@@ -1,15 +1,16 @@
-"""Physical quantities as a report prints them: with units, and only known digits."""
+"""Physical quantities of answers: how far they agree, and the digits that are known."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
+from reports.data.cells import source
 from reports.data.evidence import Outcome
 from reports.document.formatting import clean, significant, span
 from reports.document.layout import Cell
-from reports.sections.cells import source
 
 SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
 _UNITS = {
@@ -124,3 +125,58 @@ def _rounded(leaf: Leaf, digits: int) -> str:
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))
     return significant(leaf.value, digits - below) if below < digits else "0"
+
+
+class Spread(NamedTuple):
+    """How far the energies of verified answers to one physical case lie apart."""
+
+    answers: tuple[Outcome, ...]  #: of every solver and form; at least one
+    relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
+    pair: tuple[Outcome, Outcome] | None  #: where it occurs
+
+    @property
+    def best(self) -> Outcome:
+        """The answer with the smallest worst residual."""
+        return best_of(self.answers)
+
+    @property
+    def digits(self) -> int:
+        """As many as the energies agree on and one more; alone, as tol promises."""
+        doubt = self.answers[0].tol if self.relative is None else self.relative
+        return known_digits(doubt, MOST_DIGITS["energy"])
+
+
+def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
+    """Compare energies pairwise per physical case and tolerance.
+
+    No answer serves as the reference of the others: each is set against each, across
+    solvers and across primal and dual forms.
+    """
+    groups: dict[tuple[str, float], list[Outcome]] = {}
+    for o in outcomes:
+        if o.verified and o.energy is not None:
+            groups.setdefault((o.physical, o.tol), []).append(o)
+    return [_spread(tuple(group)) for group in groups.values()]
+
+
+def _spread(answers: tuple[Outcome, ...]) -> Spread:
+    pairs = list(combinations(answers, 2))
+    if not pairs:
+        return Spread(answers, None, None)
+    differences = [_difference(a, b) for a, b in pairs]
+    worst = max(range(len(pairs)), key=differences.__getitem__)
+    return Spread(answers, differences[worst], pairs[worst])
+
+
+def _difference(a: Outcome, b: Outcome) -> float:
+    e, f = a.energy or 0.0, b.energy or 0.0
+    return abs(e - f) / max(abs(e), abs(f)) if e != f else 0.0
+
+
+def best_of(answers: Sequence[Outcome]) -> Outcome:
+    """Take the answer with the smallest worst residual; names break ties."""
+    return min(answers, key=lambda o: (_residual(o), o.case, o.solver))
+
+
+def _residual(outcome: Outcome) -> float:
+    return float("inf") if outcome.worst is None else outcome.worst

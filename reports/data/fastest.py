@@ -1,0 +1,304 @@
+"""Who was fastest at equal verified accuracy, per form and accuracy, and how surely.
+
+A solver competes if all of its answers are verified: on every case of the group that
+anybody solved. The fastest has the smallest geometric mean of times. It is named only
+if all others are told to be slower:
+
+- over `CASES` cases or more, if the ranking tells them apart, which holds for all pairs
+  at once, and the paired ratio over the cases excludes 1;
+- over fewer cases, if on each of them the paired ratio within blocks excludes 1.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from harness import Verdict
+from harness.running.pairs import Ratio, paired_ratio
+from reports.data.aggregation import Ranking
+from reports.data.comparison_groups import CASES, ComparisonGroup, Kind, kind_of
+from reports.data.evidence import Evidence, Outcome
+
+Row = Mapping[str, Outcome]  #: by solver
+Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
+
+
+class Finding(Enum):
+    """What can be said of the fastest solver of a group, or why nothing can."""
+
+    FASTEST = "one solver is faster than all others"
+    TIE = "the first is not told apart from all others"
+    DIVIDED = "on few cases, different solvers are fastest"
+    ONE_BLOCK = "few cases, and too few blocks for an interval"
+    ENVIRONMENTS = "times of different environments are not compared"
+    ALONE = "no other solver was measured"
+    ONE_COMPLETE = "only one solver was verified on every case"
+    NONE_COMPLETE = "no solver was verified on every case"
+    NONE_VERIFIED = "there is no verified answer"
+    UNFINISHED = "no case was measured with all solvers"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Competitor:
+    """A solver of a comparison, and its times over those of the first."""
+
+    solver: str
+    outcomes: Mapping[str, Outcome]  #: by case
+    compared: tuple[str, ...] = ()  #: cases that it and the first solved
+    slower: bool = False  #: told to be slower than the first
+    ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
+    by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
+
+    @property
+    def verified(self) -> tuple[str, ...]:
+        """Cases with a verified answer."""
+        return tuple(
+            case for case, o in self.outcomes.items() if time_of(o) is not None
+        )
+
+    @property
+    def closest(self) -> Ratio | None:
+        """The ratio; over a few cases, the smallest of theirs."""
+        few = min(self.by_case.values(), key=lambda r: r.value, default=None)
+        return few if self.ratio is None else self.ratio
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastestSolver:
+    """The solvers of one form at one accuracy: who was fastest, or why no one is named.
+
+    Competitors are in the order of their ratios; behind them are those that were not
+    verified on every case. Cases are those that all were measured on and one solved.
+    """
+
+    kind: Kind
+    finding: Finding
+    cases: tuple[str, ...]
+    competitors: tuple[Competitor, ...]
+    others: tuple[Competitor, ...]  #: not verified on every case
+    over_cases: bool  #: the ratios are over cases; else within blocks
+    unsolved: int  #: cases that nobody solved
+    notes: tuple[str, ...]  #: what was not measured
+
+    @property
+    def first(self) -> Competitor:
+        """The competitor with the smallest geometric mean; there has to be one."""
+        return self.competitors[0]
+
+    @property
+    def tied(self) -> tuple[Competitor, ...]:
+        """The others that are not told to be slower than the first."""
+        return tuple(c for c in self.competitors[1:] if not c.slower)
+
+    @property
+    def following(self) -> Competitor | None:
+        """The next that is told to be slower; None if there is none."""
+        return next((c for c in self.competitors[1:] if c.slower), None)
+
+    def fastest_on(self) -> dict[str, str | None]:
+        """Name the fastest of each case by its blocks; None where it is not told."""
+        return {case: _fastest_on(self.competitors, case) for case in self.cases}
+
+
+class Unverified(NamedTuple):
+    """The answers of one solver that ended in one verdict other than verified."""
+
+    solver: str
+    verdict: Verdict
+    answers: tuple[Outcome, ...]
+    of: int  #: how many the solver gave, or declined to give
+
+
+def fastest_solvers(
+    answers: Answers, groups: Iterable[ComparisonGroup], rankings: Iterable[Ranking]
+) -> tuple[FastestSolver, ...]:
+    """Find the fastest solver of every group.
+
+    groups : all of them, whatever can be said
+    rankings : of those with statements over cases
+    """
+    ranked = {ranking.group.kind: ranking for ranking in rankings}
+    return tuple(
+        _fastest(
+            group,
+            ranked.get(group.kind),
+            {case: answers[group.kind][case] for case in group.cases},
+        )
+        for group in groups
+    )
+
+
+def answers_of(evidence: Evidence) -> Answers:
+    """Choose the answer of every solver to every case; null arms take no part."""
+    found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
+    for o in evidence.flat:
+        if not o.first.arm:
+            cases = found.setdefault(kind_of(o.first), {})
+            cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
+    return {
+        kind: {
+            case: {solver: representative(given) for solver, given in row.items()}
+            for case, row in cases.items()
+        }
+        for kind, cases in found.items()
+    }
+
+
+def unverified(rows: Iterable[Row]) -> list[Unverified]:
+    """Count what was not verified, by solver and verdict; most failures first."""
+    given: dict[str, list[Outcome]] = {}
+    for row in rows:
+        for solver, outcome in row.items():
+            given.setdefault(solver, []).append(outcome)
+    found: list[Unverified] = []
+    for solver, outcomes in given.items():
+        by_verdict: dict[Verdict, list[Outcome]] = {}
+        for o in outcomes:
+            if not o.verified:
+                by_verdict.setdefault(o.verdict, []).append(o)
+        found += [
+            Unverified(solver, verdict, tuple(those), len(outcomes))
+            for verdict, those in by_verdict.items()
+        ]
+    return sorted(found, key=lambda one: -len(one.answers))
+
+
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """Choose the answer of a solver on a case: of a sweep, the cheapest verified one.
+
+    Where none is verified, that at the tightest tolerance.
+    """
+    timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
+    if timed:
+        return min(timed, key=lambda each: each[:2])[-1]
+    return min(outcomes, key=lambda o: o.tol)
+
+
+def time_of(outcome: Outcome) -> float | None:
+    """Median total time of a verified answer, s."""
+    time = outcome.seconds("total") if outcome.verified else None
+    return time.value if time is not None and time.value > 0 else None
+
+
+def _fastest(
+    group: ComparisonGroup, ranking: Ranking | None, rows: Mapping[str, Row]
+) -> FastestSolver:
+    solved = {
+        case: row
+        for case, row in rows.items()
+        if any(time_of(row[s]) is not None for s in group.solvers)
+    }
+    entered = [
+        Competitor(solver=s, outcomes={case: row[s] for case, row in solved.items()})
+        for s in group.solvers
+    ]
+    full = [c for c in entered if len(c.verified) == len(solved) > 0]
+    full.sort(key=_geometric_mean)
+    others = [c for c in entered if c not in full]
+    others.sort(key=lambda c: -len(c.verified))
+    if full:
+        first = full[0]
+        full[1:] = sorted(
+            (_compared(c, first, ranking) for c in full[1:]), key=_geometric_mean
+        )
+        others = [_compared(c, first, ranking) for c in others]
+    return FastestSolver(
+        kind=group.kind,
+        finding=_finding(group, solved, full, over_cases=ranking is not None),
+        cases=tuple(solved),
+        competitors=tuple(full),
+        others=tuple(others),
+        over_cases=ranking is not None,
+        unsolved=len(rows) - len(solved),
+        notes=group.unmeasured,
+    )
+
+
+def _geometric_mean(c: Competitor) -> float:
+    return float(np.mean([np.log(time_of(o) or np.inf) for o in c.outcomes.values()]))
+
+
+def _compared(c: Competitor, first: Competitor, ranking: Ranking | None) -> Competitor:
+    """Compare with the first on the cases that both solved, in one environment."""
+    both = [case for case in c.verified if not _mixed(c, first, case)]
+    if len(both) < len(c.verified):
+        return c
+    if ranking is None:
+        return _within_blocks(c, first, both)
+    mine, its = (
+        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(both)}
+        for one in (c, first)
+    )
+    ratio = paired_ratio(mine, its) if len(both) >= CASES else None
+    names = ranking.group.solvers
+    told = ranking.faster[names.index(first.solver), names.index(c.solver)]
+    slower = ratio is not None and bool(told) and ratio.low > 1
+    return replace(c, compared=tuple(both), ratio=ratio, slower=slower)
+
+
+def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
+    """Compare on each case by the blocks that both were measured in."""
+    paired = {
+        case: paired_ratio(c.outcomes[case].by_repeat, first.outcomes[case].by_repeat)
+        for case in cases
+    }
+    by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
+    slower = len(by_case) == len(c.outcomes) and all(
+        ratio.low > 1 for ratio in by_case.values()
+    )
+    only = by_case.get(cases[0]) if len(cases) == len(c.outcomes) == 1 else None
+    return replace(c, compared=tuple(cases), by_case=by_case, ratio=only, slower=slower)
+
+
+def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
+    """Whether blocks of two solvers were measured in different environments."""
+    mine, its = (
+        {r.repeat: r.environment for r in one.outcomes[case].records} for one in (a, b)
+    )
+    return any(mine[block] != its[block] for block in mine.keys() & its.keys())
+
+
+def _finding(
+    group: ComparisonGroup,
+    solved: Mapping[str, Row],
+    full: Sequence[Competitor],
+    *,
+    over_cases: bool,
+) -> Finding:
+    if not group.cases or not group.solvers:
+        return Finding.UNFINISHED
+    if not solved:
+        return Finding.NONE_VERIFIED
+    if len(group.solvers) == 1:
+        return Finding.ALONE
+    if len(full) < 2:
+        return Finding.ONE_COMPLETE if full else Finding.NONE_COMPLETE
+    if any(_mixed(c, full[0], case) for c in full[1:] for case in solved):
+        return Finding.ENVIRONMENTS
+    if all(c.slower for c in full[1:]):
+        return Finding.FASTEST
+    if over_cases:
+        return Finding.TIE
+    if any(len(c.by_case) < len(solved) for c in full[1:]):
+        return Finding.ONE_BLOCK
+    faster = any(r.high < 1 for c in full[1:] for r in c.by_case.values())
+    return Finding.DIVIDED if faster else Finding.TIE
+
+
+def _fastest_on(competitors: Sequence[Competitor], case: str) -> str | None:
+    """Name the solver with the smallest time on a case, if it is told from all."""
+    first = min(competitors, key=lambda c: time_of(c.outcomes[case]) or np.inf)
+    its = first.outcomes[case].by_repeat
+    ratios = [
+        paired_ratio(c.outcomes[case].by_repeat, its)
+        for c in competitors
+        if c is not first
+    ]
+    told = all(ratio is not None and ratio.low > 1 for ratio in ratios)
+    return first.solver if told else None

@@ -1,0 +1,191 @@
+"""The times of all solvers over that of the first, form by form, and who failed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from harness.running.pairs import Ratio
+from reports.data.fastest import Competitor, FastestSolver, Finding, time_of
+from reports.document.figure import (
+    INK,
+    Axis,
+    Figure,
+    Intervals,
+    Look,
+    Mark,
+    Panel,
+    Row,
+    Rule,
+    Series,
+    Text,
+    categories,
+    limits,
+    numbers,
+)
+from reports.document.formatting import VERDICTS, clean, plural
+from reports.figures.style import legible, look, run_ids
+
+PANELS = 4  #: forms that are drawn
+SOLVERS = 12  #: of a panel
+_NAME = 20  #: letters of a name beside an axis
+_ROW = 0.3  #: height of a solver, inches
+_BESIDE = 0.24  #: from a mean to the cases that it is of, rows
+_TALL = 0.38  #: where ratios and a verdict share one, inches
+_RAISED, _BELOW = 0.16, 0.32  #: of ratios above a verdict, and it below them, rows
+_ALIKE = Look(colour=INK, width=0.8)  #: the line where times are equal
+
+
+def fastest_figure(
+    found: Sequence[FastestSolver], solvers: Sequence[str]
+) -> Figure | None:
+    """Draw a panel per form and in it a row per solver; None without an answer.
+
+    solvers : of the whole report, which their looks go by
+    """
+    shown = [f for f in found if f.cases and (f.competitors or f.others)]
+    if not shown:
+        return None
+    columns = min(len(shown), 2)
+    panels = _on_one_scale([_panel(f, solvers) for f in shown])
+    rows = []
+    for i in range(0, len(shown), columns):
+        height = 0.75 + max(map(_height, shown[i : i + columns]))
+        rows.append(Row(panels=tuple(panels[i : i + columns]), height=height))
+    return Figure(rows=tuple(rows), height=sum(row.height for row in rows))
+
+
+def _rows(f: FastestSolver) -> tuple[Competitor, ...]:
+    return (*f.competitors, *f.others)[:SOLVERS]
+
+
+def _height(f: FastestSolver) -> float:
+    """Height of all rows, inches."""
+    shared = _has_reference(f) and any(c.compared for c in f.others)
+    return max(len(_rows(f)), 2) * (_TALL if shared else _ROW)
+
+
+def _panel(f: FastestSolver, solvers: Sequence[str]) -> Panel:
+    """Draw the first solver uppermost, at 1, and everybody's ratios to it."""
+    marks: list[Mark] = []
+    texts = []
+    for k, c in enumerate(_rows(f)):
+        style = replace(look(solvers.index(c.solver)), dash=None)
+        failed = c in f.others
+        below = _BELOW if failed and c.compared else 0.0
+        if _has_reference(f):
+            marks += _marks(_RAISED - k if below else -float(k), c, f, style)
+        if failed:
+            texts.append(
+                Text(text=_failure(c), place=(0.995, -k - below),
+                     inside=(True, False), align=("right", "center"))
+            )  # fmt: skip
+    return Panel(
+        x=_ratios(f),
+        y=categories([_short(c.solver) for c in _rows(f)]),
+        marks=tuple(marks),
+        rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if _has_reference(f) else (),
+        texts=tuple(texts),
+        title=f"{legible(f.kind.title)}, {plural(len(f.cases), 'case')}",
+        grid="x",
+    )
+
+
+def _ratios(f: FastestSolver) -> Axis:
+    if not _has_reference(f):
+        return Axis(low=0.0, high=1.0, ticks=())
+    label = f"total time / that of {legible(f.first.solver)}"
+    return Axis(label=label, log=True, plain=True, shared="ratios")
+
+
+def _short(name: str) -> str:
+    """Leave out the middle of a long name, in letters that the font has."""
+    text = clean(name)
+    half = _NAME // 2 - 1
+    return legible(text if len(text) <= _NAME else f"{text[:half]}..{text[-half:]}")
+
+
+def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
+    """Give all ratios one scale that holds 0.8 and 2."""
+    ratios = [p for p in panels if p.x.log]
+    if not ratios:
+        return list(panels)
+    low, high = limits(ratios, "x")
+    low, high = min(0.8, low), max(2.0, high)
+    return [
+        replace(p, x=replace(p.x, low=low, high=high)) if p.x.log else p for p in panels
+    ]
+
+
+def _has_reference(f: FastestSolver) -> bool:
+    return bool(f.competitors) and f.finding is not Finding.ENVIRONMENTS
+
+
+def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]:
+    """Mark the ratios of one solver to the first, case by case and over the cases."""
+    if c is f.first:
+        return [_points([1.0], [y], [_behind(c, f.cases)], c, style)]
+    count = len(c.compared)
+    middle = c.ratio if f.over_cases else None
+    spread = np.linspace(0.25, -0.25, count) if count > 1 else np.zeros(count)
+    places = np.full(count, y + (_BESIDE if middle else 0.0))
+    places += 0 if f.over_cases else spread
+    small = replace(style, size=2.8, opacity=0.6) if f.over_cases else style
+    marks: list[Mark] = []
+    if count:
+        ratios = [_ratio(c, f.first, case) for case in c.compared]
+        runs = [_behind(c, [case]) for case in c.compared]
+        known = [c.by_case.get(case) for case in c.compared]
+        marks.append(_points(ratios, places, runs, c, small, known))
+    if middle:
+        runs = [_behind(c, c.compared)]
+        marks.append(_points([middle.value], [y], runs, c, style, [middle]))
+    return marks
+
+
+def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
+    """Name the measurements of a solver on some cases."""
+    return run_ids(r for case in cases for r in c.outcomes[case].records)
+
+
+def _ratio(c: Competitor, first: Competitor, case: str) -> float:
+    """Ratio of a case: within blocks where there are some, else of the medians."""
+    if case in c.by_case:
+        return c.by_case[case].value
+    mine, its = time_of(c.outcomes[case]), time_of(first.outcomes[case])
+    return mine / its if mine and its else np.nan
+
+
+def _points(
+    x: Sequence[float],
+    y: Iterable[float],
+    runs: Sequence[tuple[str, ...]],
+    c: Competitor,
+    style: Look,
+    known: Sequence[Ratio | None] = (),
+) -> Series:
+    """Make a series of ratios with their intervals, where they have one."""
+    bars = None
+    if any(known):
+        low = numbers([i.low if i else np.nan for i in known])
+        high = numbers([i.high if i else np.nan for i in known])
+        bars = Intervals(low=low, high=high, along="x", cap=0.0, width=1.1)
+    return Series(
+        x=numbers(x), y=numbers(list(y)), runs=tuple(runs), look=style, intervals=bars,
+        solver=c.solver, clipped=False,
+    )  # fmt: skip
+
+
+def _failure(c: Competitor) -> str:
+    """Say which verdict most of the answers ended in that were not verified."""
+    count = Counter(o.verdict for o in c.outcomes.values() if time_of(o) is None)
+    if not count:
+        return ""
+    verdict, n = count.most_common(1)[0]
+    _, words = VERDICTS[verdict]
+    return (
+        words if n == len(c.outcomes) == 1 else f"{words} on {n} of {len(c.outcomes)}"
+    )

@@ -1,0 +1,517 @@
+"""The report opens with who was fastest: no more than the measurements bear out."""
+
+import re
+
+import numpy as np
+import pytest
+
+from harness import InputError, Record, Verdict
+from harness.results.journal import Journal
+from reports import answer, write_report
+from reports.data.aggregation import ranking_of
+from reports.data.comparison_groups import all_groups
+from reports.data.evidence import Evidence, arrange
+from reports.data.fastest import Finding, answers_of, fastest_solvers
+from reports.figures.fastest import fastest_figure
+from reports.folder import compose
+from reports.render.html_page import html
+from reports.render.latex import latex
+from reports.render.markdown import markdown
+
+LIMIT = 5.0
+
+
+@pytest.fixture
+def record():
+    def make(solver, case, seconds=0.01, repeat=0, **changes):
+        form, tol = changes.get("form", "dual"), changes.get("tol", 1e-6)
+        name = f"box/n={case}/{form}"
+        defaults = dict(
+            run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
+            params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
+            repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
+            iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
+            complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
+            environment="abc",
+        )  # fmt: skip
+        return Record(**(defaults | changes))
+
+    return make
+
+
+@pytest.fixture
+def evidence(tmp_path):
+    def make(records, **suite):
+        given = {"time_limit": LIMIT} | suite
+        return Evidence(directory=tmp_path, records=arrange(records), suite=given)
+
+    return make
+
+
+@pytest.fixture
+def opened(evidence):
+    """Factory: statements of the report's first section, by their subjects."""
+
+    def make(records):
+        first = compose(evidence(records)).sections[0]
+        assert first.name == "answer"
+        return {s.subject: s for s in first.statements}
+
+    return make
+
+
+def found(evidence):
+    groups = all_groups(evidence)
+    rankings = [ranking_of(group) for group in groups if group.comparable]
+    return fastest_solvers(answers_of(evidence), groups, rankings)
+
+
+def one_case(record, seed=1, blocks=6, case=0, **factors):
+    """Measure one case: what slows a block down slows all solvers down."""
+    rng = np.random.default_rng(seed)
+    slow = rng.lognormal(0, 0.3, blocks)
+    return [
+        record(s, case, 0.01 * factor * slow[i] * rng.lognormal(0, 0.02), i)
+        for s, factor in factors.items()
+        for i in range(blocks)
+    ]
+
+
+def many_cases(record, cases=8, seed=1, scatter=0.05, **factors):
+    """Measure cases of very different sizes, once each."""
+    rng = np.random.default_rng(seed)
+    return [
+        record(s, k, 1e-3 * 2.0**k * factor * rng.lognormal(0, scatter))
+        for s, factor in factors.items()
+        for k in range(cases)
+    ]
+
+
+def ratio_in(text):
+    """Read the first ratio and its interval."""
+    value, low, high = re.search(
+        r"took (?:at least )?(\S+) \[(\S+), (\S+)\]", text
+    ).groups()
+    return float(value), float(low), float(high)
+
+
+# ---- who is named
+
+
+@pytest.mark.parametrize("make", [one_case, many_cases])
+def test_a_planted_winner_is_named_with_its_planted_ratio(record, opened, make):
+    records = make(record, slow=2.0, fast=1.0, slowest=5.0)
+    (claim,) = opened(records)["dual"].claims
+    assert claim.startswith("fast was the fastest")
+    assert "the next, slow, took" in claim
+    value, low, high = ratio_in(claim)
+    assert low < 2.0 < high
+    assert value == pytest.approx(2.0, rel=0.1)
+    assert "slowest" not in claim
+
+
+@pytest.mark.parametrize("make", [one_case, many_cases])
+def test_equal_solvers_are_a_tie_and_the_next_is_behind_it(record, opened, make):
+    (claim,) = opened(make(record, a=1.0, b=1.0, slow=3.0))["dual"].claims
+    assert claim.startswith("A tie")
+    assert re.search(r"\b(a and b|b and a) are not told apart", claim)
+    _, low, high = ratio_in(claim)
+    assert low <= 1 <= high
+    assert "the next, slow, took 3" in claim or "the next, slow, took 2.9" in claim
+
+
+@pytest.mark.parametrize(
+    ("logs", "why"),
+    [
+        # signs of six cases: five of one sign occur by chance in 2 of 2⁵
+        ([0.3, 0.3, 0.3, 0.3, 0.3, -0.01], "does not outlast a test of all pairs"),
+        # all of one sign, but the interval of their mean holds 0
+        ([0.01, 0.01, 0.01, 0.01, 0.01, 3.0], "b took 1.66 [0.4"),
+    ],
+)
+def test_a_winner_over_cases_takes_both_the_interval_and_the_test_of_all_pairs(
+    record, opened, logs, why
+):
+    records = [
+        r for k, log in enumerate(logs)
+        for r in (record("a", k, 0.01), record("b", k, 0.01 * np.exp(log)))
+    ]  # fmt: skip
+    (claim,) = opened(records)["dual"].claims
+    assert claim.startswith("A tie over 6 cases at tol 1e-6: a and b are not told")
+    assert why in claim
+
+
+@pytest.mark.parametrize("cases", [1, 2, 7])
+def test_of_equal_solvers_one_is_named_in_one_run_of_twenty_at_most(
+    record, evidence, cases
+):
+    rng = np.random.default_rng(cases)
+    named = 0
+    for _ in range(100):
+        records = [
+            record(s, case, 0.01 * rng.lognormal(0, 0.2), i)
+            for case in range(cases) for s in "abcd" for i in range(4)
+        ]  # fmt: skip
+        named += found(evidence(records))[0].finding is Finding.FASTEST
+    assert named <= 10  # 5 expected at most; more than 10 once in a hundred
+
+
+@pytest.mark.parametrize("make", [one_case, many_cases])
+def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
+    record, opened, make
+):
+    lies = dict(status=Verdict.WRONG, claimed="solved", dual=0.03)
+    liar = [r.but(**lies) for r in make(record, liar=0.01)]
+    statement = opened(make(record, honest=1.0, slow=2.0) + liar)["dual"]
+    (claim,) = statement.claims
+    assert claim.startswith("honest was the fastest")
+    assert "liar" not in claim
+    (failed,) = (text for text in statement.remarks if text.startswith("Failed"))
+    assert "liar claimed solved but wrong on" in failed
+    assert "(residual 3.0e-2, allowed 1.0e-5)" in failed
+    assert "verdicts" in statement.evidence
+
+
+def test_one_refuted_repeat_is_enough_not_to_compete(record, opened):
+    records = one_case(record, fast=0.1, honest=1.0, slow=2.0)
+    records[3] = records[3].but(status=Verdict.INACCURATE, dual=1e-3)
+    statement = opened(records)["dual"]
+    assert statement.claims[0].startswith("honest was the fastest")
+    assert "fast claimed solved but inaccurate on 1 of 1 case" in statement.remarks[0]
+
+
+def test_a_solver_that_fails_half_of_the_cases_is_not_the_fastest_of_all(
+    record, opened
+):
+    half = [
+        r.but(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
+        if r.params["n"] % 2 else r
+        for r in many_cases(record, half=1e-4)
+    ]  # fmt: skip
+    statement = opened(many_cases(record, sure=1.0, slow=2.0) + half)["dual"]
+    assert statement.claims[0].startswith("sure was the fastest over 8 cases")
+    assert "half ended at the iteration limit on 4 of 8 cases" in statement.remarks[0]
+
+
+def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
+    record, opened
+):
+    almost = many_cases(record, almost=0.5)
+    almost[0] = almost[0].but(status=Verdict.CRASHED)
+    statement = opened(many_cases(record, sure=1.0, slow=2.0) + almost)["dual"]
+    assert statement.claims[0].startswith("sure was the fastest over 8 cases")
+    faster = statement.remarks[0]
+    assert faster.startswith("Faster where verified, at tol 1e-6: almost (7 of 8 cases")
+    value, low, high = re.search(r"(\S+) \[(\S+), (\S+)\] times", faster).groups()
+    assert 0.4 < float(low) <= float(value) <= float(high) < 0.6
+    assert float(value) == pytest.approx(0.5, rel=0.1)
+
+
+def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
+    a, b = many_cases(record, a=1.0), many_cases(record, b=2.0)
+    a[0] = a[0].but(status=Verdict.TIME_LIMIT)
+    b[5] = b[5].but(status=Verdict.CRASHED, message="signal 11")
+    b[6] = b[6].but(status=Verdict.CRASHED, message="signal 11")
+    statement = opened(a + b)["dual"]
+    assert statement.claims == (
+        "Nobody is named over 8 cases at tol 1e-6: no solver was verified on all of "
+        "them; a was on most, 7.",
+    )
+    assert "b crashed on 2 of 8 cases (signal 11)" in statement.remarks[0]
+
+
+def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, opened):
+    records = [
+        r.but(status=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
+        for r in many_cases(record, fast=1.0, slow=3.0)
+    ]
+    statement = opened(records)["dual"]
+    assert statement.claims[0].startswith("fast was the fastest over 7 cases")
+    assert "Nobody solved 1 further case." in statement.remarks
+
+
+def test_a_single_solver_has_nobody_to_be_faster_than(record, opened):
+    (claim,) = opened(one_case(record, lonely=1.0))["dual"].claims
+    assert claim.startswith("Only lonely was measured on the only case at tol 1e-6:")
+    assert claim.endswith("nothing to compare with.")
+
+
+def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
+    failed = [r.but(status=Verdict.FAILED, message="gave up")
+              for r in one_case(record, other=0.5)]  # fmt: skip
+    (claim,) = opened(one_case(record, lonely=1.0) + failed)["dual"].claims
+    assert "Nobody is named" in claim
+    assert "only lonely was verified, and no other competes" in claim
+
+
+def test_a_form_without_a_verified_answer_says_so(record, opened):
+    records = [
+        r.but(status=Verdict.ITERATION_LIMIT) for r in one_case(record, a=1.0, b=2.0)
+    ]
+    assert opened(records)["dual"].claims == ("No answer was verified at tol 1e-6.",)
+
+
+def test_one_repeat_of_a_case_gives_no_winner_and_says_what_is_missing(record, opened):
+    statement = opened(one_case(record, blocks=1, fast=1.0, slow=9.0))["dual"]
+    assert statement.claims[0].startswith("Nobody is named on the only case")
+    assert "fewer than two blocks" in statement.claims[0]
+    assert "more repeats will" in statement.claims[0]
+
+
+def test_a_few_cases_are_told_one_by_one_and_say_nothing_of_others(record, opened):
+    records = [
+        r for case in range(3)
+        for r in one_case(record, seed=case, case=case, fast=1.0, slow=2.0 + case)
+    ]  # fmt: skip
+    statement = opened(records)["dual"]
+    assert statement.claims[0].startswith("fast was the fastest on each of 3 cases")
+    value, _, _ = ratio_in(statement.claims[0])
+    assert "took at least" in statement.claims[0]
+    assert value == pytest.approx(2.0, rel=0.1)  # of 2, 3 and 4
+    assert "Fewer than 6 cases: nothing is said of other cases." in statement.remarks
+
+
+def test_where_each_has_its_case_nobody_is_fastest(record, opened):
+    records = [
+        *one_case(record, case=0, a=1.0, b=2.0),
+        *one_case(record, case=1, a=2.0, b=1.0),
+        *one_case(record, case=2, a=3.0, b=1.0),
+    ]
+    (claim,) = opened(records)["dual"].claims
+    assert claim == (
+        "No solver was the fastest on each of 3 cases at tol 1e-6: b on 2, a on 1."
+    )
+
+
+# ---- what is not mixed
+
+
+def test_forms_and_tolerances_have_answers_of_their_own(record, opened):
+    def measured(form, tol, **factors):
+        return [
+            r.but(form=form, tol=tol, case=f"box/n=0/{form}",
+                  run_id=f"{r.run_id}-{form}-{tol}")
+            for r in one_case(record, **factors)
+        ]  # fmt: skip
+
+    told = opened([
+        *measured("dual", 1e-3, a=1.0, b=2.0),
+        *measured("dual", 1e-6, a=2.0, b=1.0),
+        *measured("primal", 1e-6, a=1.0, c=4.0),
+    ])  # fmt: skip
+    assert list(told) == ["dual", "primal"]
+    loose, tight = told["dual"].claims
+    assert loose.startswith("a was the fastest on the only case at tol 1e-3")
+    assert tight.startswith("b was the fastest on the only case at tol 1e-6")
+    assert told["primal"].claims[0].startswith("a was the fastest")
+
+
+def test_many_tolerances_are_no_wall_of_text(record, opened):
+    tols = [10.0**-k for k in range(2, 10)]
+    records = [
+        r.but(tol=tol, run_id=f"{r.run_id}-{tol}")
+        for tol in tols for r in one_case(record, a=1.0, b=2.0)
+    ]  # fmt: skip
+    statement = opened(records)["dual"]
+    assert [re.search(r"tol (\S+),", c)[1] for c in statement.claims] == [
+        "1e-2", "1e-6", "1e-9",
+    ]  # fmt: skip
+    assert "5 more tolerances are in the evidence." in statement.remarks
+
+
+def test_a_null_arm_is_nobodys_rival(record, opened):
+    records = one_case(record, a=1.0, b=2.0)
+    null = [r.but(solver="a (null)", arm="null", run_id=f"{r.run_id}-null")
+            for r in one_case(record, seed=2, a=1.0)]  # fmt: skip
+    null[0] = null[0].but(status=Verdict.CRASHED)
+    statement = opened(records + null)["dual"]
+    assert statement.claims[0].startswith("a was the fastest")
+    assert not any("null" in line for line in statement.lines)
+
+
+def test_sequences_are_compared_with_sequences(record, opened):
+    cold = one_case(record, a=1.0, b=2.0)
+    warm = [
+        r.but(mode="sequence", solver=f"{r.solver} (sequence)",
+              run_id=f"{r.run_id}-warm", total_seconds=r.total_seconds / 100)
+        for r in one_case(record, a=2.0, b=1.0)
+    ]  # fmt: skip
+    told = opened(cold + warm)
+    assert list(told) == ["dual", "dual, sequence"]
+    assert told["dual"].claims[0].startswith("a was the fastest")
+    assert told["dual, sequence"].claims[0].startswith("b (sequence) was the fastest")
+
+
+def test_of_a_sweep_the_cheapest_verified_answers_compete_at_one_accuracy(
+    record, opened
+):
+    def swept(solver, tol, seconds, status=Verdict.VERIFIED):
+        return [
+            record(solver, 0, seconds * (1 + i / 100), i, tol=tol, accuracy=1e-6,
+                   status=status)
+            for i in range(4)
+        ]  # fmt: skip
+
+    statement = opened([
+        *swept("hasty", 1e-2, 0.001, Verdict.INACCURATE), *swept("hasty", 1e-6, 0.08),
+        *swept("sound", 1e-2, 0.02), *swept("sound", 1e-6, 0.07),
+    ])["dual"]  # fmt: skip
+    (claim,) = statement.claims
+    assert claim.startswith("sound was the fastest on the only case at accuracy 1e-6")
+    assert ratio_in(claim)[0] == pytest.approx(4.0)
+    assert not any(text.startswith("Failed") for text in statement.remarks)
+
+
+def test_equal_certified_errors_are_compared_where_there_are_any(record, opened):
+    """Both ask for the same; b hands over what is a hundred times more accurate."""
+    records = [
+        record(s, 0, factor * (8 - np.log10(tol)) * 1e-3 * (1 + i / 1000), i, tol=tol,
+               energy_bound=tol / better)
+        for s, factor, better in (("a", 1.0, 1.0), ("b", 1.05, 100.0))
+        for tol in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6) for i in range(4)
+    ]  # fmt: skip
+    statement = opened(records)["dual"]
+    assert statement.claims[0] == (
+        "At equal certified error (1 case) the fastest was: at 1e-4 b on 1; at 1e-6 b "
+        "on 1."
+    )
+    assert "accuracy" in statement.evidence
+
+
+def test_times_of_different_environments_name_nobody(record, opened):
+    records = [
+        r.but(environment="other" if r.solver == "new" else "abc")
+        for r in one_case(record, old=1.0, new=0.5)
+    ]
+    (claim,) = opened(records)["dual"].claims
+    assert "different environments, whose times are not comparable" in claim
+    nodes = [
+        r.but(environment=f"node{r.repeat % 2}") for r in one_case(record, a=1.0, b=2.0)
+    ]
+    assert opened(nodes)["dual"].claims[0].startswith("a was the fastest")
+
+
+def test_who_declined_is_told_apart_from_who_failed(record, opened):
+    shy = record(
+        "shy", 0, None, status=Verdict.DECLINED, claimed="", message="too large"
+    )
+    statement = opened([*one_case(record, a=1.0, b=2.0), shy])["dual"]
+    assert "Declined: shy (too large)." in statement.remarks
+    assert not any(text.startswith("Failed") for text in statement.remarks)
+
+
+def test_many_failures_are_counted_not_listed(record, opened):
+    lost = [
+        r.but(status=Verdict.FAILED, message="no")
+        for k in range(30) for r in one_case(record, blocks=2, **{f"s{k:02d}": 1.0})
+    ]  # fmt: skip
+    statement = opened([*one_case(record, a=1.0, b=2.0), *lost])["dual"]
+    (failed,) = (text for text in statement.remarks if text.startswith("Failed"))
+    assert len(failed) < 300
+    assert "and 23 more" in failed
+
+
+# ---- as it is read
+
+
+def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
+    record, evidence, tmp_path
+):
+    page = compose(evidence(many_cases(record, fast=1.0, slow=2.0)))
+    text, source = html(page), markdown(page)
+    names = {s.name for s in page.sections}
+    first = text[text.index("<main>") : text.index('<section id="summary"')]
+    assert "fast was the fastest" in first
+    shown = first[: first.index("</dl>")]
+    targets = set(re.findall(r'href="#([^"]+)"', shown))
+    assert {"means", "ranking", "verdicts"} <= targets <= names
+    headings = {
+        re.sub(r"[^\w -]", "", line[3:].lower()).replace(" ", "-")
+        for line in source.splitlines() if line.startswith("## ")
+    }  # fmt: skip
+    opening = source[: source.index("## Summary")]
+    anchors = set(re.findall(r"\]\(#([^)]+)\)", opening))
+    assert "means-over-cases" in anchors
+    assert anchors <= headings
+    assert "![answer](figures/answer.png)" in opening
+    tex = latex(page.sections[0].tables, page.sections[0].statements)
+    assert r"\item[{dual}] fast was the fastest" in tex
+
+
+def test_plain_sentences_are_those_of_the_report(record, tmp_path):
+    with Journal(tmp_path, "test") as journal:
+        for r in one_case(record, fast=1.0, slow=2.0):
+            journal.append(r)
+    lines = answer(tmp_path)
+    assert lines[0].startswith("dual: fast was the fastest on the only case at tol")
+    write_report(tmp_path, ["md", "tex"])
+    text = (tmp_path / "report/report.md").read_text("utf-8")
+    assert (
+        lines[0].removeprefix("dual: ").replace("[", r"\[").replace("]", r"\]") in text
+    )
+    assert (tmp_path / "report/tables/answer.tex").is_file()
+    with pytest.raises(InputError, match="no such folder"):
+        answer(tmp_path / "empty")
+
+
+def test_names_cannot_break_out_of_the_answer(record, evidence):
+    names = ("<b>x</b>", r"\input{a}$", "| a |\n## b", "\u202eleft", "", "n" * 5000)
+    records = [
+        record(name, 0, 0.01 * (k + 1) * (1 + i / 100), i, form=form,
+               status=Verdict.WRONG if k == 2 else Verdict.VERIFIED, message=name,
+               run_id=f"{k}-{i}-{n}")
+        for n, form in enumerate((*names, "dual"))
+        for k, name in enumerate(names) for i in range(3)
+    ]  # fmt: skip
+    page = compose(evidence(records))
+    text = html(page)
+    opening = text[text.index('<dl class="answer">') : text.index("</dl>")]
+    assert not {"b", "input"} & set(re.findall(r"</?(\w+)", opening))
+    assert "\u202e" not in opening
+    assert "n" * 100 not in opening
+    assert not re.search(r"^## b", markdown(page), flags=re.MULTILINE)
+    tex = latex((), page.sections[0].statements)
+    for line in tex.splitlines():
+        bare = re.sub(r"\\[\\{}$&#%_]", "", line)
+        assert bare.count("{") == bare.count("}"), line
+
+
+# ---- the figure
+
+
+def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
+    made = evidence(many_cases(record, fast=1.0, slow=2.0))
+    (panel,) = fastest_figure(found(made), made.solvers).panels
+    owners = {}
+    for series in panel.marks:
+        assert len(series.runs) == len(series.x)
+        assert all(series.runs)
+        owners.setdefault(series.solver, []).append(series.x)
+    ratios, mean = sorted(owners["slow"], key=len, reverse=True)
+    assert len(ratios) == 8
+    assert np.exp(np.mean(np.log(ratios))) == pytest.approx(mean[0])
+    assert owners["fast"] == [(1.0,)]
+    own = {r.run_id for r in made.records if r.solver == "slow"}
+    slow = [series for series in panel.marks if series.solver == "slow"]
+    shown = {run_id for series in slow for ids in series.runs for run_id in ids}
+        r for m in panel.marks if m.solver == "slow" for one in m.runs for r in one
+    }
+    assert shown == own
+
+
+def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence):
+    lost = [r.but(status=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
+    made = evidence(one_case(record, a=1.0, b=2.0) + lost)
+    (panel,) = fastest_figure(found(made), made.solvers).panels
+    assert panel.y.ticks == ((0.0, "a"), (-1.0, "b"), (-2.0, "lost"))
+    (text,) = panel.texts
+    assert (text.text, text.place) == ("time limit", (0.995, -2.0))
+    assert text.inside == (True, False)
+    assert {y for series in panel.marks for y in series.y} == {0.0, -1.0}
+
+
+def test_without_answers_there_is_no_figure(record, evidence):
+    lost = [r.but(status=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)]
+    made = evidence(lost)
+    assert fastest_figure(found(made), made.solvers) is None
+    assert compose(made).sections[0].pictures == ()
