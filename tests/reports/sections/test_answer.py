@@ -494,8 +494,6 @@ def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
     own = {r.run_id for r in made.records if r.solver == "slow"}
     slow = [series for series in panel.marks if series.solver == "slow"]
     shown = {run_id for series in slow for ids in series.runs for run_id in ids}
-        r for m in panel.marks if m.solver == "slow" for one in m.runs for r in one
-    }
     assert shown == own
 
 
