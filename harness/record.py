@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
 from operator import attrgetter
@@ -30,14 +30,6 @@ _TOO_LARGE = "expected an integer of at most 64 bits"
 #: fields that many lines share
 _TEXTS = ("case", "family", "form", "solver", "claimed", "mode", "qp", "environment")
 _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
-_NOT_NEGATIVE = (
-    "repeat", "block", "prepare_seconds", "solve_seconds", "total_seconds", "peak_mib",
-    "prepare_peak_mib", "solve_peak_mib", "inner", "build_seconds", "dualise_seconds",
-    "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
-    "dual", "complementarity", "gap", "energy_bound", "optimum_error",
-)  # fmt: skip
-_texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
-_not_negative = attrgetter(*_NOT_NEGATIVE)
 
 
 class Verdict(StrEnum):
@@ -56,8 +48,32 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Record:
+class Measurement:
+    """What preparing and solving cost; None where nothing was measured.
+
+    Every field is one of the journal, too: what is added here, and filled in by
+    `harness.verify.measure`, is carried from the worker to the record as it is. It is
+    no negative number.
+    """
+
+    prepare_seconds: float | None = None
+    solve_seconds: float | None = None
+    total_seconds: float | None = None  #: prepare + solve
+    peak_mib: float | None = None  #: resident memory of the worker, peak
+    prepare_peak_mib: float | None = None
+    solve_peak_mib: float | None = None
+    inner: int = 1  #: prepared and solved so often; the seconds are the mean
+
+
+MEASURED = tuple(f.name for f in fields(Measurement))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Record(Measurement):
     """One solver on one case at one tolerance, once: plain scalars, one JSON line.
+
+    It is a measurement together with what was asked for, what the solver said of its
+    answer, and what we find of it.
 
     None stands for what was not or cannot be measured (NaN has no place in JSON).
     """
@@ -82,13 +98,6 @@ class Record:
     reported: Mapping[str, Any] = field(
         default_factory=dict
     )  #: its linear solver, its own times in seconds
-    prepare_seconds: float | None = None
-    solve_seconds: float | None = None
-    total_seconds: float | None = None  #: prepare + solve
-    peak_mib: float | None = None  #: resident memory of the worker, peak
-    prepare_peak_mib: float | None = None
-    solve_peak_mib: float | None = None
-    inner: int = 1  #: prepared and solved so often; the seconds are the mean
     build_seconds: float | None = None  #: of the case, in the process that built it
     dualise_seconds: float | None = (
         None  #: part of build: factor, dual; dual forms only
@@ -128,7 +137,7 @@ class Record:
 
     def to_dict(self) -> dict[str, Any]:
         """Give every field by its name; what is nested is not copied."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        return {f.name: getattr(self, f.name) for f in FIELDS}
 
     def to_json(self) -> str:
         """Serialise to one line of strict JSON.
@@ -173,6 +182,23 @@ class Record:
             raise ValueError(f"nested deeper than {MOST_LEVELS} levels") from None
 
 
+def _in_order() -> tuple[Field[Any], ...]:
+    own = [f for f in fields(Record) if f.name not in MEASURED]
+    at = [f.name for f in own].index("build_seconds")
+    return (*own[:at], *fields(Measurement), *own[at:])
+
+
+#: in the order of a journal line: what was measured comes before what else took time
+FIELDS = _in_order()
+_NOT_NEGATIVE = (
+    "repeat", "block", *MEASURED, "build_seconds", "dualise_seconds",
+    "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
+    "dual", "complementarity", "gap", "energy_bound", "optimum_error",
+)  # fmt: skip
+_texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
+_not_negative = attrgetter(*_NOT_NEGATIVE)
+
+
 def _parsed(line: str | bytes) -> Any:
     """Parse JSON without the constants that only Python knows."""
 
@@ -197,7 +223,7 @@ def _explained(e: Exception, row: object) -> str:
     if place is None:
         return f"incomplete journal line: {e}"
     name = place[1]
-    annotation = next(str(f.type) for f in fields(Record) if f.name == name)
+    annotation = next(str(f.type) for f in FIELDS if f.name == name)
     if annotation == "Verdict" and isinstance(row[name], str):
         annotation = f"one of {', '.join(Verdict)}"
     return f"{name} = {shown(row[name])}; expected {annotation}"

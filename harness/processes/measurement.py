@@ -8,7 +8,7 @@ import shutil
 import stat
 from collections.abc import Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from io import BytesIO
@@ -29,9 +29,9 @@ from harness.processes.case_folder import content_digest
 from harness.processes.protocol import MOST_ECHOED
 from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from harness.qp import QP
-from harness.record import Record, Verdict
+from harness.record import MEASURED, Measurement, Record, Verdict
 from harness.solution import Solution, Status, checked_history
-from harness.verify.measure import Measurement, one_line
+from harness.verify.measure import one_line
 from harness.verify.optimum import Proves, proves
 from harness.verify.verdicts import certified, has_point, judged, noted, quantities_of
 
@@ -48,16 +48,6 @@ _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 _POINT = ("x", "y", "z", "z_box")
 _HISTORY = "history_"
 _KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "FIFO", stat.S_IFLNK: "symbolic link"}
-
-_MEASURED = (
-    "prepare_seconds",
-    "solve_seconds",
-    "total_seconds",
-    "prepare_peak_mib",
-    "solve_peak_mib",
-    "inner",
-    "first_seconds",
-)
 
 
 def measured(
@@ -115,10 +105,12 @@ def measured(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    measurement, *notes = _believed(reply, solution)
+    cost, *notes = _believed(reply)
     if not notes:
-        notes = _cached(measurement, worker.first_seconds, (record.qp, record.tol))
-    record = noted(judged(record, qp, measurement, prove), reply.message, *notes)
+        first = reply.answer["first_seconds"]
+        notes = _cached(cost, first, worker.first_seconds, (record.qp, record.tol))
+    record = judged(record.but(**asdict(cost)), qp, solution, prove)
+    record = noted(record, reply.message, *notes)
     return _within(memory_limit, record).but(
         canary_seconds=reply.answer["canary_seconds"]
     ), solution
@@ -217,7 +209,7 @@ def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _believed(reply: Reply, solution: Solution) -> tuple[Measurement, *tuple[str, ...]]:
+def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     """Take the worker's times where they agree with our clock; else ours, and say so.
 
     It may have used no more time than passed between request and end, and no less than
@@ -225,36 +217,42 @@ def _believed(reply: Reply, solution: Solution) -> tuple[Measurement, *tuple[str
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
-    told = {name: answer[name] for name in _MEASURED}
-    if clock is None or told["total_seconds"] is None:
-        return (Measurement(solution=solution, **told),)
-    inner = told["inner"]
-    times = inner + (told["first_seconds"] is not None)
-    reported = (told["first_seconds"] or 0.0) + inner * told["total_seconds"]
-    phases = told["prepare_seconds"] + told["solve_seconds"]
+    told = Measurement(**{name: answer[name] for name in MEASURED})
+    if clock is None or told.total_seconds is None:
+        return (told,)
+    assert told.prepare_seconds is not None
+    assert told.solve_seconds is not None
+    inner, first = told.inner, answer["first_seconds"]
+    times = inner + (first is not None)
+    reported = (first or 0.0) + inner * told.total_seconds
+    phases = told.prepare_seconds + told.solve_seconds
     least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
-    adds_up = abs(phases - told["total_seconds"]) <= 1e-6 * phases + 1e-9
-    possible = adds_up and min(told["prepare_seconds"], told["solve_seconds"]) >= 0
+    adds_up = abs(phases - told.total_seconds) <= 1e-6 * phases + 1e-9
+    possible = adds_up and min(told.prepare_seconds, told.solve_seconds) >= 0
     if possible and least <= reported <= clock.most:
-        return (Measurement(solution=solution, **told),)
-    ours = dict.fromkeys(("prepare_seconds", "solve_seconds", "first_seconds"))
-    told |= {**ours, "total_seconds": clock.seen / times}
-    return Measurement(solution=solution, **told), (
+        return (told,)
+    seen = clock.seen / times
+    ours = replace(told, prepare_seconds=None, solve_seconds=None, total_seconds=seen)
+    return ours, (
         f"the worker told of {reported:.3g} s of work; by our clock it was busy for "
         f"{clock.least:.3g} s, and done after {clock.seen:.3g} s: the time is ours"
     )
 
 
 def _cached(
-    m: Measurement, first_seconds: dict[Hashable, float], what: Hashable
+    m: Measurement,
+    first: float | None,
+    first_seconds: dict[Hashable, float],
+    what: Hashable,
 ) -> list[str]:
     """Say so where a repeat took far less than the first time.
 
+    first : what the first time took, where there were others
     first_seconds : of each QP and tolerance, in the first measurement; `what` is added
     """
     if m.total_seconds is None:
         return []
-    first = m.first_seconds or m.total_seconds
+    first = first or m.total_seconds
     before = first_seconds.setdefault(what, first)
     compared = [
         (first, m.total_seconds, LEAST_GAIN_SECONDS, "solves"),

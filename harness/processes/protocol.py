@@ -20,11 +20,11 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import Field, dataclass, fields
 from math import isfinite
 from typing import Any, TextIO
 
-from harness.record import finite
+from harness.record import Measurement, finite
 from harness.solution import Status
 
 LONGEST_REPLY = 2**22  #: bytes
@@ -32,6 +32,7 @@ MOST_ECHOED = 200  #: characters of what came, in a message
 LONGEST_TEXT = 2000  #: characters that a solver's message may have
 MOST_NAMED = 1000  #: values that a solver may name
 LARGEST_COUNT = 2**53
+MOST_TIMES = 1000  #: that something is done within one measurement
 
 
 @dataclass(frozen=True)
@@ -177,21 +178,25 @@ def _is_bounds(value: Any) -> bool:
     ) and all(name.startswith(("energy", "certif")) for name in value)
 
 
+def _cost(field: Field[Any]) -> Accepts:
+    """Tell what is accepted as what a measurement cost, by the field's name and type.
+
+    A count is of something that happened at least once.
+    """
+    if str(field.type) == "int":
+        return lambda value: _is_count(value) and 1 <= value <= MOST_TIMES
+    return _is_time if field.name.endswith("_seconds") else _is_size
+
+
 _MEASURED: Mapping[str, Accepts] = {
     "claimed": lambda value: isinstance(value, str) and value in set(Status),
     "message": _is_text,
     "iterations": _maybe(_is_count),
     "counts": _named(_is_count),
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
-    "prepare_seconds": _is_time,
-    "solve_seconds": _is_time,
-    "total_seconds": _is_time,
     "first_seconds": _is_time,
-    "peak_mib": _is_size,
-    "prepare_peak_mib": _is_size,
-    "solve_peak_mib": _is_size,
-    "inner": lambda value: _is_count(value) and 1 <= value <= 1000,
     "canary_seconds": _is_size,
+    **{f.name: _cost(f) for f in fields(Measurement)},
 }
 _CHECKED: Mapping[str, Accepts] = {
     "grade": _is_text, "message": _is_any_text, "work": _maybe(_is_number),

@@ -23,6 +23,7 @@ import random
 import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -41,7 +42,7 @@ from harness.qp import QP, Vector, no_rows
 from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.solution import Solution
-from harness.verify.measure import Measurement, Prepare, measure, memory_mib
+from harness.verify.measure import Prepare, Timed, measure, memory_mib
 
 _MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
@@ -104,7 +105,7 @@ class _Bench:
         qp, _ = load_qp(path, operators=self._operators if vouched else None)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        m = _measured_here(
+        timed = _measured_here(
             self._solver,
             qp,
             request["tol"],
@@ -114,7 +115,7 @@ class _Bench:
             ends=events.timed,
         )
         _limit_memory(None)
-        s = m.solution
+        s = timed.solution
         _write_new(out, s)
         return {
             "claimed": s.status,
@@ -122,15 +123,9 @@ class _Bench:
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
-            "prepare_seconds": m.prepare_seconds,
-            "solve_seconds": m.solve_seconds,
-            "total_seconds": m.total_seconds,
-            "first_seconds": m.first_seconds,
-            "peak_mib": m.peak_mib,
-            "prepare_peak_mib": m.prepare_peak_mib,
-            "solve_peak_mib": m.solve_peak_mib,
-            "inner": m.inner,
+            "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
+            **asdict(timed.cost),
         }
 
     def _shift_heap(self) -> None:
@@ -220,7 +215,7 @@ def _limit_memory(mib: float | None) -> None:
 def _measured_here(
     solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
     **how: Any,
-) -> Measurement:  # fmt: skip
+) -> Timed:  # fmt: skip
     """Measure; a child that the solver forked and let return to us ends here."""
     process = os.getpid()
 

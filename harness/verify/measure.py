@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import issparse
@@ -18,6 +18,7 @@ from scipy.sparse import issparse
 from harness.plugin import Solver
 from harness.qp import QP, Matrix, Vector
 from harness.recipe import Recipe
+from harness.record import Measurement
 from harness.solution import Solution, Status, usable_history
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
@@ -28,24 +29,12 @@ LONGEST_MESSAGE = 1900  #: characters
 _VECTORS = ("x", "y", "z", "z_box")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Measurement:
-    """What a solver returned and what that cost; None where nothing was measured."""
+class Timed(NamedTuple):
+    """What a solver returned, and what that cost."""
 
     solution: Solution  #: float vectors of the right shapes, whatever happened
-    prepare_seconds: float | None = None
-    solve_seconds: float | None = None
-    total_seconds: float | None = None  #: prepare + solve
-    prepare_peak_mib: float | None = None  #: largest resident memory while it ran
-    solve_peak_mib: float | None = None
-    inner: int = 1  #: times that it was prepared and solved; seconds are the mean
+    cost: Measurement
     first_seconds: float | None = None  #: of the first time, where there were others
-
-    @property
-    def peak_mib(self) -> float | None:
-        """Largest resident memory while prepare and solve ran."""
-        peaks = (self.prepare_peak_mib, self.solve_peak_mib)
-        return max((p for p in peaks if p is not None), default=None)
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
@@ -60,7 +49,7 @@ def measure(
     sample_seconds: float = 0.0,
     starts: Callable[[], None] = lambda: None,
     ends: Callable[[], None] = lambda: None,
-) -> Measurement:
+) -> Timed:
     """Let `solver` prepare and solve `qp`, both timed; asking it first is preparing.
 
     Nothing that the solver does wrong raises: an exception, a missing library or a
@@ -95,16 +84,16 @@ def measure(
             return _without_point(qp, Status.FAILED, f"{type(e).__name__}: {_said(e)}")
         finally:
             ends()
-    return Measurement(
-        solution=_checked(answer, qp),
+    cost = Measurement(
         prepare_seconds=seconds[0],
         solve_seconds=seconds[1],
         total_seconds=sum(seconds),
+        peak_mib=max((p for p in peaks if p is not None), default=None),
         prepare_peak_mib=peaks[0],
         solve_peak_mib=peaks[1],
         inner=inner,
-        first_seconds=first if inner > 1 else None,
     )
+    return Timed(_checked(answer, qp), cost, first if inner > 1 else None)
 
 
 @dataclass(frozen=True)
@@ -192,8 +181,9 @@ def _reset_peak() -> bool:
     return True
 
 
-def _without_point(qp: QP, status: Status, message: str) -> Measurement:
-    return Measurement(solution=Solution.without_point(qp, status, one_line(message)))
+def _without_point(qp: QP, status: Status, message: str) -> Timed:
+    solution = Solution.without_point(qp, status, one_line(message))
+    return Timed(solution, Measurement())
 
 
 def one_line(message: object) -> str:

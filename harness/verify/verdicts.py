@@ -19,7 +19,6 @@ from harness.registry import SolverSpec
 from harness.solution import Solution, Status
 from harness.verify.certificate import UncertifiableError, certify
 from harness.verify.kkt import kkt_residuals, verdict
-from harness.verify.measure import Measurement
 from harness.verify.optimum import Proves, decided
 
 #: first part of what a run_id digests; it names a measurement, whatever is stored of it
@@ -70,14 +69,11 @@ def new_record(
     )
 
 
-def judged(
-    record: Record, qp: QP, measurement: Measurement, prove: Proves | None = None
-) -> Record:
-    """Fill in what `measurement` is worth on `qp`, by our own evaluation.
+def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> Record:
+    """Fill in what a solver's answer `s` is worth on `qp`, by our own evaluation.
 
     prove : finds the optimum of `qp` where residuals cannot decide
     """
-    s = measurement.solution
     record = record.but(
         sizes=qp.sizes,
         claimed=s.status.value,
@@ -85,13 +81,6 @@ def judged(
         iterations=s.iterations,
         counts=s.counts,
         reported=s.reported,
-        prepare_seconds=measurement.prepare_seconds,
-        solve_seconds=measurement.solve_seconds,
-        total_seconds=measurement.total_seconds,
-        peak_mib=measurement.peak_mib,
-        prepare_peak_mib=measurement.prepare_peak_mib,
-        solve_peak_mib=measurement.solve_peak_mib,
-        inner=measurement.inner,
     )
     if s.status is Status.DECLINED:
         return record.but(status=Verdict.DECLINED)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pyarrow.parquet as pq
 
 from harness import Record
 from harness.files.durable import replacing
-from harness.record import finite
+from harness.record import FIELDS, finite
 
 _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 
@@ -29,7 +28,7 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     """
     table = pa.table({
         f.name: _column([getattr(r, f.name) for r in records], str(f.type))
-        for f in fields(Record)
+        for f in FIELDS
     })  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:

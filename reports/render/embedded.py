@@ -6,12 +6,11 @@ import gzip
 import json
 from base64 import b64encode
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from functools import partial
 from typing import Any
 
 from harness import Record
-from harness.record import finite
+from harness.record import FIELDS, finite
 from reports.document.figure import Figure
 from reports.document.formatting import VERDICTS, clean, tolerance
 from reports.document.layout import Cell, Page, Table, named, short
@@ -42,7 +41,7 @@ def details(records: Sequence[Record]) -> str:
     A column is a list of values, or, where few differ, these and their positions.
     """
     lines = [_as_journalled(r) for r in records]
-    columns = {f.name: [getattr(r, f.name) for r in lines] for f in fields(Record)}
+    columns = {f.name: [getattr(r, f.name) for r in lines] for f in FIELDS}
     text = strict({name: _column(values) for name, values in columns.items()})
     return b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 

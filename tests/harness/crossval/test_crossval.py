@@ -19,7 +19,6 @@ from harness.names import parse
 from harness.record import Verdict
 from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
-from harness.verify.measure import Measurement
 from harness.verify.references import reference_point
 from harness.verify.verdicts import judged, new_record
 from mortarbench.cli.main import main
@@ -59,7 +58,7 @@ def write(folder, answers, tol=1e-8):
                 continue
             case = cases.setdefault(text, built(text))
             record = record.but(qp=qp_digest(case.qp, recipe=True))
-            record = judged(record, case.qp, Measurement(solution=answer))
+            record = judged(record, case.qp, answer)
             if np.isfinite(answer.x).all():
                 record = record.but(vectors=save_solution(folder, answer))
             journal.append(record)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from harness import Solution, Status, Verdict
+from harness import Verdict
 from harness.errors import FaultError
 from harness.files.qpfile import save_qp
 from harness.names import assemble
@@ -266,9 +266,8 @@ def test_a_time_is_believed_within_what_the_parent_knows(
         prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
         first_seconds=first, inner=inner,
     )  # fmt: skip
-    qp = TINY.build("plain", TINY.defaults, None).qp
     reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
-    m, *notes = _believed(reply, Solution.without_point(qp, Status.FAILED))
+    m, *notes = _believed(reply)
 
     assert bool(notes) is not is_believed
     if is_believed:
@@ -280,11 +279,7 @@ def test_a_time_is_believed_within_what_the_parent_knows(
 
 def test_a_total_that_is_not_the_sum_of_its_phases_is_ours():
     seconds = dict(prepare_seconds=0.01, solve_seconds=0.01, total_seconds=0.15)
-    qp = TINY.build("plain", TINY.defaults, None).qp
-    m, note = _believed(
-        Reply(answer=ANSWER | seconds, clock=CLOCK),
-        Solution.without_point(qp, Status.FAILED),
-    )
+    m, note = _believed(Reply(answer=ANSWER | seconds, clock=CLOCK))
 
     assert OURS in note
     assert m.total_seconds == CLOCK.seen

@@ -2,6 +2,7 @@ import json
 import os
 import resource
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -165,6 +166,15 @@ def test_a_measurement_has_the_name_that_older_folders_give_it():
     )  # fmt: skip
 
     assert made.run_id == "37b0acf5a279"
+
+
+def test_old_lines_are_written_as_they_were_read():
+    """To the byte: the names of the fields, their order, and their values."""
+    (old,) = (Path(__file__).parents[2] / "data/results-2026-11/journal").iterdir()
+    lines = old.read_text().splitlines()
+
+    assert len(lines) >= 20
+    assert [Record.from_json(line).to_json() for line in lines] == lines
 
 
 def test_a_folder_without_journal_is_named(tmp_path):

@@ -49,7 +49,7 @@ def test_whatever_a_solver_does_is_a_status_and_one_line(qp, solver, status, mes
 
 
 def test_both_phases_are_timed_and_add_up(qp):
-    m = measure(PLUGIN.solvers["honest"], qp, 1e-6)
+    m = measure(PLUGIN.solvers["honest"], qp, 1e-6).cost
 
     assert m.prepare_seconds > 0
     assert m.solve_seconds > 0
@@ -75,7 +75,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
     clock = sys.modules["harness.verify.measure"]
     monkeypatch.setattr(clock, "perf_counter", lambda: now[0])
-    m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds)
+    m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds).cost
 
     assert (m.prepare_seconds, m.solve_seconds) == pytest.approx((0.001, 0.004))
     assert m.total_seconds == pytest.approx(0.005)
@@ -92,7 +92,7 @@ def test_each_phase_has_a_peak_of_its_own(qp):
             np.ones(2**24)  # 128 MiB
             return super().prepare(qp, tol)
 
-    m = measure(Hungry(), qp, 1e-6)
+    m = measure(Hungry(), qp, 1e-6).cost
 
     assert m.prepare_peak_mib > m.solve_peak_mib + 100
     assert m.peak_mib == m.prepare_peak_mib
@@ -105,9 +105,9 @@ def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
             return super().act(qp)
 
     modest = PLUGIN.solvers["honest"]
-    before = measure(modest, qp, 1e-6).peak_mib
-    hungry = measure(Hungry(), qp, 1e-6).peak_mib
-    after = measure(modest, qp, 1e-6).peak_mib
+    before = measure(modest, qp, 1e-6).cost.peak_mib
+    hungry = measure(Hungry(), qp, 1e-6).cost.peak_mib
+    after = measure(modest, qp, 1e-6).cost.peak_mib
 
     assert before + 100 < hungry < before + 300
     assert after < before + 50
@@ -159,7 +159,7 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
             asked.append(next(clock))
 
     monkeypatch.setattr(harness.verify.measure, "perf_counter", lambda: next(clock))
-    m = measure(Asks(), qp, 1e-6)
+    m = measure(Asks(), qp, 1e-6).cost
 
     assert asked == [1]  # the clock had been read once
     assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked

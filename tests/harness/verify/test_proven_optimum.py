@@ -10,7 +10,6 @@ from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdi
 from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
 from harness.verify.kkt import Residuals, rejudged, widths
-from harness.verify.measure import Measurement
 from harness.verify.optimum import decided, exact_value, proven_optimum, proves
 from harness.verify.verdicts import judged
 from solvers.reference.solve import reference_solution
@@ -143,9 +142,7 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
 def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
     assert kkt_residuals(WEAK, SHORT).worst <= 10 * TOL
 
-    measured = judged(
-        new_record(), WEAK, Measurement(solution=SHORT), proves(reference_solution)
-    )
+    measured = judged(new_record(), WEAK, SHORT, proves(reference_solution))
 
     assert measured.status is Verdict.WRONG
     assert measured.decided_by == "reference"
@@ -168,9 +165,7 @@ def test_an_answer_is_judged_at_the_accuracy_that_is_not_its_tolerance(
 ):
     """min ½x² − x at x = 1.001: a residual of 1e-3."""
     s = at([1.001])
-    measured = judged(
-        new_record(accuracy=accuracy), qp_of([1], [-1]), Measurement(solution=s)
-    )
+    measured = judged(new_record(accuracy=accuracy), qp_of([1], [-1]), s)
 
     assert (measured.status is Verdict.VERIFIED) is expected
     assert measured.decided_by == "residuals"
@@ -183,9 +178,7 @@ def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
     broken = replace(s, **{name: np.full_like(getattr(s, name), np.nan)})
     assert judge(qp, s) is Verdict.VERIFIED
 
-    measured = judged(
-        new_record(), qp, Measurement(solution=broken), proves(reference_solution)
-    )
+    measured = judged(new_record(), qp, broken, proves(reference_solution))
 
     assert measured.status is Verdict.WRONG
 

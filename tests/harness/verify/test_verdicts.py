@@ -12,7 +12,6 @@ from harness import QP, Case, Solution, Status, Verdict
 from harness.names import CaseId
 from harness.registry import SolverSpec
 from harness.verify.certificate import UncertifiableError
-from harness.verify.measure import Measurement
 from harness.verify.verdicts import certified, judged, new_record, quantities_of
 
 #: min ½(x₁² + x₂²) − x₁ − x₂, x₁ + x₂ = 1, x₁ ≤ ¼, x ≥ 0: (¼, ¾), y = ¼, z = ½
@@ -70,14 +69,14 @@ def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
 
 def test_what_was_declined_is_declined_and_has_no_residuals():
     answer = Solution.without_point(QP_, Status.DECLINED, "bounds only")
-    got = judged(record(), QP_, Measurement(solution=answer))
+    got = judged(record(), QP_, answer)
 
     assert (got.status, got.claimed) == (Verdict.DECLINED, "declined")
     assert (got.message, got.objective) == ("bounds only", None)
 
 
 def test_a_solution_is_verified_and_has_its_objective():
-    got = judged(record(), QP_, Measurement(solution=POINT))
+    got = judged(record(), QP_, POINT)
 
     assert got.status is Verdict.VERIFIED
     assert got.objective == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
@@ -89,7 +88,7 @@ def test_a_solution_is_verified_and_has_its_objective():
 )
 def test_the_accuracy_of_a_suite_goes_before_the_tolerance(tol, accuracy, is_right):
     near = replace(POINT, x=POINT.x + np.array([-1e-3, 1e-3]))
-    got = judged(record(tol, accuracy=accuracy), QP_, Measurement(solution=near))
+    got = judged(record(tol, accuracy=accuracy), QP_, near)
 
     assert (got.status is Verdict.VERIFIED) == is_right
 
