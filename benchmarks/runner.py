@@ -86,7 +86,7 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
         suite, out=out, environment={}, digest="here",
         commands=Commands(
             solvers={s.label: [*start, s.name] for s in specs},
-            generator=[*start, "generator"],
+            case_worker=[*start, "generator"],
         ),
         resolve=lambda spec: resolve(spec, plugin.solvers), progress=watch,
     )  # fmt: skip

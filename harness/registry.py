@@ -23,7 +23,7 @@ from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver, as_family
 
 if TYPE_CHECKING:
-    from harness.recipe import Maker
+    from harness.operators import Maker
 
 T = TypeVar("T")
 
@@ -49,7 +49,7 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
+    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.operators`
     origin: str = ""  #: its file, or "entry points"
 
 

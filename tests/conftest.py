@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from harness import QP, Solution
-from harness.conformance.manufactured import planted as drawn
+from harness.conformance.manufactured import manufactured as drawn
 from harness.limits import ONE_THREAD
 
 
@@ -33,6 +33,6 @@ def state(tmp_path_factory):
 
 
 @pytest.fixture
-def planted() -> Callable[..., tuple[QP, Solution]]:
-    """Factory: ``planted(shape, seed=…, dense=False, n=20)``; see `manufactured`."""
+def manufactured() -> Callable[..., tuple[QP, Solution]]:
+    """Factory: ``manufactured(shape, seed=…, dense=False, n=20)``, as in `harness`."""
     return drawn

@@ -28,9 +28,9 @@ from harness.conformance.manufactured import (
     FORMS,
     SHAPES,
     infeasible,
+    manufactured,
     membrane,
     one_of_each,
-    planted,
     unbounded,
 )
 from harness.plugin import Solver
@@ -107,7 +107,7 @@ def _judge(qp: QP, s: Solution, allowed: float) -> None:
 
 
 def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
-    qp, expected = planted(shape, dense=dense)
+    qp, expected = manufactured(shape, dense=dense)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
     objective = qp.objective(expected.x)
     _near("objective", qp.objective(s.x), objective, 1e-6 * abs(objective))
@@ -116,7 +116,7 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 
 
 def _reaches_the_tolerance(shape: str, tol: float, solver: Solver) -> None:
-    _solved(solver, planted(shape, seed=161803)[0], tol, VERIFIED_FACTOR)
+    _solved(solver, manufactured(shape, seed=161803)[0], tol, VERIFIED_FACTOR)
 
 
 def _multipliers_have_our_signs(solver: Solver) -> None:
@@ -127,7 +127,7 @@ def _multipliers_have_our_signs(solver: Solver) -> None:
 
 
 def _absent_bounds_have_no_multipliers(solver: Solver) -> None:
-    qp, _ = planted("some bounds")
+    qp, _ = manufactured("some bounds")
     z_box = _solve(solver, qp, 1e-3).z_box
     worst = max(
         (-z_box[np.isinf(qp.lb)]).max(initial=0), z_box[np.isinf(qp.ub)].max(initial=0)
@@ -137,7 +137,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> None:
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
-    qp, _ = planted("bounds", n=60)
+    qp, _ = manufactured("bounds", n=60)
     first, *others = (_solve(solver, qp, 1e-6) for _ in range(3))
     if first.status is not Status.SOLVED:
         raise BrokenError(f"ended as {first.status}: {first.message}")
@@ -148,7 +148,7 @@ def _repeats_are_cold_and_alike(solver: Solver) -> None:
 
 
 def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
-    qp, _ = planted("everything", dense=dense)
+    qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
     for buffer, copy in zip(_buffers(qp), before, strict=True):
@@ -175,7 +175,7 @@ def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> None:
 
 
 def _an_operator_is_taken_or_declined(solver: Solver) -> None:
-    qp, _ = planted("bounds")
+    qp, _ = manufactured("bounds")
     _solved(solver, replace(qp, P=aslinearoperator(qp.P)), 1e-6, VERIFIED_FACTOR)
 
 
@@ -189,7 +189,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
     The process may use all CPUs meanwhile, or two threads would take turns on one.
     """
-    qp, _ = planted("everything", n=300, dense=True)
+    qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
@@ -226,14 +226,14 @@ def _a_sequence_is_solved(solver: Solver) -> None:
 
 
 def _sequence() -> list[QP]:
-    qp, point = planted("everything")
+    qp, point = manufactured("everything")
     shift = 0.1 * np.cos(np.arange(qp.q.size))  # of the solution, the active set kept
     moved = replace(
         qp, q=qp.q - qp.P @ shift, b=qp.b + qp.A @ shift, h=qp.h + qp.G @ shift,
         lb=qp.lb + shift, ub=qp.ub + shift,
     )  # fmt: skip
     softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))
-    return [qp, moved, softer, planted("bounds", n=12)[0]]
+    return [qp, moved, softer, manufactured("bounds", n=12)[0]]
 
 
 def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:

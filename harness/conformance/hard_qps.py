@@ -16,7 +16,7 @@ from harness.solution import Solution, Status
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Planted:
+class HardQP:
     """A QP, a KKT point of it, and its optimal value."""
 
     qp: QP
@@ -184,7 +184,7 @@ KINDS: Mapping[str, Kind] = {
 }
 
 
-def hard(kinds: frozenset[str], seed: int) -> Planted:
+def hard(kinds: frozenset[str], seed: int) -> HardQP:
     """Plant a QP of all the given kinds (keys of `KINDS`), of 2 to 9 variables."""
     rng = np.random.default_rng([seed, *(k in kinds for k in KINDS)])
     d = _plain(rng)
@@ -195,7 +195,7 @@ def hard(kinds: frozenset[str], seed: int) -> Planted:
     )
     s = Solution(status=Status.SOLVED, x=d.x, y=d.y, z=d.z, z_box=d.z_box)
     x = d.x.astype(np.longdouble)
-    return Planted(qp=qp, solution=s, value=float(x @ (qp.P @ x) / 2 + qp.q @ x))
+    return HardQP(qp=qp, solution=s, value=float(x @ (qp.P @ x) / 2 + qp.q @ x))
 
 
 def _plain(rng: np.random.Generator) -> _Draft:

@@ -27,7 +27,7 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def planted(
+def manufactured(
     shape: str, *, seed: int = 271828, dense: bool = False, n: int = 20
 ) -> tuple[QP, Solution]:
     """Draw x*, multipliers and an active set; solve stationarity for q.

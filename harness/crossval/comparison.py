@@ -20,7 +20,13 @@ from statistics import median
 from typing import NamedTuple
 
 from harness.crossval.assessment import Assessment, Deviation, distances, energy_allowed
-from harness.crossval.ground_truth import Given, Truth, nan_last, residuals_of, truth_of
+from harness.crossval.ground_truth import (
+    Given,
+    GroundTruth,
+    ground_truth_of,
+    nan_last,
+    residuals_of,
+)
 from harness.errors import some
 from harness.plugin import Reference
 from harness.record import Verdict
@@ -102,7 +108,7 @@ def compared(
     references : folder that keeps reference points
     """
     prove = proves(solve)
-    truth = truth_of(given, solve, references)
+    truth = ground_truth_of(given, solve, references)
     if isinstance(truth, str):
         alone = tuple(_answer(g, None, None, prove) for g in given)
         return Problem(
@@ -221,7 +227,9 @@ def _outliers(answers: Sequence[Answer]) -> list[Answer]:
 
 
 def _pairs(
-    answers: Sequence[Answer], places: Sequence[tuple[int, Deviation]], truth: Truth
+    answers: Sequence[Answer],
+    places: Sequence[tuple[int, Deviation]],
+    truth: GroundTruth,
 ) -> list[Pair]:
     """Set each answer against each other one at its tolerance."""
     if not places:

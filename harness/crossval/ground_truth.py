@@ -42,7 +42,7 @@ class Given:
     twin: str = ""  #: another case to which it gave the very same point
 
 
-class Truth(NamedTuple):
+class GroundTruth(NamedTuple):
     """What answers are set against, and the norm of distances."""
 
     name: str
@@ -54,9 +54,9 @@ class Truth(NamedTuple):
     note: str = ""
 
 
-def truth_of(
+def ground_truth_of(
     given: Sequence[Given], solve: Reference, references: Path | None
-) -> Truth | str:
+) -> GroundTruth | str:
     """Find the reference, or else the best answer; or say why there is neither."""
     mechanics = given[0].case.mechanics
     if mechanics is None:
@@ -79,7 +79,7 @@ def truth_of(
     closed = int((point.multipliers * exact.loose > gap).sum())
     kernel = mechanics.inverse.kernel
     P = mechanics.primal.P
-    return Truth(name, point.bound, closed, assessed, P, kernel, why)
+    return GroundTruth(name, point.bound, closed, assessed, P, kernel, why)
 
 
 def _elastic_truth(
@@ -117,7 +117,7 @@ def _best_certified(
     return point, _who(g)
 
 
-def _plain_truth(given: Sequence[Given], solve: Reference) -> Truth | str:
+def _plain_truth(given: Sequence[Given], solve: Reference) -> GroundTruth | str:
     """Do so for a QP alone: what its residuals prove is a bound as for claims."""
     qp, why = given[0].case.qp, ""
     try:
@@ -134,7 +134,9 @@ def _plain_truth(given: Sequence[Given], solve: Reference) -> Truth | str:
     def assessed(g: Given) -> tuple[Assessment, Deviation]:
         return assess_point(qp, s, g.solution)
 
-    return Truth(name, float(np.sqrt(2 * worst)), None, assessed, qp.P, nothing, why)
+    return GroundTruth(
+        name, float(np.sqrt(2 * worst)), None, assessed, qp.P, nothing, why
+    )
 
 
 @np.errstate(all="ignore")  # a point may hold 1e300

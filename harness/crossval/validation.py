@@ -22,7 +22,7 @@ from harness.plugin import Case, Family, Reference
 from harness.qp import Vector
 from harness.record import Record, Verdict
 from harness.results.journal import read_journal
-from harness.results.rebuild import rebuilt
+from harness.results.rebuild import rebuild
 from harness.solution import Status
 from harness.verify.verdicts import has_point
 
@@ -188,7 +188,7 @@ def _built(
     lost: list[Listed] = []
     for first in {r.case: r for r in records if r.vectors}.values():
         try:
-            cases[first.case] = rebuilt(
+            cases[first.case] = rebuild(
                 first, folder.path, folder.families, folder.reference
             )
         except InputError as e:

@@ -28,8 +28,8 @@ from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, json_object
 from harness.files.npz import write_mappable
 from harness.files.store import digest_of, mapped_arrays
+from harness.operators import Maker, SerialisableOperator
 from harness.qp import QP, Matrix, Structure, Vector
-from harness.recipe import Maker, Recipe
 
 SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
 _STRIP = 256  #: rows of a dense matrix that are compared at once
@@ -38,7 +38,7 @@ _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
 _STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
-_INGREDIENT = "P_from_"  #: of a P that is a recipe
+_INGREDIENT = "P_from_"  #: of a P that is a serialised operator
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
@@ -49,15 +49,16 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
 
 
 def save_qp(
-    path: Path, qp: QP, meta: Mapping[str, Any], *, recipe: bool = False
+    path: Path, qp: QP, meta: Mapping[str, Any], *, serialised: bool = False
 ) -> str:
     """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
 
-    Returns 16 hex digits that name its numbers: equal digests, equal QPs. A P that is
-    written as a recipe has another digest than the same one multiplied out.
+    Returns 16 hex digits that name its numbers: equal digests, equal QPs. An operator P
+    that is serialised has another digest than the same one multiplied out.
 
     meta : plain data; its keys ``dense`` and ``maker`` are filled in here
-    recipe : whether a P that is a `Recipe` is written as such, which only we can read
+    serialised : whether a P that is a `SerialisableOperator` is written as its arrays,
+        which only we can read
 
     Raises
     ------
@@ -65,7 +66,7 @@ def save_qp(
         When the file cannot be written.
 
     """
-    arrays, dense, maker = _parts(qp, recipe=recipe)
+    arrays, dense, maker = _parts(qp, serialised=serialised)
     digest = digest_of(arrays)
     arrays["meta"] = np.array(json.dumps({**meta, **maker, "dense": dense}))
     try:
@@ -75,18 +76,18 @@ def save_qp(
     return digest
 
 
-def qp_digest(qp: QP, *, recipe: bool = False) -> str:
+def qp_digest(qp: QP, *, serialised: bool = False) -> str:
     """Name the numbers of a QP by 16 hex digits, as `save_qp` does."""
-    return digest_of(_parts(qp, recipe=recipe)[0])
+    return digest_of(_parts(qp, serialised=serialised)[0])
 
 
 def _parts(
-    qp: QP, *, recipe: bool
+    qp: QP, *, serialised: bool
 ) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
     """Take a QP apart; also tell which matrices are dense, and who makes P."""
     P = qp.P
-    if not (recipe and isinstance(P, Recipe)):
-        return *_arrays(qp, structure=recipe), {}
+    if not (serialised and isinstance(P, SerialisableOperator)):
+        return *_arrays(qp, structure=serialised), {}
     arrays, dense = _arrays(replace(qp, P=csc_array(P.shape)), structure=True)
     arrays |= {_INGREDIENT + name: array for name, array in P.arrays.items()}
     return arrays, dense, {"maker": P.maker}
@@ -111,10 +112,10 @@ def load_qp(
 ) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data.
 
-    operators : makers of operators (`harness.recipe`), for a file that a generator of
-        this very run wrote: it may hold an operator, and is as large as it is. Without
-        them the file may be anybody's: an operator is refused, and so is what exceeds
-        the limit of `harness.files.datafile`, or has no symmetric P
+    operators : makers of operators (`harness.operators`), for a file that the case
+        worker of this very run wrote: it may hold an operator, and is as large as it
+        is. Without them the file may be anybody's: an operator is refused, and so is
+        what exceeds the limit of `harness.files.datafile`, or has no symmetric P
 
     Raises
     ------
@@ -137,7 +138,9 @@ def load_qp(
             matrices[name] = _dense(matrices[name])
         if operators is not None and "maker" in meta:
             n, maker = vectors["q"].size, str(meta["maker"])
-            matrices["P"] = Recipe(n, maker, _ingredients(arrays), operators)
+            matrices["P"] = SerialisableOperator(
+                n, maker, _ingredients(arrays), operators
+            )
         qp = QP(**vectors, **matrices, structure=structure)
         if not own:
             check_symmetric(qp.P)

@@ -35,7 +35,7 @@ class Entry:
 
     qp: Path  #: see `harness.files.qpfile`
     digest: str  #: of the content of that file
-    meta: Mapping[str, Any]  #: of the case, as the generator told it
+    meta: Mapping[str, Any]  #: of the case, as the case worker told it
 
 
 def entry(

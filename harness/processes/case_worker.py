@@ -37,10 +37,10 @@ from harness.files.store import (
     write_point,
 )
 from harness.names import CaseId, unbuilt
+from harness.operators import NO_MAKERS, Maker
 from harness.plugin import Case, Family, Reference
 from harness.processes.protocol import Events, answer_requests
 from harness.qp import QP
-from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.solution import Solution, Status
 from harness.verify.verdicts import certified, note_of, plain, quantities_of
@@ -149,7 +149,7 @@ class CaseWorker:
             "scale": case.scale,
             "constant": case.constant,
         }
-        digest = save_qp(path, case.qp, plain(meta), recipe=True)
+        digest = save_qp(path, case.qp, plain(meta), serialised=True)
         seconds = {
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
@@ -157,11 +157,11 @@ class CaseWorker:
         return {"meta": {**meta, **seconds, "qp": digest}}
 
 
-def serve(generator: CaseWorker, request_fd: int, reply_fd: int) -> None:
+def serve(worker: CaseWorker, request_fd: int, reply_fd: int) -> None:
     """Answer requests until there are no more."""
 
     def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:
         events.start()
-        return generator.answer(request)
+        return worker.answer(request)
 
     answer_requests(handle, lambda: None, request_fd, reply_fd)

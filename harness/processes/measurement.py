@@ -299,7 +299,7 @@ def measured_once(
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
         qp_file = scratch / "qp.npz"
-        digest = save_qp(qp_file, case.qp, {"name": record.case}, recipe=True)
+        digest = save_qp(qp_file, case.qp, {"name": record.case}, serialised=True)
         record = record.but(qp=digest)
         request = {
             "qp": str(qp_file),

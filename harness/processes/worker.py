@@ -35,11 +35,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from harness.conformance.conformance import run_check
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays
+from harness.operators import NO_MAKERS, Maker
 from harness.plugin import Solver
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
 from harness.qp import QP, Vector, no_rows
-from harness.recipe import NO_MAKERS, Maker
 from harness.record import finite
 from harness.solution import Solution
 from harness.verify.measure import Prepare, Timed, measure, memory_mib
@@ -55,7 +55,7 @@ def serve(
 ) -> None:
     """Answer requests until there are no more.
 
-    operators : what puts an operator P of a request together, see `harness.recipe`
+    operators : what puts an operator P of a request together, see `harness.operators`
     """
     bench = _Bench(solver, operators)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)

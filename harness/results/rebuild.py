@@ -14,7 +14,7 @@ from harness.results.folder import environment_of
 from harness.results.stored_run import plugins_needed
 
 
-def rebuilt(
+def rebuild(
     r: Record, folder: Path, families: Mapping[str, Family], reference: Reference
 ) -> Case:
     """Build the case of a record.
@@ -36,7 +36,7 @@ def rebuilt(
         case = name.build(reference)
     except (Exception, SystemExit) as e:  # the family's code
         raise InputError(unbuilt(r.case, e)) from None
-    if r.qp is not None and (now := qp_digest(case.qp, recipe=True)) != r.qp:
+    if r.qp is not None and (now := qp_digest(case.qp, serialised=True)) != r.qp:
         raise InputError(
             f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
             "the same version of the code, of its libraries and of plug-ins"

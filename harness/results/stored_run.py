@@ -33,7 +33,7 @@ class StoredRun:
     memory_limit: float  #: MiB
 
 
-def open_capsule(
+def open_stored_run(
     folder: Path,
     run_id: str,
     families: Mapping[str, Family],
@@ -75,34 +75,34 @@ def open_capsule(
     )
 
 
-def block_of(
-    capsule: StoredRun,
+def work_unit_of(
+    stored: StoredRun,
     solvers: Mapping[str, Solver],
     environment: str,
 ) -> WorkUnit:
-    """Make the block that measures a capsule again; its last result is that.
+    """Make the block that measures a stored run again; its last result is that.
 
     environment : digest
     """
-    record = capsule.record
+    record = stored.record
     turn = tuple(
         new_record(
             name,
-            capsule.spec,
-            options=options_of(resolve(capsule.spec, solvers)),
+            stored.spec,
+            options=options_of(resolve(stored.spec, solvers)),
             tol=record.tol,
             repeat=record.repeat,
             environment=environment,
             mode=record.mode,
             accuracy=record.accuracy,
         )
-        for name in capsule.cases
+        for name in stored.cases
     )
     return WorkUnit(
         number=0,
         turns=(turn,),
-        time_limit=capsule.time_limit,
-        memory_limit=capsule.memory_limit,
+        time_limit=stored.time_limit,
+        memory_limit=stored.memory_limit,
     )
 
 

@@ -22,7 +22,7 @@ class Commands:
     """How the processes of a run are started, less the two pipes of each."""
 
     solvers: Mapping[str, list[str]]  #: by label; they serve `harness.processes.worker`
-    generator: list[str]  #: serves `harness.processes.case_worker`
+    case_worker: list[str]  #: serves `harness.processes.case_worker`
 
 
 @dataclass(frozen=True, kw_only=True)

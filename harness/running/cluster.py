@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from harness.errors import InputError, some
-from harness.recipe import Maker
+from harness.operators import Maker
 from harness.results.folder import differences
 from harness.results.work_unit import (
     Commands,
@@ -83,14 +83,14 @@ def on_cluster(
 
     @contextmanager
     def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
-        from harness.running.dask_worker import Node
+        from harness.running.dask_worker import ExecutorPlugin
 
         with ExitStack() as stack:
             client = _connected(address, stack)
             name = f"mortarbench-{client.id}"
             _forget_lost_runs(client)
             files = [file.resolve() for file in plugins]
-            node = Node(commands, files, operators, _sharing(client))
+            node = ExecutorPlugin(commands, files, operators, _sharing(client))
             client.register_plugin(node, name=name)
             stack.callback(_end, client, name)
             nodes = Nodes(environment, keep, warn)

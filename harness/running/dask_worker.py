@@ -25,7 +25,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from harness.environment.environment import capture_in, digest
 from harness.errors import InputError
 from harness.limits import ONE_THREAD
-from harness.recipe import Maker
+from harness.operators import Maker
 from harness.registry import load_plugin, merged
 from harness.results.work_unit import Commands, Outcome, WorkUnit
 from harness.running.executor import Executor
@@ -43,7 +43,7 @@ class Delivery:
     environment: dict[str, Any]
 
 
-class Node(WorkerPlugin):
+class ExecutorPlugin(WorkerPlugin):
     """Opens an executor in every Dask worker, those that join later included.
 
     commands : of the parent; its Python is replaced by that of the node
@@ -192,7 +192,7 @@ class Node(WorkerPlugin):
 
         return Commands(
             solvers={label: here(c) for label, c in commands.solvers.items()},
-            generator=here(commands.generator),
+            case_worker=here(commands.case_worker),
         )
 
 
@@ -214,13 +214,13 @@ def execute(name: str, key: str, block: WorkUnit) -> Delivery:
             f"{worker.state.nthreads} blocks at a time, so that they would disturb "
             "each other; start it with --nthreads 1"
         )
-    node = cast(Node, worker.plugins[name])
+    node = cast(ExecutorPlugin, worker.plugins[name])
     return node.execute(key, block, lambda: worker.log_event(name, key))
 
 
 def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
     """Fetch what that block has come to since the last time; runs in Dask's loop."""
-    node = cast(Node | None, dask_worker.plugins.get(name))
+    node = cast(ExecutorPlugin | None, dask_worker.plugins.get(name))
     return None if node is None else node.collect(key)
 
 

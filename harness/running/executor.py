@@ -14,11 +14,11 @@ from harness.errors import FaultError
 from harness.files.durable import full_disk_told, refuse_full_disk
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays, read_arrays, read_point
+from harness.operators import NO_MAKERS, Maker
 from harness.processes.case_folder import Entry, entry
 from harness.processes.measurement import measured
 from harness.processes.supervisor import WorkerProcess
 from harness.qp import QP
-from harness.recipe import NO_MAKERS, Maker
 from harness.record import Record, Verdict
 from harness.results.work_unit import (
     Commands,
@@ -42,7 +42,7 @@ class Executor:
     scratch : for files that last as long as the executor, of this executor alone
     cases : folder of built cases, see `harness.processes.case_folder`; executors
         may share it
-    operators : what puts an operator P together, see `harness.recipe`
+    operators : what puts an operator P together, see `harness.operators`
     """
 
     def __init__(
@@ -56,7 +56,9 @@ class Executor:
         self._scratch = scratch
         self._cases = cases
         self._operators = operators
-        self._generator = WorkerProcess(commands.generator, scratch / "generator.log")
+        self._case_worker = WorkerProcess(
+            commands.case_worker, scratch / "case-worker.log"
+        )
         self._workers: dict[str, WorkerProcess] = {}
         self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
         self._loaded: dict[str, QP] = {}  # theirs, by digest
@@ -71,7 +73,7 @@ class Executor:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for process in (*self._workers.values(), self._generator):
+        for process in (*self._workers.values(), self._case_worker):
             process.close()
 
     def execute(self, block: WorkUnit) -> Iterator[Outcome]:
@@ -160,7 +162,7 @@ class Executor:
     def _described(
         self, block: WorkUnit, record: Record, solution: Solution | None
     ) -> Result:
-        """Add what the point means, which the generator knows."""
+        """Add what the point means, which the case worker knows."""
         if solution is None or not has_point(solution):
             return Result(record=record)
         first = record.status is Verdict.VERIFIED and record.repeat == 0
@@ -173,7 +175,7 @@ class Executor:
         }
         notes: list[str]
         try:
-            answer = self._ask_generator(request, block)
+            answer = self._ask_case_worker(request, block)
             notes = answer["notes"]
             record = record.but(
                 quantities=answer["quantities"],
@@ -190,17 +192,17 @@ class Executor:
     def _entry(self, record: Record, block: WorkUnit) -> Entry:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
-            meta: Mapping[str, Any] = self._ask_generator(request, block)["meta"]
+            meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
             return meta
 
         r = record
         return entry(self._cases, [r.family, r.params, r.form, r.environment], make)
 
-    def _ask_generator(
+    def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
         for _ in range(2):  # it may have died of something else
-            reply = self._generator.ask(
+            reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
             )
             if reply.answer is not None:
@@ -226,7 +228,7 @@ class Executor:
         return self._optima[at.digest]
 
     def _reference(self, at: Entry, qp: QP) -> Solution:
-        """Have the generator solve the QP of an entry by the reference.
+        """Have the case worker solve the QP of an entry by the reference.
 
         Raises
         ------
@@ -238,7 +240,7 @@ class Executor:
         """
         point = self._scratch / "reference.npz"
         request = {"solve": str(at.qp), "point": str(point)}
-        reply = self._generator.ask(request, time_limit=inf, memory_limit=inf)
+        reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
         if reply.answer is None:
             raise FaultError(f"the reference solve failed: {reply.message}")
         if not reply.answer["found"]:

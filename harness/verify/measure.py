@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import issparse
 
+from harness.operators import SerialisableOperator
 from harness.plugin import Solver
 from harness.qp import QP, Matrix, Vector
-from harness.recipe import Recipe
 from harness.record import Measurement
 from harness.solution import Solution, Status, usable_history
 
@@ -106,7 +106,7 @@ class _Asked:
     def __call__(self, qp: QP) -> Callable[[], Solution]:
         if (reason := self.solver.declines(qp)) is not None:
             raise _DeclinedError(reason)
-        if isinstance(qp.P, Recipe):
+        if isinstance(qp.P, SerialisableOperator):
             qp.P.build()
         return self.prepare(qp)
 
@@ -129,7 +129,7 @@ def _timed(
     answer = solve()
     end = perf_counter()
     solve_peak = memory_mib("VmHWM") if reset else None
-    if isinstance(qp.P, Recipe):
+    if isinstance(qp.P, SerialisableOperator):
         qp.P.forget()
     return answer, (ready - start, end - again), (prepare_peak, solve_peak)
 

@@ -66,7 +66,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
     if argv[:1] in (["worker"], ["generator"]):  # how runs start their processes
         from mortarbench.cli import processes
 
-        start = processes.worker if argv[0] == "worker" else processes.generator
+        start = processes.worker if argv[0] == "worker" else processes.case_worker
         return start(registries, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:

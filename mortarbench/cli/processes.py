@@ -1,4 +1,4 @@
-"""The processes that runs start: a worker per solver, and a generator."""
+"""The processes that runs start: a worker per solver, and one that builds cases."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     return 0
 
 
-def generator(registries: Registries, arguments: Sequence[str]) -> int:
-    """Be the generator that `Registries.commands` starts."""
+def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
+    """Be the case worker that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
     files = [Path(file) for file in json.loads(text)["plugins"]]
     registries = registries.with_files(files)

@@ -28,7 +28,7 @@ from scipy.sparse import coo_array
 
 from harness import InputError
 from harness.errors import shortened, unknown
-from problems.files.two_sided import TwoSided
+from problems.files.two_sided import TwoSidedQP
 
 _NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",
@@ -53,7 +53,7 @@ class _Model:
     objective: str = ""  #: the first N row
 
 
-def parse_qps(text: str) -> tuple[TwoSided, float]:
+def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
     """Read a QPS text; also return the sign, −1 where it maximises.
 
     A maximised objective comes back negated, constant included.
@@ -196,7 +196,7 @@ _SECTIONS: dict[str, Callable[[_Model, list[str]], None]] = {
 }  # fmt: skip
 
 
-def _two_sided(model: _Model) -> TwoSided:
+def _two_sided(model: _Model) -> TwoSidedQP:
     names, n = list(model.columns), len(model.columns)
     rows = {
         row: i for i, row in enumerate(k for k, v in model.rows.items() if v != "N")
@@ -213,7 +213,7 @@ def _two_sided(model: _Model) -> TwoSided:
     free = [model.upper.get(name, math.inf) < 0 for name in names]
     lower = [model.lower.get(name, -math.inf if f else 0.0)
              for name, f in zip(names, free, strict=True)]  # fmt: skip
-    return TwoSided(
+    return TwoSidedQP(
         P=model.sign * _sparse(P, (n, n)), q=model.sign * q,
         r=-model.sign * model.rhs.get(objective, 0.0),
         A=_sparse(A, (len(rows), n)), l=sides[:, 0], u=sides[:, 1],

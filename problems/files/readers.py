@@ -18,7 +18,7 @@ from harness.files.matfile import matrix, read_mat, to_qp, vector
 from harness.files.parquetfile import load_parquet
 from harness.files.qpfile import load_qp
 from problems.files.qps import parse_qps
-from problems.files.two_sided import TwoSided, one_sided
+from problems.files.two_sided import TwoSidedQP, one_sided
 
 #: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
 Loaded = tuple[QP, float, float]
@@ -81,7 +81,7 @@ _READERS: dict[str, Callable[[Path], Loaded]] = {
 }  # fmt: skip
 
 
-def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSided:
+def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     """Take  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  out of the variables of a .mat file.
 
     P and q may be called Q and c, r be missing. As distributed, the last n rows of A
@@ -109,7 +109,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSided:
             raise InputError(f"{name} is not {size}, as the other variables have it")
     bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
     rows = m - n if bounded else m
-    return TwoSided(
+    return TwoSidedQP(
         P=P, q=q, r=r, A=A[:rows], l=l[:rows], u=u[:rows],
         lb=l[rows:] if bounded else np.full(n, -np.inf),
         ub=u[rows:] if bounded else np.full(n, np.inf),

@@ -14,7 +14,7 @@ from harness.files.qpfile import check_symmetric
 INFINITE = 1e20  #: bounds of at least this size mean that there is none
 
 
-class TwoSided(NamedTuple):
+class TwoSidedQP(NamedTuple):
     """Minimise ½xᵀPx + qᵀx + r subject to l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
 
     P: Any  #: (n, n) sparse, whole
@@ -27,7 +27,7 @@ class TwoSided(NamedTuple):
     ub: Vector  #: (n,) as u
 
 
-def one_sided(given: TwoSided) -> QP:
+def one_sided(given: TwoSidedQP) -> QP:
     """Split the rows: those with l = u are equalities, others up to two inequalities.
 
     First all upper sides  Ax ≤ u, then all lower ones  −Ax ≤ −l; free rows vanish.

@@ -19,7 +19,7 @@ from solvers.smalbe.mprgp import Face, FaceRun, Point, Rules, Watch
 from solvers.smalbe.options import Options
 from solvers.smalbe.outer_loop import (
     Constants,
-    Inner,
+    InnerSolver,
     Iterate,
     Until,
     first_iterate,
@@ -63,7 +63,7 @@ class _Task:
     eliminated: Eliminated | None
     problem: Projected
     options: Options
-    means: Inner
+    means: InnerSolver
     history: History | None
     start: Iterate
 
@@ -136,13 +136,13 @@ def _penalty(options: Options, tol: float) -> float:
 
 def _means(
     problem: Projected, qp: QP, options: Options, history: History | None
-) -> Inner:
+) -> InnerSolver:
     """Choose what the inner problems are solved with."""
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced
     )
     plain = partial(problem.plain_model, alpha=options.alpha)
-    return Inner(
+    return InnerSolver(
         rules=rules,
         model=problem.model if options.expansion == "model" else plain,
         precondition=face_preconditioner(problem, qp, options.preconditioner),

@@ -67,7 +67,7 @@ class Until(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Inner:
+class InnerSolver:
     """How the inner problems are solved, for each ρ."""
 
     rules: Rules
@@ -78,7 +78,7 @@ class Inner:
     run: Callable[[float, Until], FaceRun] | None = None  #: compiled CG steps
 
 
-class Outer(NamedTuple):
+class OuterIteration(NamedTuple):
     """One outer iteration, as it ended."""
 
     trace: str  #: the steps of its inner run
@@ -96,7 +96,7 @@ class Iterate(NamedTuple):
     mu: Vector  #: (r,) multipliers of Cν = 0, relative to ‖𝒫F𝒫‖
     M: float
     rho: float
-    outer: tuple[Outer, ...] = ()
+    outer: tuple[OuterIteration, ...] = ()
     status: Status = Status.ITERATION_LIMIT
 
     @property
@@ -121,7 +121,11 @@ def first_iterate(
 
 
 def smalbe(
-    problem: Projected, constants: Constants, inner: Inner, tol: float, at: Iterate
+    problem: Projected,
+    constants: Constants,
+    inner: InnerSolver,
+    tol: float,
+    at: Iterate,
 ) -> Iterate:
     """Run the outer loop on from `at`."""
     C, b = problem.rows.C, problem.b
@@ -178,7 +182,7 @@ def _updated(
     Cnu = C @ run.x
     lagrangian = float(0.5 * run.x @ (run.g - problem.b + C.T @ at.mu))
     enough = lagrangian >= before + rho / 2 * (Cnu @ Cnu)
-    done = Outer(run.trace, at.M, rho, _norm(Cnu), lagrangian)
+    done = OuterIteration(run.trace, at.M, rho, _norm(Cnu), lagrangian)
     new = at._replace(
         nu=run.x,
         g=run.g + rho * (C.T @ Cnu),

@@ -19,8 +19,8 @@ PRESETS = [
 
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("shape", ["box", "some bounds"])
-def test_a_history_tells_what_happened(planted, name, shape):
-    qp, _ = planted(shape, seed=271828)
+def test_a_history_tells_what_happened(manufactured, name, shape):
+    qp, _ = manufactured(shape, seed=271828)
     solver = replace(SOLVERS[name], history=True)
     s = solver.prepare(qp, 1e-8)()
     h = s.history
@@ -41,8 +41,8 @@ def test_a_history_tells_what_happened(planted, name, shape):
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_history_changes_nothing_and_is_off_by_default(planted, name):
-    qp, _ = planted("some bounds", seed=314159)
+def test_a_history_changes_nothing_and_is_off_by_default(manufactured, name):
+    qp, _ = manufactured("some bounds", seed=314159)
     plain = SOLVERS[name].prepare(qp, 1e-8)()
     kept = replace(SOLVERS[name], history=True).prepare(qp, 1e-8)()
 

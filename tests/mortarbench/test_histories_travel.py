@@ -76,8 +76,8 @@ def strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_a_kept_history_tells_what_the_solver_did(planted):
-    qp, solution = planted("box")
+def test_a_kept_history_tells_what_the_solver_did(manufactured):
+    qp, solution = manufactured("box")
     s = measure(PLUGIN.solvers["descent"].__class__(history=True), qp, 1e-8).solution
 
     assert s.status is Status.SOLVED
@@ -105,8 +105,8 @@ def test_a_kept_history_tells_what_the_solver_did(planted):
         ("angry", "no history for you"),
     ],
 )
-def test_a_malformed_history_is_dropped_and_the_answer_kept(planted, solver, word):
-    qp, _ = planted("box")
+def test_a_malformed_history_is_dropped_and_the_answer_kept(manufactured, solver, word):
+    qp, _ = manufactured("box")
     kept = measure(PLUGIN.solvers["descent"], qp, 1e-8).solution
     s = measure(PLUGIN.solvers[solver], qp, 1e-8).solution
 
@@ -118,8 +118,8 @@ def test_a_malformed_history_is_dropped_and_the_answer_kept(planted, solver, wor
     assert kept.message == ""
 
 
-def test_columns_become_whole_numbers_floats_and_texts(planted):
-    h = measure(PLUGIN.solvers["notes"], planted("box")[0], 1e-8).solution.history
+def test_columns_become_whole_numbers_floats_and_texts(manufactured):
+    h = measure(PLUGIN.solvers["notes"], manufactured("box")[0], 1e-8).solution.history
 
     assert h["step"].tolist() == ["a", "bc"]
     assert (h["big"].dtype, h["big"].tolist()) == (np.int64, [1, 2])

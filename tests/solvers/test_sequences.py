@@ -61,10 +61,10 @@ def test_half_the_products_again_and_the_support_block_factorised_once(load_step
 
 
 @pytest.mark.parametrize("name", WARM)
-def test_steps_that_share_nothing_are_solved_as_well(load_steps, planted, name):
+def test_steps_that_share_nothing_are_solved_as_well(load_steps, manufactured, name):
     """Other sizes, other scales, other signs, an infeasible one in between."""
     qp, other = load_steps["dual"][9], load_steps["dual"][0]
-    box, _ = planted("box", seed=271828)
+    box, _ = manufactured("box", seed=271828)
     impossible = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))
     sequence = [qp, box, qp, replace(qp, P=1e6 * qp.P, q=1e6 * qp.q), other, impossible]
     sequence += [replace(qp, P=1e-6 * qp.P), replace(qp, q=-qp.q), qp]
@@ -128,10 +128,12 @@ def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
 
 @pytest.mark.parametrize("name", WARM)
 @pytest.mark.parametrize("jump", [1e2, 1e4])
-def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(planted, name, jump):
+def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(
+    manufactured, name, jump
+):
     """P = I, then a far larger one that agrees with it on the first component."""
     rng = np.random.default_rng(271828)
-    qp, _ = planted("bounds", seed=271828, dense=True)
+    qp, _ = manufactured("bounds", seed=271828, dense=True)
     W = rng.standard_normal((20, 20))
     W[:, 0] = 0
     first = replace(qp, P=np.eye(20), q=-np.eye(20)[0], lb=np.zeros(20))

@@ -73,8 +73,8 @@ def membrane():
 
 
 @pytest.mark.parametrize("name", sorted(CONCRETE.keys() - EXACT))
-def test_more_digits_take_more_iterations(planted, name):
-    qp, _ = planted("bounds", seed=57721, n=60)
+def test_more_digits_take_more_iterations(manufactured, name):
+    qp, _ = manufactured("bounds", seed=57721, n=60)
     few, many = (solve(name, qp, tol) for tol in (1e-2, 1e-10))
     if few.iterations is None:
         assert kkt_residuals(qp, many).worst < kkt_residuals(qp, few).worst
@@ -85,8 +85,8 @@ def test_more_digits_take_more_iterations(planted, name):
 @pytest.mark.parametrize("length", [1.0, 1e-3])
 @pytest.mark.parametrize("energy", [1.0, 1e-6, 1e6])
 @every_native_solver
-def test_accuracy_does_not_depend_on_the_units(planted, name, energy, length):
-    qp, _ = planted("everything")
+def test_accuracy_does_not_depend_on_the_units(manufactured, name, energy, length):
+    qp, _ = manufactured("everything")
     scaled = replace(
         qp, P=qp.P * (energy / length**2), q=qp.q * (energy / length),
         b=qp.b * length, h=qp.h * length, lb=qp.lb * length, ub=qp.ub * length,
@@ -111,8 +111,8 @@ def test_a_membrane_in_contact_is_solved_to_the_tolerance(membrane, name, tol):
 @pytest.mark.parametrize(
     "name", [n for n in NATIVE if "max_iter" in options_of(SOLVERS[n])]
 )
-def test_an_iteration_limit_is_reported_as_one(planted, name):
-    qp, _ = planted("everything")
+def test_an_iteration_limit_is_reported_as_one(manufactured, name):
+    qp, _ = manufactured("everything")
     solution = replace(CONCRETE[name], max_iter=1).prepare(qp, 1e-9)()
     assert solution.status is Status.ITERATION_LIMIT
     assert solution.iterations <= 2  # ProxQP counts inner ones too
@@ -128,8 +128,8 @@ def test_a_certificate_is_not_passed_off_as_a_point(name, problem):
 
 
 @pytest.mark.parametrize(("name", "library"), LIBRARIES.items())
-def test_a_missing_library_is_an_import_error(planted, monkeypatch, name, library):
-    qp, _ = planted("box")
+def test_a_missing_library_is_an_import_error(manufactured, monkeypatch, name, library):
+    qp, _ = manufactured("box")
     monkeypatch.setitem(sys.modules, library, None)
     assert CONCRETE[name].declines(qp) is None
     with pytest.raises(ImportError, match=library):
@@ -142,15 +142,15 @@ def test_the_registry_imports_no_solver_library():
     assert set(LIBRARIES.values()).isdisjoint(run.stdout.decode().split())
 
 
-def test_proxqp_backends_agree(planted):
-    qp, expected = planted("everything")
+def test_proxqp_backends_agree(manufactured):
+    qp, expected = manufactured("everything")
     for backend in ("dense", "sparse"):
         solution = replace(SOLVERS["proxqp"], backend=backend).prepare(qp, 1e-9)()
         np.testing.assert_allclose(solution.x, expected.x, atol=1e-6)
 
 
 @pytest.mark.parametrize("wildcard", WILDCARDS)
-def test_the_backends_that_decline_are_those_not_installed(planted, wildcard):
+def test_the_backends_that_decline_are_those_not_installed(manufactured, wildcard):
     import cvxpy
     import qpsolvers
 
@@ -158,7 +158,7 @@ def test_the_backends_that_decline_are_those_not_installed(planted, wildcard):
         "qpsolvers:*": qpsolvers.available_solvers,
         "cvxpy:*": cvxpy.installed_solvers(),
     }[wildcard]
-    qp, _ = planted("box")
+    qp, _ = manufactured("box")
     reasons = {
         backend: replace(SOLVERS[wildcard], backend=backend).declines(qp)
         for backend in SOLVERS[wildcard].backends()
@@ -171,8 +171,8 @@ def test_the_backends_that_decline_are_those_not_installed(planted, wildcard):
 
 
 @pytest.mark.parametrize("wildcard", WILDCARDS)
-def test_an_unknown_backend_is_declined_with_those_there_are(planted, wildcard):
-    qp, _ = planted("box")
+def test_an_unknown_backend_is_declined_with_those_there_are(manufactured, wildcard):
+    qp, _ = manufactured("box")
     solver = replace(SOLVERS[wildcard], backend="foo")
     assert "foo" not in solver.backends()
     reason = solver.declines(qp)
@@ -180,13 +180,13 @@ def test_an_unknown_backend_is_declined_with_those_there_are(planted, wildcard):
     assert "osqp" in reason.lower()
 
 
-def test_an_error_of_cvxpy_is_a_failure_in_its_words(planted, monkeypatch):
+def test_an_error_of_cvxpy_is_a_failure_in_its_words(manufactured, monkeypatch):
     import cvxpy
 
     def fail(*args):
         raise cvxpy.SolverError("gave up")
 
-    qp, _ = planted("box")
+    qp, _ = manufactured("box")
     call = CONCRETE["cvxpy:OSQP"].prepare(qp, 1e-6)
     monkeypatch.setattr(cvxpy.Problem, "unpack_results", fail)
 
@@ -198,7 +198,9 @@ def test_an_error_of_cvxpy_is_a_failure_in_its_words(planted, monkeypatch):
 
 
 @pytest.mark.parametrize("backend", ["osqp", "scs", "clarabel", "proxqp"])
-def test_qpsolvers_claims_no_success_it_was_not_given(planted, monkeypatch, backend):
+def test_qpsolvers_claims_no_success_it_was_not_given(
+    manufactured, monkeypatch, backend
+):
     import qpsolvers
 
     honest = qpsolvers.solve_problem
@@ -208,7 +210,7 @@ def test_qpsolvers_claims_no_success_it_was_not_given(planted, monkeypatch, back
         found.found = False
         return found
 
-    qp, _ = planted("box")
+    qp, _ = manufactured("box")
     monkeypatch.setattr(qpsolvers, "solve_problem", unsure)
     solution = replace(SOLVERS["qpsolvers:*"], backend=backend).prepare(qp, 1e-6)()
     assert solution.status is Status.FAILED
@@ -228,9 +230,9 @@ def test_a_converted_matrix_shares_nothing_with_the_problem():
     assert not np.shares_memory(csc(M).data, M.data)
 
 
-def test_a_vector_update_costs_a_sequence_fewer_iterations(planted):
+def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
     # the second QP differs from the first in vectors only, and by little
-    qp, _ = planted("everything", n=40)
+    qp, _ = manufactured("everything", n=40)
     moved = replace(qp, q=qp.q * (1 + 1e-4))
     for name in ("osqp", "scs", "qpalm", "daqp"):
         prepare = SOLVERS[name].chain(1e-6)
@@ -239,8 +241,8 @@ def test_a_vector_update_costs_a_sequence_fewer_iterations(planted):
 
 
 @pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse"])
-def test_a_rebuilt_session_starts_where_the_last_one_ended(planted, name):
-    qp, _ = planted("everything", n=40)
+def test_a_rebuilt_session_starts_where_the_last_one_ended(manufactured, name):
+    qp, _ = manufactured("everything", n=40)
     other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
     prepare = SOLVERS[name].chain(1e-6)
     first, again = prepare(qp)(), prepare(other)()
@@ -248,14 +250,14 @@ def test_a_rebuilt_session_starts_where_the_last_one_ended(planted, name):
     assert kkt_residuals(other, again).worst <= 1e-5
 
 
-def test_sequences_do_not_know_each_other(planted):
-    qp, _ = planted("everything")
+def test_sequences_do_not_know_each_other(manufactured):
+    qp, _ = manufactured("everything")
     one, two = (SOLVERS["osqp"].chain(1e-6)(qp)().iterations for _ in range(2))
     assert one == two == SOLVERS["osqp"].prepare(qp, 1e-6)().iterations
 
 
-def test_matrices_that_differ_are_not_updated(planted):
-    qp, _ = planted("everything")
+def test_matrices_that_differ_are_not_updated(manufactured):
+    qp, _ = manufactured("everything")
     assert only_vectors_differ(qp, replace(qp, q=qp.q + 1, h=qp.h + 1, lb=qp.lb - 1))
     assert not only_vectors_differ(qp, replace(qp, P=qp.P * 2))
     assert not only_vectors_differ(qp, replace(qp, G=qp.G * 2))
@@ -264,8 +266,8 @@ def test_matrices_that_differ_are_not_updated(planted):
 
 
 @pytest.mark.parametrize("name", ["daqp", "quadprog", "piqp-dense", "proxqp-dense"])
-def test_a_dense_solver_declines_what_does_not_fit(planted, monkeypatch, name):
-    qp, _ = planted("bounds", n=400)  # 1.2 MiB a matrix
+def test_a_dense_solver_declines_what_does_not_fit(manufactured, monkeypatch, name):
+    qp, _ = manufactured("bounds", n=400)  # 1.2 MiB a matrix
     assert SOLVERS[name].declines(qp) is None
     monkeypatch.setenv("MORTARBENCH_MEMORY_MIB", "2")
     reason = SOLVERS[name].declines(qp)
@@ -273,15 +275,15 @@ def test_a_dense_solver_declines_what_does_not_fit(planted, monkeypatch, name):
     assert reason.endswith(" MiB for dense matrices of 400 rows; the limit is 2 MiB")
 
 
-def test_a_solver_tells_its_linear_solver(planted):
-    qp, _ = planted("box")
+def test_a_solver_tells_its_linear_solver(manufactured):
+    qp, _ = manufactured("box")
     for name in NATIVE:
         assert solve(name, qp, 1e-6).reported["linear_solver"]
 
 
-def test_highs_has_no_hidden_regularisation(planted):
+def test_highs_has_no_hidden_regularisation(manufactured):
     # 1e-7 on the Hessian's diagonal would show in the ninth digit and before
-    qp, _ = planted("singular")
+    qp, _ = manufactured("singular")
     small = replace(qp, P=qp.P * 1e-4, q=qp.q * 1e-4)
     for name in ("highs", "highs-hipo"):
         solution = solve(name, small)
@@ -299,8 +301,8 @@ def test_highs_drops_no_small_entries(name):
     assert kkt_residuals(small, solve(name, small)).worst <= 1e-8
 
 
-def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(planted):
-    qp, _ = planted("singular")
+def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(manufactured):
+    qp, _ = manufactured("singular")
     solution = SOLVERS["quadprog"].prepare(qp, 1e-6)()
     assert solution.status is Status.DECLINED
     assert solution.message == "P is not positive definite"

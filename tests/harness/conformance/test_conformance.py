@@ -22,7 +22,7 @@ from harness.conformance.equivalence import (
     changes_of,
     same_answer,
 )
-from harness.conformance.manufactured import FORMS, SHAPES, planted, strings
+from harness.conformance.manufactured import FORMS, SHAPES, manufactured, strings
 from harness.conformance.weaknesses import line_of
 from solvers import SOLVERS
 from tests.support import ROOT
@@ -73,7 +73,7 @@ def loaded_once():
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_planted_point_is_a_solution(shape, dense):
-    qp, expected = planted(shape, seed=314159, dense=dense)
+    qp, expected = manufactured(shape, seed=314159, dense=dense)
     assert kkt_residuals(qp, expected).worst < 1e-13
 
 

@@ -83,10 +83,10 @@ def lagrangian(qp, s):
 @every_shape
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 def test_the_way_back_leads_from_a_solution_to_the_solution(
-    planted, transform, shape, dense
+    manufactured, transform, shape, dense
 ):
     """Solved anew, the changed QP has the planted minimiser and objective."""
-    qp, expected = planted(shape, dense=dense)
+    qp, expected = manufactured(shape, dense=dense)
     new = TRANSFORMS[transform](qp)
     s = PIQP().prepare(new.qp, 1e-11)()
     back = new.recover(s)
@@ -107,9 +107,9 @@ def test_the_way_back_leads_from_a_solution_to_the_solution(
 @every_transform
 @every_shape
 def test_objective_and_lagrangian_keep_their_relation_at_every_point(
-    planted, transform, shape
+    manufactured, transform, shape
 ):
-    qp, _ = planted(shape, dense=True)
+    qp, _ = manufactured(shape, dense=True)
     new = TRANSFORMS[transform](qp)
     s = anywhere(new.qp)
     back = new.recover(s)
@@ -121,7 +121,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
-def test_what_is_violated_stays_violated(planted, transform, shape):
+def test_what_is_violated_stays_violated(manufactured, transform, shape):
     """Rows, bounds and signs of multipliers, at a point that is anything but good."""
 
     def violated(qp, s):
@@ -130,7 +130,7 @@ def test_what_is_violated_stays_violated(planted, transform, shape):
         absent = (z_lb & np.isinf(qp.lb)).sum() + (z_ub & np.isinf(qp.ub)).sum()
         return (qp.G @ s.x > qp.h).sum(), (s.z < 0).sum(), bounds, absent
 
-    qp, _ = planted(shape, dense=True)
+    qp, _ = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     s = anywhere(new.qp)
 
@@ -139,9 +139,11 @@ def test_what_is_violated_stays_violated(planted, transform, shape):
 
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
-def test_names_and_units_change_no_residual_at_any_point(planted, transform, shape):
+def test_names_and_units_change_no_residual_at_any_point(
+    manufactured, transform, shape
+):
     """What `harness.verify.kkt` promises, at good and bad points, and at none."""
-    qp, expected = planted(shape, dense=True)
+    qp, expected = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)
     near = replace(expected, x=expected.x + 1e-5 * drawn().standard_normal(qp.q.size))
@@ -188,10 +190,10 @@ def preimage(qp, new):
 
 @every_shape
 def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
-    planted, shape
+    manufactured, shape
 ):
     """With each multiplier halved nothing but z⁻ and zᵢ·slackᵢ can shrink, twofold."""
-    qp, _ = planted(shape, dense=True)
+    qp, _ = manufactured(shape, dense=True)
     new = duplicate_rows(qp, np.arange(qp.b.size), np.arange(qp.h.size))
     old = anywhere(qp)
     s = replace(old, y=np.tile(old.y / 2, 2), z=np.tile(old.z / 2, 2))
@@ -205,8 +207,8 @@ def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
 
 
 @pytest.mark.parametrize("transform", ["units", "rows scaled", "mirrored"])
-def test_powers_of_two_lose_no_bit(planted, transform):
-    qp, _ = planted("everything")
+def test_powers_of_two_lose_no_bit(manufactured, transform):
+    qp, _ = manufactured("everything")
     new = TRANSFORMS[transform](qp).qp
     for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
         old, got = (getattr(p, name) for p in (qp, new))
@@ -279,7 +281,7 @@ def same(a: QP, b: QP):
     )  # fmt: skip
 
 
-def test_an_operator_is_refused_where_its_unknowns_would_change(planted):
-    qp, _ = planted("bounds")
+def test_an_operator_is_refused_where_its_unknowns_would_change(manufactured):
+    qp, _ = manufactured("bounds")
     with pytest.raises(ValueError, match="expected a matrix"):
         mirror(replace(qp, P=aslinearoperator(qp.P)), [0])

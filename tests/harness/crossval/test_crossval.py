@@ -12,7 +12,7 @@ from harness import QP, Case, Mechanics, Solution, Status, no_rows
 from harness.crossval.assessment import assess, distances, energy_allowed
 from harness.crossval.comparison import brief, compared
 from harness.crossval.discretisation import read_discretisation
-from harness.crossval.ground_truth import Given, truth_of
+from harness.crossval.ground_truth import Given, ground_truth_of
 from harness.files.qpfile import qp_digest, save_qp
 from harness.files.store import save_solution, write_point
 from harness.names import parse
@@ -57,7 +57,7 @@ def write(folder, answers, tol=1e-8):
                 journal.append(record.but(status=answer, message="as it ended"))
                 continue
             case = cases.setdefault(text, built(text))
-            record = record.but(qp=qp_digest(case.qp, recipe=True))
+            record = record.but(qp=qp_digest(case.qp, serialised=True))
             record = judged(record, case.qp, answer)
             if np.isfinite(answer.x).all():
                 record = record.but(vectors=save_solution(folder, answer))
@@ -342,9 +342,9 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
         return replace(s, x=s.x + 1) if s.iterations else s
 
     def doubtful(*args):
-        return truth_of(*args)._replace(doubt=np.inf)
+        return ground_truth_of(*args)._replace(doubt=np.inf)
 
-    monkeypatch.setattr("harness.crossval.comparison.truth_of", doubtful)
+    monkeypatch.setattr("harness.crossval.comparison.ground_truth_of", doubtful)
     case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
     s = pushed((1.5, 0.0))
     answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
@@ -382,11 +382,11 @@ def test_distances_are_those_of_the_energy_norm():
     assert found[2, 0] == found[1, 2] == np.inf
 
 
-@pytest.mark.parametrize("recipe", [True, False])
-def test_a_qp_has_the_digest_that_a_run_writes_down(recipe, truths, tmp_path):
+@pytest.mark.parametrize("serialised", [True, False])
+def test_a_qp_has_the_digest_that_a_run_writes_down(serialised, truths, tmp_path):
     for case, _ in truths.values():
-        written = save_qp(tmp_path / "qp.npz", case.qp, {}, recipe=recipe)
-        assert qp_digest(case.qp, recipe=recipe) == written
+        written = save_qp(tmp_path / "qp.npz", case.qp, {}, serialised=serialised)
+        assert qp_digest(case.qp, serialised=serialised) == written
 
 
 def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():

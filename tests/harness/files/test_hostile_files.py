@@ -21,7 +21,7 @@ from harness import QP, InputError, no_rows
 from harness.files.datafile import VARIABLE
 from harness.files.parquetfile import save_parquet
 from harness.files.qpfile import load_qp, save_qp
-from harness.recipe import Recipe
+from harness.operators import SerialisableOperator
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from problems import PROBLEMS
@@ -72,12 +72,14 @@ def hostile(path, maker):
     """Write a QP whose P says to be an operator that `maker` puts together."""
     arrays = ["/bin/touch", str(path.parent / "SENTINEL")]
     operators = {maker: lambda arrays: lambda x: x}
-    P = Recipe(2, maker, {"args": np.array(arrays), "d": np.ones(2)}, operators)
+    P = SerialisableOperator(
+        2, maker, {"args": np.array(arrays), "d": np.ones(2)}, operators
+    )
     qp = QP(
         P=P, q=np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2), h=np.zeros(0),
         lb=np.zeros(2), ub=np.ones(2),
     )  # fmt: skip
-    save_qp(path, qp, {"name": "hostile"}, recipe=True)
+    save_qp(path, qp, {"name": "hostile"}, serialised=True)
 
 
 MAKERS = ("subprocess:call", "os:system", "builtins:print", "", "diagonal")

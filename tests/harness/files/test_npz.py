@@ -1,4 +1,4 @@
-"""Arrays that are mapped, operators that travel as recipes."""
+"""Arrays that are mapped, operators that travel as arrays."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from scipy.sparse import csr_array
 from harness import QP, Status, no_rows
 from harness.files.npz import ALIGNMENT, mapped, write_mappable
 from harness.files.qpfile import load_qp, save_qp
-from harness.recipe import Recipe
+from harness.operators import SerialisableOperator
 from harness.verify.measure import measure
 
 ARRAYS = {
@@ -71,17 +71,15 @@ MAKERS = {"diagonal": diagonal}
 def operator_qp():
     """A QP whose P is the operator diag(1, 2); BUILT counts how often it was made."""
     BUILT.clear()
-    P = Recipe(2, "diagonal", {"d": np.array([1.0, 2.0])}, MAKERS)
+    P = SerialisableOperator(2, "diagonal", {"d": np.array([1.0, 2.0])}, MAKERS)
     return QP(
         P=P, q=np.array([-1.0, -2.0]), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
         h=np.zeros(0), lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
     )  # fmt: skip
 
 
-def test_an_operator_travels_as_its_recipe_and_is_the_same_operator(
-    operator_qp, tmp_path
-):
-    save_qp(tmp_path / "qp.npz", operator_qp, {}, recipe=True)
+def test_an_operator_travels_as_arrays_and_is_the_same_operator(operator_qp, tmp_path):
+    save_qp(tmp_path / "qp.npz", operator_qp, {}, serialised=True)
     assert BUILT == []  # nothing is multiplied out to write it
     qp, _ = load_qp(tmp_path / "qp.npz", operators=MAKERS)
     assert BUILT == []  # nor to read it

@@ -322,7 +322,7 @@ def attack(out, *solvers):
     run(
         given, out=out, environment={"machine": "test"},
         commands=Commands(
-            solvers={s: [*START, s] for s in solvers}, generator=[*START, "generator"]
+            solvers={s: [*START, s] for s in solvers}, case_worker=[*START, "generator"]
         ),
         resolve=lambda spec: resolve(spec, ATTACKERS.solvers), digest="here",
         progress=Silent(),

@@ -247,7 +247,7 @@ def test_a_folder_without_a_journal_is_one_line(cli):
 
 
 @pytest.mark.parametrize("missing", ["suite.toml", "environment.json"])
-def test_a_capsule_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
+def test_a_stored_run_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
     (tmp_path / "done" / missing).unlink()
     code, _, err = cli("replay", "done", stored["exact", 1, 0].run_id)
 
@@ -278,8 +278,8 @@ def real(*arguments, folder):
     )
 
 
-def test_a_case_whose_file_has_changed_is_refused(planted, tmp_path):
-    qp, _ = planted("box")
+def test_a_case_whose_file_has_changed_is_refused(manufactured, tmp_path):
+    qp, _ = manufactured("box")
     save_qp(tmp_path / "a.npz", qp, {})
     (tmp_path / "a.toml").write_text(
         'name = "a"\nrepeats = 1\nsolvers = ["osqp"]\n'
@@ -299,8 +299,8 @@ def test_a_case_whose_file_has_changed_is_refused(planted, tmp_path):
 
 
 @pytest.mark.parametrize("shape", ["box", "everything"])
-def test_equal_qps_have_one_digest_and_others_another(planted, tmp_path, shape):
-    qp, _ = planted(shape)
+def test_equal_qps_have_one_digest_and_others_another(manufactured, tmp_path, shape):
+    qp, _ = manufactured(shape)
     file = tmp_path / "a.npz"
     digest = save_qp(file, qp, {"name": "whatever"})
     loaded, _ = load_qp(file)

@@ -50,7 +50,7 @@ try:
             suite, out=Path(sys.argv[2]),
             commands=Commands(
                 solvers={{s.label: [*start, s.name] for s in suite.solvers}},
-                generator=[*start, "generator"],
+                case_worker=[*start, "generator"],
             ),
             resolve=lambda spec: resolve(spec, plugin.solvers),
             environment={{}}, digest="here", progress=progress,

@@ -104,7 +104,7 @@ def measure(tmp_path):
             out=out,
             commands=Commands(
                 solvers={spec.label: [*START, spec.name] for spec in suite.solvers},
-                generator=[*START, "generator"],
+                case_worker=[*START, "generator"],
             ),
             resolve=lambda spec: resolve(spec, SOLVERS),
             environment=environment or {"machine": "test"},

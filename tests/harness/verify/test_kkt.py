@@ -17,7 +17,7 @@ from harness import (
     no_rows,
     verdict,
 )
-from harness.conformance.manufactured import planted
+from harness.conformance.manufactured import manufactured
 from problems.families.beam_ring import BeamRing
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP
@@ -158,17 +158,17 @@ def test_a_load_step_without_contact_is_verified(solver, form):
 
 
 @pytest.mark.parametrize("seed", [271828, 314159])
-def test_a_planted_solution_has_no_residual_and_a_moved_one_has(planted, seed):
-    qp, s = planted("everything", seed=seed, dense=True)
+def test_a_planted_solution_has_no_residual_and_a_moved_one_has(manufactured, seed):
+    qp, s = manufactured("everything", seed=seed, dense=True)
 
     assert kkt_residuals(qp, s).worst < 1e-13
     assert kkt_residuals(qp, replace(s, x=s.x * (1 + 1e-4))).worst > 1e-6
 
 
 @pytest.mark.parametrize("seed", [271828, 314159])
-def test_units_of_objective_variables_and_rows_do_not_matter(planted, seed):
+def test_units_of_objective_variables_and_rows_do_not_matter(manufactured, seed):
     """Objective × 2²⁰, x in units of 2⁻⁷, rows × powers of two: the same residuals."""
-    qp, s = planted("everything", seed=seed, dense=True)
+    qp, s = manufactured("everything", seed=seed, dense=True)
     s = replace(s, x=s.x + 1e-3, y=s.y * 1.01, z=s.z - 1e-3, z_box=s.z_box * 0.99)
     o, u = 2.0**20, 2.0**-7
     rA, rG = 2.0 ** np.arange(-2, 3), 2.0 ** np.arange(-8, 8, 2)
@@ -184,16 +184,16 @@ def test_units_of_objective_variables_and_rows_do_not_matter(planted, seed):
     assert kkt_residuals(scaled, same) == pytest.approx(kkt_residuals(qp, s), rel=1e-10)
 
 
-def test_no_point_no_residual(planted):
-    qp, _ = planted("everything", seed=271828, dense=True)
+def test_no_point_no_residual(manufactured):
+    qp, _ = manufactured("everything", seed=271828, dense=True)
     r = kkt_residuals(qp, Solution.without_point(qp, Status.SOLVED))
 
     assert np.isnan(r).all()
     assert verdict(Status.SOLVED, r, 1e-2) is Verdict.WRONG
 
 
-def test_one_nan_is_enough_to_fail(planted):
-    qp, s = planted("everything", seed=271828, dense=True)
+def test_one_nan_is_enough_to_fail(manufactured):
+    qp, s = manufactured("everything", seed=271828, dense=True)
     y = s.y.copy()
     y[0] = np.nan
 
@@ -229,8 +229,8 @@ def test_a_loose_tolerance_does_not_verify_a_refutation():
 
 
 @pytest.mark.parametrize("unit", [2.0**-20, 2.0**20])
-def test_an_operator_is_judged_alike_in_all_units(planted, unit):
-    qp, s = planted("everything", seed=314159, dense=True)
+def test_an_operator_is_judged_alike_in_all_units(manufactured, unit):
+    qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
 
     def operator_in(unit):
@@ -245,9 +245,9 @@ def test_an_operator_is_judged_alike_in_all_units(planted, unit):
     assert found == pytest.approx(kkt_residuals(operator_in(1.0), moved), rel=1e-9)
 
 
-def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(planted):
+def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufactured):
     """Lengths come from Pᵢᵢ, which no operator tells: they may differ by a factor."""
-    qp, s = planted("everything", seed=314159, dense=True)
+    qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
     one = kkt_residuals(qp, moved)
     other = kkt_residuals(replace(qp, P=aslinearoperator(qp.P)), moved)
@@ -258,7 +258,7 @@ def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(plante
 
 
 def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
-    qp, s = planted("inequalities")
+    qp, s = manufactured("inequalities")
     n = qp.q.size
     empty = replace(
         qp, G=vstack([csr_array(qp.G), csr_array((1, n))]), h=np.append(qp.h, 3.0)

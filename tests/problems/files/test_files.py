@@ -438,8 +438,8 @@ def test_unknown_formats_of_an_export_are_refused_with_those_there_are(
     )
 
 
-def test_a_file_of_an_operator_comes_back_as_an_array(written, planted, tmp_path):
-    qp, _ = planted("everything", dense=True)
+def test_a_file_of_an_operator_comes_back_as_an_array(written, manufactured, tmp_path):
+    qp, _ = manufactured("everything", dense=True)
     save_qp(tmp_path / "a.npz", qp, {"scale": -2.0, "constant": 3.0})
     case = build("file:a.npz")
 

@@ -112,8 +112,8 @@ def test_solve_writes_the_deformed_state(solve):
     assert "von_mises" in meshio.read(path).point_data
 
 
-def test_solve_refuses_what_it_cannot_write(solve, planted, tmp_path):
-    save_qp(tmp_path / "a.npz", planted("box")[0], {})
+def test_solve_refuses_what_it_cannot_write(solve, manufactured, tmp_path):
+    save_qp(tmp_path / "a.npz", manufactured("box")[0], {})
     code, err, path = solve(f"file:{tmp_path / 'a.npz'}")
 
     assert (code, path.exists()) == (2, False)

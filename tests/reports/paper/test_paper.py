@@ -76,7 +76,7 @@ def experiment():
 def folder(experiment, tmp_path_factory):
     path = tmp_path_factory.mktemp("paper")
     save_experiment(experiment, path / "data")
-    for name, records in planted().items():
+    for name, records in synthetic().items():
         with Journal(path / "data" / name, "here") as journal:
             for record in records:
                 journal.append(record)
@@ -101,7 +101,7 @@ def record(solver, form, m, seconds, repeat, **changes):
     return Record(**(given | changes))
 
 
-def planted():
+def synthetic():
     """Times of 1e-6·m² s; `lazy` is wrong at the largest size, in no time at all."""
     fleet = [
         record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
@@ -160,7 +160,7 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, tmp_path):
     """What is stored, and a figure of each sort: a mesh, curves, solvers."""
     again = load_experiment(folder / "data")
     save_experiment(again, tmp_path / "data")
-    suites = {n: read_evidence(folder / "data" / n) for n in planted()}
+    suites = {n: read_evidence(folder / "data" / n) for n in synthetic()}
     pictures = {
         p.name: p for s in compose(again, suites).sections for p in s.pictures
     }  # fmt: skip
@@ -383,7 +383,7 @@ def test_the_pressures_of_a_step_carry_the_force_of_its_nodes(experiment):
 
 
 def evidence(name):
-    return Evidence(directory=Path(), records=arrange(planted()[name]))
+    return Evidence(directory=Path(), records=arrange(synthetic()[name]))
 
 
 def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
@@ -430,7 +430,7 @@ def test_the_time_to_an_error_is_that_of_the_cheapest_certified_answer():
 
 
 def test_no_panel_is_empty(experiment):
-    suites = {name: evidence(name) for name in planted()}
+    suites = {name: evidence(name) for name in synthetic()}
     for section in compose(experiment, suites).sections:
         for picture in section.pictures:
             assert all(panel.marks for panel in picture.figure.panels), picture.name

@@ -44,21 +44,21 @@ def test_degenerate_problems_have_their_solutions_exactly(qp, x):
 
 
 @pytest.mark.parametrize("exponent", [-30, 30])
-def test_scaling_the_objective_changes_nothing(planted, exponent):
+def test_scaling_the_objective_changes_nothing(manufactured, exponent):
     for shape in ("bounds", "box"):
-        qp, factor = planted(shape)[0], 2.0**exponent
+        qp, factor = manufactured(shape)[0], 2.0**exponent
         scaled = replace(qp, P=qp.P * factor, q=qp.q * factor)
         plain, large = (BVLS().prepare(p, 1e-9)() for p in (qp, scaled))
         assert large.iterations == plain.iterations
         assert large.x == pytest.approx(plain.x, rel=1e-12, abs=1e-14)
 
 
-def test_what_it_cannot_take_is_declined(planted, monkeypatch):
-    qp, _ = planted("box")
+def test_what_it_cannot_take_is_declined(manufactured, monkeypatch):
+    qp, _ = manufactured("box")
     operator = replace(qp, P=aslinearoperator(qp.P))
     singular = replace(qp, P=csr_array(np.diag([0.0] + [1.0] * 19)))
 
-    assert BVLS().declines(planted("equalities")[0]) == "takes bounds only"
+    assert BVLS().declines(manufactured("equalities")[0]) == "takes bounds only"
     assert BVLS().declines(operator) == "needs explicit matrices"
     assert BVLS().declines(singular) == "needs a positive definite P"
     monkeypatch.setattr(bvls, "LARGEST", 19)
@@ -66,8 +66,8 @@ def test_what_it_cannot_take_is_declined(planted, monkeypatch):
 
 
 @pytest.mark.parametrize("shape", ["bounds", "box"])
-def test_the_step_limit_is_not_called_solved(planted, shape):
-    qp, _ = planted(shape, n=60)
+def test_the_step_limit_is_not_called_solved(manufactured, shape):
+    qp, _ = manufactured(shape, n=60)
     s = BVLS(max_iter=1).prepare(qp, 1e-9)()
 
     assert s.status is Status.ITERATION_LIMIT

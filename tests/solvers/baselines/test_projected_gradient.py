@@ -115,14 +115,18 @@ def test_every_product_is_counted_and_one_per_step():
     assert s.counts["P_products"] == s.iterations + 4
 
 
-def test_operators_are_taken_and_rows_are_not(planted):
+def test_operators_are_taken_and_rows_are_not(manufactured):
     qp = random(161803)
     as_operator = solve(replace(qp, P=aslinearoperator(csr_array(qp.P))))
 
     assert as_operator.x == pytest.approx(solve(qp).x, abs=1e-8)
-    assert ProjectedGradient().declines(planted("equalities")[0]) == "takes bounds only"
     assert (
-        ProjectedGradient().declines(planted("inequalities")[0]) == "takes bounds only"
+        ProjectedGradient().declines(manufactured("equalities")[0])
+        == "takes bounds only"
+    )
+    assert (
+        ProjectedGradient().declines(manufactured("inequalities")[0])
+        == "takes bounds only"
     )
 
 

@@ -13,9 +13,9 @@ from harness import QP, kkt_residuals, no_rows
 from harness.conformance.manufactured import (
     SHAPES,
     infeasible,
+    manufactured,
     membrane,
     one_of_each,
-    planted,
     unbounded,
 )
 from harness.names import completed
@@ -127,7 +127,7 @@ def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_planted_point_of_every_shape_is_found_in_every_unit(shape, dense):
     """Units of x and of the objective from 1e-8 to 1e8."""
-    qp, exact = planted(shape, dense=dense)
+    qp, exact = manufactured(shape, dense=dense)
     for length, energy in [(1, 1), (1e8, 1), (1e-8, 1e8), (1, 1e-8)]:
         scaled = replace(
             qp, P=energy / length**2 * qp.P, q=energy / length * qp.q,
@@ -240,7 +240,7 @@ def test_the_beam_sinks_by_what_a_prototype_found(steps, tip, force):
 
 
 def test_rows_without_entries_hold_nothing():
-    qp, exact = planted("everything", dense=True)
+    qp, exact = manufactured("everything", dense=True)
     empty = np.zeros((1, 20))
     more = replace(
         qp, A=np.vstack([qp.A, empty]), b=np.append(qp.b, 0),
@@ -254,7 +254,7 @@ def test_rows_without_entries_hold_nothing():
 
 @pytest.mark.parametrize("size", [1e10, 1e20, 1e100])
 def test_a_far_bound_is_as_none(size):
-    qp, exact = planted("some bounds")
+    qp, exact = manufactured("some bounds")
     far = replace(
         qp, lb=np.maximum(qp.lb, -size), ub=np.minimum(qp.ub, size),
         G=csr_array(np.eye(1, 20)), h=np.array([size]),
@@ -265,7 +265,7 @@ def test_a_far_bound_is_as_none(size):
 
 @pytest.mark.parametrize("noise", [1e-16, 1e-12, 1e-9, 1e-6])
 def test_rows_that_are_almost_the_same_do_no_harm(noise):
-    qp, exact = planted("everything", dense=True)
+    qp, exact = manufactured("everything", dense=True)
     wobble = 1 + noise * np.random.default_rng(31415).standard_normal(qp.G.shape)
     G = np.vstack([qp.G, qp.G * wobble])
     almost = replace(qp, G=G, h=np.append(qp.h, qp.h))
@@ -327,7 +327,7 @@ def test_the_scaled_qp_has_entries_of_about_one_and_the_same_points():
 
 
 def test_an_operator_is_refused_in_one_line():
-    qp, _ = planted("box")
+    qp, _ = manufactured("box")
 
     with pytest.raises(ValueError, match="needs P as a matrix, got an operator") as e:
         reference_solution(replace(qp, P=aslinearoperator(qp.P)))
@@ -336,7 +336,7 @@ def test_an_operator_is_refused_in_one_line():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_matrix_that_holds_no_numbers_is_refused_in_one_line(bad):
-    qp, _ = planted("bounds", dense=True)
+    qp, _ = manufactured("bounds", dense=True)
 
     with pytest.raises(ValueError, match="needs finite matrices"):
         reference_solution(replace(qp, P=np.where(np.eye(20) == 1, bad, qp.P)))
@@ -344,13 +344,13 @@ def test_a_matrix_that_holds_no_numbers_is_refused_in_one_line(bad):
 
 def contradicting():
     """x₀ = 1 and x₀ = 2."""
-    qp, _ = planted("unconstrained")
+    qp, _ = manufactured("unconstrained")
     return replace(qp, A=csr_array(np.eye(20)[[0, 0]]), b=np.array([1.0, 2.0]))
 
 
 def crossing():
     """x₀ ≤ −1 by a row, x₀ ≥ 0 by a bound."""
-    qp, _ = planted("bounds", dense=True)
+    qp, _ = manufactured("bounds", dense=True)
     return replace(qp, G=np.eye(1, 20), h=-np.ones(1), lb=np.zeros(20))
 
 
@@ -385,11 +385,11 @@ import sys, types
 bare = types.ModuleType("solvers")  # solvers/__init__.py names every solver under test
 bare.__path__ = [sys.argv[1]]
 sys.modules["solvers"] = bare
-from harness.conformance.manufactured import planted
+from harness.conformance.manufactured import manufactured
 from solvers.reference.solve import reference_solution
 for shape in ("everything", "singular", "bounds"):
     for dense in (False, True):
-        reference_solution(planted(shape, dense=dense)[0])
+        reference_solution(manufactured(shape, dense=dense)[0])
 print(*sorted({m.split(".")[0] for m in sys.modules}))
 print(*sorted(m for m in sys.modules if m.startswith("solvers.")))
 """

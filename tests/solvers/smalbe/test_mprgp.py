@@ -142,8 +142,10 @@ def test_an_unbounded_cost_is_not_called_a_minimum():
 
 @pytest.mark.parametrize("expansion", sorted({*EXPANSIONS} - {"projcg"}))
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_every_iterate_is_feasible_and_the_cost_never_rises(planted, seed, expansion):
-    qp, _ = planted("box", seed=seed, dense=True, n=24)
+def test_every_iterate_is_feasible_and_the_cost_never_rises(
+    manufactured, seed, expansion
+):
+    qp, _ = manufactured("box", seed=seed, dense=True, n=24)
     rules = Rules(expansion=expansion, proportioning="cg")
     costs = []
     for steps in range(30):

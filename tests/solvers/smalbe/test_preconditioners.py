@@ -112,7 +112,7 @@ def test_they_lead_to_the_solution_and_are_counted(form, kind):
 
 
 def test_structure_survives_the_file(gap, tmp_path):
-    save_qp(tmp_path / "qp.npz", gap, {}, recipe=True)
+    save_qp(tmp_path / "qp.npz", gap, {}, serialised=True)
     loaded, _ = load_qp(tmp_path / "qp.npz")
 
     assert (loaded.structure.K != gap.structure.K).nnz == 0

@@ -12,7 +12,7 @@ from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.mprgp import Rules
-from solvers.smalbe.outer_loop import Constants, Inner, first_iterate, smalbe
+from solvers.smalbe.outer_loop import Constants, InnerSolver, first_iterate, smalbe
 from solvers.smalbe.projected import by_lanczos, orthonormal_rows, projected_problem
 from solvers.smalbe.solver import SMALBE
 from solvers.smalbe.spectrum import lanczos, power_method
@@ -25,7 +25,7 @@ def projected(qp, steps=10):
 
 
 def outer_loop(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
-    inner = Inner(
+    inner = InnerSolver(
         Rules(1.0, "mixed", "cg"),
         partial(problem.plain_model, alpha=1.9),
         precondition=lambda rho: None,
@@ -372,8 +372,8 @@ def test_the_power_method_stops_at_its_tolerance():
     assert 5 <= len(products) <= 10
 
 
-def test_inequality_rows_are_declined_with_a_way_out(planted):
-    qp, _ = planted("inequalities")
+def test_inequality_rows_are_declined_with_a_way_out(manufactured):
+    qp, _ = manufactured("inequalities")
 
     assert "dualise" in SMALBE().declines(qp)
 
@@ -389,10 +389,10 @@ def test_scaling_the_rows_changes_no_step(dual, exponent):
 
 
 @pytest.mark.parametrize("shape", ["bounds", "box", "equalities", "some bounds"])
-def test_random_planted_problems_are_solved_and_certified(planted, shape):
+def test_random_planted_problems_are_solved_and_certified(manufactured, shape):
     """125 of each: every answer has small residuals and is the planted one."""
     for seed in range(1000, 1125):
-        qp, planted_point = planted(shape, seed=seed, dense=seed % 2 == 0)
+        qp, planted_point = manufactured(shape, seed=seed, dense=seed % 2 == 0)
         s = SMALBE().prepare(qp, 1e-9)()
 
         assert s.status is Status.SOLVED, seed
@@ -404,12 +404,12 @@ def test_random_planted_problems_are_solved_and_certified(planted, shape):
 @pytest.mark.parametrize("proportioning", ["cg", "model"])
 @pytest.mark.parametrize("preconditioner", ["none", "diagonal", "model"])
 def test_every_combination_of_rules_solves(
-    planted, dual, expansion, proportioning, preconditioner
+    manufactured, dual, expansion, proportioning, preconditioner
 ):
     solver = SMALBE(
         expansion=expansion, proportioning=proportioning, preconditioner=preconditioner
     )
-    for qp in (planted("box", seed=161803)[0], dual(161803)):
+    for qp in (manufactured("box", seed=161803)[0], dual(161803)):
         s = solver.prepare(qp, 1e-8)()
 
         assert s.status is Status.SOLVED

@@ -1,4 +1,4 @@
-"""An operator P as a recipe: plain arrays, and the name of what multiplies by it.
+"""Operators P that can be written: plain arrays, and the name of what multiplies.
 
 A matrix-free P cannot be written to a file, but what it is made from can. It travels to
 workers as these arrays and is put together there, on the clock: whatever an operator
@@ -27,7 +27,7 @@ Maker = Callable[[Arrays], Product]
 NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 
 
-class Recipe(LinearOperator):  # type: ignore[misc]  # scipy has no types
+class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
     maker : what puts it together, a name in `makers`
@@ -70,5 +70,5 @@ class Recipe(LinearOperator):  # type: ignore[misc]  # scipy has no types
     def _matmat(self, X: NDArray[np.float64]) -> NDArray[np.float64]:
         return self.build()(X)
 
-    def _adjoint(self) -> Recipe:
+    def _adjoint(self) -> SerialisableOperator:
         return self
