@@ -55,7 +55,9 @@ class Watch:
 
     def advance(self, record):
         self.records.append((record.solver, record.repeat, record.total_seconds))
-        self.solving.append(record.total_seconds * (record.inner + (record.inner > 1)))
+        self.solving.append(
+            record.total_seconds * (record.inner_loops + (record.inner_loops > 1))
+        )
         self.at.append(perf_counter())
         self.synced.append(self._waited)
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
@@ -74,7 +76,7 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
     start = [sys.executable, "-P", str(plugin)]
     plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
-    specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", arm="null")]
+    specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", role="null")]
     tiny = plugin.problems["tiny"]
     suite = Suite(
         name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,

@@ -6,15 +6,16 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from enum import StrEnum
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self, get_type_hints
 
 from harness.errors import shown
 
 if TYPE_CHECKING:
+    from msgspec import Struct
     from msgspec.json import Decoder
 
 #: version of the journal line; raised whenever a field changes its meaning.
@@ -62,7 +63,7 @@ class Measurement:
     peak_mib: float | None = None  #: resident memory of the worker, peak
     prepare_peak_mib: float | None = None
     solve_peak_mib: float | None = None
-    inner: int = 1  #: prepared and solved so often; the seconds are the mean
+    inner_loops: int = 1  #: prepared and solved so often; the seconds are the mean
 
 
 MEASURED = tuple(f.name for f in fields(Measurement))
@@ -90,7 +91,7 @@ class Record(Measurement):
     tol: float
     repeat: int  #: 0, 1, …
     block: int  #: measurements of one block ran next to each other in time
-    status: Verdict
+    verdict: Verdict
     claimed: str | None = None  #: the solver's own status
     message: str = ""  #: its words, the reason it declined, or how it died
     iterations: int | None = None
@@ -109,12 +110,12 @@ class Record(Measurement):
     cpu: int | None = None  #: that the worker was bound to
     mode: str = "cold"  #: or "sequence": may use what earlier steps left
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
-    arm: str = ""  #: "null": the same solver once more, to show the noise
+    role: str = ""  #: "null": the same solver once more, to show the noise
     primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: "reference" where `optimum_error` decided the status, and not the residuals
+    #: "reference" where `optimum_error` decided the verdict, and not the residuals
     decided_by: str = "residuals"
     optimum_error: float | None = (
         None  #: against the proven optimum, harness.verify.optimum
@@ -136,8 +137,8 @@ class Record(Measurement):
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Give every field by its name; what is nested is not copied."""
-        return {f.name: getattr(self, f.name) for f in FIELDS}
+        """Give every field by its name in the journal; nested data is not copied."""
+        return {name: getattr(self, f.name) for name, f in JOURNAL.items()}
 
     def to_json(self) -> str:
         """Serialise to one line of strict JSON.
@@ -167,29 +168,40 @@ class Record(Measurement):
 
         try:
             try:
-                record = _decoder().decode(line)
+                parsed = _decoder().decode(line)
             except msgspec.ValidationError as e:
                 raise ValueError(_explained(e, _parsed(line))) from None
             except msgspec.DecodeError:  # no JSON, or a lone surrogate
                 row = _spelt(_parsed(line))
                 try:
-                    record = msgspec.convert(row, Record)
+                    parsed = msgspec.convert(row, _line())
                 except msgspec.ValidationError as e:
                     raise ValueError(_explained(e, row)) from None
+            record = msgspec.convert(parsed, Record, from_attributes=True)
             _check(record)
             return _share(record, {} if shared is None else shared)
         except RecursionError:
             raise ValueError(f"nested deeper than {MOST_LEVELS} levels") from None
 
 
-def _in_order() -> tuple[Field[Any], ...]:
+#: what fields are called in the journal, where that is not the name in the code
+_JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
+
+
+def journal_name(name: str) -> str:
+    """Give the name in the journal of a field."""
+    return _JOURNAL_NAMES.get(name, name)
+
+
+def _journal() -> dict[str, Field[Any]]:
     own = [f for f in fields(Record) if f.name not in MEASURED]
-    at = [f.name for f in own].index("build_seconds")
-    return (*own[:at], *fields(Measurement), *own[at:])
+    at = [f.name for f in own].index("build_seconds")  # of what else took time
+    ordered = (*own[:at], *fields(Measurement), *own[at:])
+    return {journal_name(f.name): f for f in ordered}
 
 
-#: in the order of a journal line: what was measured comes before what else took time
-FIELDS = _in_order()
+#: the fields of a record by their names in the journal, in the order of a line
+JOURNAL: Mapping[str, Field[Any]] = _journal()
 _NOT_NEGATIVE = (
     "repeat", "block", *MEASURED, "build_seconds", "dualise_seconds",
     "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
@@ -209,10 +221,26 @@ def _parsed(line: str | bytes) -> Any:
 
 
 @cache
-def _decoder() -> Decoder[Record]:
+def _decoder() -> Decoder[Struct]:
     from msgspec.json import Decoder
 
-    return Decoder(Record)
+    return Decoder(_line())
+
+
+@cache
+def _line() -> type[Struct]:
+    """Make the type of a journal line: a record's fields, by the journal's names."""
+    import msgspec
+
+    types = get_type_hints(Record)
+    line: list[Any] = []
+    for f in JOURNAL.values():
+        if f.default_factory is not MISSING:
+            default = msgspec.field(default_factory=f.default_factory)
+        else:
+            default = msgspec.NODEFAULT if f.default is MISSING else f.default
+        line.append((f.name, types[f.name], default))
+    return msgspec.defstruct("Line", line, rename=_JOURNAL_NAMES, kw_only=True)
 
 
 def _explained(e: Exception, row: object) -> str:
@@ -223,7 +251,7 @@ def _explained(e: Exception, row: object) -> str:
     if place is None:
         return f"incomplete journal line: {e}"
     name = place[1]
-    annotation = next(str(f.type) for f in FIELDS if f.name == name)
+    annotation = str(JOURNAL[name].type)
     if annotation == "Verdict" and isinstance(row[name], str):
         annotation = f"one of {', '.join(Verdict)}"
     return f"{name} = {shown(row[name])}; expected {annotation}"
@@ -249,8 +277,9 @@ def _check(r: Record) -> None:
     if numbers and not 0 < min(numbers) <= max(numbers) <= LARGEST_INTEGER:
         for name, value in zip(_NOT_NEGATIVE, _not_negative(r), strict=True):
             if (value or 0) < 0:
+                name = journal_name(name)
                 raise ValueError(f"{name} = {value!r}; expected no negative number")
-            _check_nested(name, value, 0)
+            _check_nested(journal_name(name), value, 0)
     _check_nested("iterations", r.iterations, 0)
     _check_nested("reported", r.reported, MOST_LEVELS)
 

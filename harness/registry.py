@@ -40,7 +40,7 @@ class SolverSpec:
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  #: that differ from defaults
-    arm: str = ""  #: "null": one that the suite has already, to show the noise
+    role: str = ""  #: "null": one that the suite has already, to show the noise
 
 
 @dataclass(frozen=True, kw_only=True)

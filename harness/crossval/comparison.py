@@ -147,7 +147,7 @@ def _answer(
     error = decided(g.case.qp, g.solution, residuals, r.tol, prove)
     answer = Answer(
         run_id=r.run_id, repeats=g.repeats, solver=g.label, case=r.case, form=r.form,
-        tol=r.tol, claimed=r.claimed or "", stored=r.status,
+        tol=r.tol, claimed=r.claimed or "", stored=r.verdict,
         verdict=verdict(g.solution.status, residuals, r.tol, error=error),
         residuals=residuals._asdict(), optimum_error=error, allowed=allowed(r.tol),
         energy_allowed=energy_allowed(r.tol), energy_bound=r.energy_bound,

@@ -129,7 +129,7 @@ def validated(
             if _silent(r) and r.run_id not in {x.run_id for x in false_claims}
         ),
         not_validated=tuple(x for part in parts for x in part.lost),
-        declined=sum(r.status is Verdict.DECLINED for r in records),
+        declined=sum(r.verdict is Verdict.DECLINED for r in records),
     )
 
 
@@ -137,7 +137,7 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
     """Group what was measured by physical case, in the order of names."""
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
-        if r.status is not Verdict.DECLINED:
+        if r.verdict is not Verdict.DECLINED:
             groups.setdefault(_physical(r), []).append(r)
     return groups
 
@@ -175,7 +175,7 @@ def _pointless(records: Sequence[Record]) -> str:
     """Say why a folder has nothing to judge."""
     if any(r.vectors for r in records):
         return "its stored points are gone; expected vectors/*.npz, which a run writes"
-    statuses = Counter(r.status.value.replace("_", " ") for r in records)
+    statuses = Counter(r.verdict.value.replace("_", " ") for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
     return f"no solver returned a point ({ends}); expected one that solves a case"
 
@@ -234,12 +234,12 @@ def _twin(folder: _Folder, r: Record) -> str:
 
 def _stands(r: Record) -> bool:
     """Whether a record has an answer to judge: claimed, or verified all the same."""
-    return r.claimed == Status.SOLVED or r.status is Verdict.VERIFIED
+    return r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
 
 
 def _silent(r: Record) -> bool:
     """Whether a record neither claims success nor is verified."""
-    return r.claimed != Status.SOLVED and r.status not in (
+    return r.claimed != Status.SOLVED and r.verdict not in (
         Verdict.VERIFIED,
         Verdict.DECLINED,
     )
@@ -261,7 +261,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _ending(r: Record) -> str:
-    words = r.status.value.replace("_", " ")
+    words = r.verdict.value.replace("_", " ")
     return f"{words}: {r.message}" if r.message else words
 
 

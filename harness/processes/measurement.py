@@ -29,7 +29,7 @@ from harness.processes.case_folder import content_digest
 from harness.processes.protocol import MOST_ECHOED
 from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from harness.qp import QP
-from harness.record import MEASURED, Measurement, Record, Verdict
+from harness.record import MEASURED, Measurement, Record, Verdict, journal_name
 from harness.solution import Solution, Status, checked_history
 from harness.verify.measure import one_line
 from harness.verify.optimum import Proves, proves
@@ -97,7 +97,7 @@ def measured(
             cpu=reply.cpu,
         )
         if reply.answer is None:
-            return record.but(status=reply.verdict), None
+            return record.but(verdict=reply.verdict), None
         solution = _solution(returned, qp, reply.answer)
         _clear(out, returned)
         if has_point(solution):
@@ -217,12 +217,12 @@ def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
-    told = Measurement(**{name: answer[name] for name in MEASURED})
+    told = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
     if clock is None or told.total_seconds is None:
         return (told,)
     assert told.prepare_seconds is not None
     assert told.solve_seconds is not None
-    inner, first = told.inner, answer["first_seconds"]
+    inner, first = told.inner_loops, answer["first_seconds"]
     times = inner + (first is not None)
     reported = (first or 0.0) + inner * told.total_seconds
     phases = told.prepare_seconds + told.solve_seconds
@@ -268,15 +268,15 @@ def _cached(
 
 def _within(limit: float, record: Record) -> Record:
     """Say so where an answer went beyond the memory limit, or failed because of it."""
-    if record.status is Verdict.DECLINED:
+    if record.verdict is Verdict.DECLINED:
         return record
     peak = record.peak_mib
     if peak is not None and peak > limit:
         message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
-        return noted(record.but(status=Verdict.MEMORY_LIMIT), message)
-    succeeded = record.status in (Verdict.VERIFIED, Verdict.INACCURATE)
+        return noted(record.but(verdict=Verdict.MEMORY_LIMIT), message)
+    succeeded = record.verdict in (Verdict.VERIFIED, Verdict.INACCURATE)
     if not succeeded and out_of_memory(record.message, peak, limit):
-        return record.but(status=Verdict.MEMORY_LIMIT)
+        return record.but(verdict=Verdict.MEMORY_LIMIT)
     return record
 
 
@@ -314,7 +314,7 @@ def measured_once(
             record, solution = once()
         except FaultError:
             record, solution = once()
-    if solution is None or record.status is Verdict.DECLINED:
+    if solution is None or record.verdict is Verdict.DECLINED:
         return record, solution
     quantities, note = quantities_of(case, solution)
     bounds, objection = certified(case, solution)

@@ -24,7 +24,7 @@ from dataclasses import Field, dataclass, fields
 from math import isfinite
 from typing import Any, TextIO
 
-from harness.record import Measurement, finite
+from harness.record import Measurement, finite, journal_name
 from harness.solution import Status
 
 LONGEST_REPLY = 2**22  #: bytes
@@ -196,7 +196,7 @@ _MEASURED: Mapping[str, Accepts] = {
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
     "first_seconds": _is_time,
     "canary_seconds": _is_size,
-    **{f.name: _cost(f) for f in fields(Measurement)},
+    **{journal_name(f.name): _cost(f) for f in fields(Measurement)},
 }
 _CHECKED: Mapping[str, Accepts] = {
     "grade": _is_text, "message": _is_any_text, "work": _maybe(_is_number),

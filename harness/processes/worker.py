@@ -40,7 +40,7 @@ from harness.plugin import Solver
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
 from harness.qp import QP, Vector, no_rows
-from harness.record import finite
+from harness.record import finite, journal_name
 from harness.solution import Solution
 from harness.verify.measure import Prepare, Timed, measure, memory_mib
 
@@ -125,7 +125,7 @@ class _Bench:
             "reported": finite(dict(s.reported)),
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
-            **asdict(timed.cost),
+            **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
     def _shift_heap(self) -> None:

@@ -149,10 +149,10 @@ class Executor:
                 memory_limit=block.memory_limit,
                 prove=partial(self._optimum, at),
             )
-            if record.status in (Verdict.CRASHED, Verdict.FAILED):
+            if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self._scratch, "")  # whatever it died of
             yield self._described(block, record, solution)
-            stopped = record.status is not Verdict.DECLINED and (
+            stopped = record.verdict is not Verdict.DECLINED and (
                 solution is None or not has_point(solution)
             )
             if block.is_sequence and stopped:  # what it carried is lost
@@ -165,7 +165,7 @@ class Executor:
         """Add what the point means, which the case worker knows."""
         if solution is None or not has_point(solution):
             return Result(record=record)
-        first = record.status is Verdict.VERIFIED and record.repeat == 0
+        first = record.verdict is Verdict.VERIFIED and record.repeat == 0
         fields = self._scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
@@ -302,7 +302,7 @@ def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     """Give the steps that a sequence did not come to, because of how one ended."""
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
-        yield Result(record=record.but(status=end.status, message=reason))
+        yield Result(record=record.but(verdict=end.verdict, message=reason))
 
 
 def _in_a_line(e: Exception) -> str:

@@ -53,7 +53,7 @@ class Schedule:
         """Know of a measurement that is in the journal."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
-        if record.status is Verdict.DECLINED:
+        if record.verdict is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
         if self.suite.precision is not None:
             self._seen.setdefault(_cell(record), []).append(record)
@@ -109,7 +109,7 @@ class Schedule:
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
-        failed = {r.solver for r in records if r.status is not Verdict.VERIFIED}
+        failed = {r.solver for r in records if r.verdict is not Verdict.VERIFIED}
         times: dict[str, dict[int, float]] = {}
         for r in records:
             if r.solver not in failed and r.total_seconds:

@@ -181,7 +181,7 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
     known = {spec.label: spec for spec in specs}
     if (label := checked.text("null_arm", label)) not in known:
         raise unknown("null_arm", label, known)
-    return (*specs, replace(known[label], label=f"{label}{NULL}", arm="null"))
+    return (*specs, replace(known[label], label=f"{label}{NULL}", role="null"))
 
 
 def _between(key: str, value: Any) -> float | None:

@@ -390,14 +390,14 @@ def rejudged(record: Record, factor: float) -> Verdict:
     stands.
     """
     if record.claimed is None:
-        return record.status
+        return record.verdict
     stored = (getattr(record, name) for name in Residuals._fields)
     residuals = Residuals(*(np.inf if r is None else r for r in stored))
     tol = record.tol if record.accuracy is None else record.accuracy
     claimed = Status(record.claimed)
     error = record.optimum_error
-    if verdict(claimed, residuals, tol, error=error) is not record.status:
-        return record.status
+    if verdict(claimed, residuals, tol, error=error) is not record.verdict:
+        return record.verdict
     return verdict(claimed, residuals, tol, factor, error=error)
 
 

@@ -91,7 +91,7 @@ def measure(
         peak_mib=max((p for p in peaks if p is not None), default=None),
         prepare_peak_mib=peaks[0],
         solve_peak_mib=peaks[1],
-        inner=inner,
+        inner_loops=inner,
     )
     return Timed(_checked(answer, qp), cost, first if inner > 1 else None)
 

@@ -60,11 +60,11 @@ def new_record(
         tol=tol,
         repeat=repeat,
         block=block,
-        status=Verdict.FAILED,
+        verdict=Verdict.FAILED,
         environment=environment,
         mode=mode,
         accuracy=accuracy,
-        arm=spec.arm,
+        role=spec.role,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
     )
 
@@ -83,7 +83,7 @@ def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> 
         reported=s.reported,
     )
     if s.status is Status.DECLINED:
-        return record.but(status=Verdict.DECLINED)
+        return record.but(verdict=Verdict.DECLINED)
     with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
         residuals = kkt_residuals(qp, s)
         objective = qp.objective(s.x)
@@ -91,7 +91,7 @@ def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> 
     if prove is not None:
         error = decided(qp, s, residuals, tol, prove)
     return record.but(
-        status=verdict(s.status, residuals, tol, error=error),
+        verdict=verdict(s.status, residuals, tol, error=error),
         objective=objective,
         decided_by="residuals" if error is None else "reference",
         optimum_error=error,

@@ -192,7 +192,7 @@ def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     """
     others: dict[tuple[str, float], list[float]] = {}
     for p in c.pairs:
-        if p.logs and p.after.solver != solver and not p.after.first.arm:
+        if p.logs and p.after.solver != solver and not p.after.first.role:
             key = (p.after.case, p.after.tol)
             others.setdefault(key, []).append(float(np.mean(p.logs)))
     logs, names = [], []

@@ -17,7 +17,7 @@ def source(*outcomes: Outcome) -> str:
 def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
     """Show a verdict with symbol and words, and how many repeats it holds for."""
     symbol, words = VERDICTS[outcome.verdict]
-    alike = sum(r.status is outcome.verdict for r in outcome.records)
+    alike = sum(r.verdict is outcome.verdict for r in outcome.records)
     if alike < len(outcome.records):
         words += f" ({alike} of {plural(len(outcome.records), 'repeat')})"
     return Cell(

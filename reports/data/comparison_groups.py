@@ -127,7 +127,7 @@ def all_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
     Forms are apart, since the primal and the dual QP of one problem are two problems to
     a solver; so are cold solves and sequences.
     """
-    records = [r for r in evidence.records if not r.arm]
+    records = [r for r in evidence.records if not r.role]
     if not records:
         return ()
     kinds = _numbered(map(kind_of, records))
@@ -163,10 +163,10 @@ def _row(r: Record) -> dict[str, float]:
     return {
         "tol": r.tol,
         "seconds": np.nan if r.total_seconds is None else r.total_seconds,
-        "verified": r.status is Verdict.VERIFIED,
+        "verified": r.verdict is Verdict.VERIFIED,
         "claimed": r.claimed == "solved",
-        "late": r.status is Verdict.TIME_LIMIT,
-        "declined": r.status is Verdict.DECLINED,
+        "late": r.verdict is Verdict.TIME_LIMIT,
+        "declined": r.verdict is Verdict.DECLINED,
     }
 
 

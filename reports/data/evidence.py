@@ -77,7 +77,7 @@ class Outcome:
     @cached_property
     def verdict(self) -> Verdict:
         """The worst verdict among the repeats."""
-        return min((r.status for r in self.records), key=SEVERITY.index)
+        return min((r.verdict for r in self.records), key=SEVERITY.index)
 
     @property
     def verified(self) -> bool:
@@ -254,7 +254,7 @@ def _read(path: Path, read: Callable[[Path, str], Any]) -> dict[str, Any]:
 def _judged(record: Record, factor: float) -> Record:
     if factor == VERIFIED_FACTOR:
         return record
-    return record.but(status=rejudged(record, factor))
+    return record.but(verdict=rejudged(record, factor))
 
 
 def _apart(record: Record) -> Record:

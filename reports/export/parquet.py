@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from harness import Record
 from harness.files.durable import replacing
-from harness.record import FIELDS, finite
+from harness.record import JOURNAL, finite
 
 _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 
@@ -27,8 +27,8 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     is JSON text.
     """
     table = pa.table({
-        f.name: _column([getattr(r, f.name) for r in records], str(f.type))
-        for f in FIELDS
+        name: _column([getattr(r, f.name) for r in records], str(f.type))
+        for name, f in JOURNAL.items()
     })  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from harness import Record
-from harness.record import FIELDS, finite
+from harness.record import JOURNAL, finite
 from reports.document.figure import Figure
 from reports.document.formatting import VERDICTS, clean, tolerance
 from reports.document.layout import Cell, Page, Table, named, short
@@ -41,7 +41,7 @@ def details(records: Sequence[Record]) -> str:
     A column is a list of values, or, where few differ, these and their positions.
     """
     lines = [_as_journalled(r) for r in records]
-    columns = {f.name: [getattr(r, f.name) for r in lines] for f in FIELDS}
+    columns = {name: [getattr(r, f.name) for r in lines] for name, f in JOURNAL.items()}
     text = strict({name: _column(values) for name, values in columns.items()})
     return b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 
@@ -145,7 +145,7 @@ def _keys(records: Sequence[Record]) -> Data:
         "case": lambda r: clean(r.case),
         "tol": lambda r: tolerance(r.tol),
         "solver": lambda r: clean(r.solver, 40),
-        "status": lambda r: VERDICTS[r.status][1],
+        "status": lambda r: VERDICTS[r.verdict][1],
     }
     keys = {name: _coded([show(r) for r in records]) for name, show in shown.items()}
     return {"id": [short(r.run_id) for r in records], **keys}

@@ -70,7 +70,7 @@ def _made(evidence: Evidence) -> str:
 
     The journal holds one line for a case that a solver declined, whatever the repeats.
     """
-    made = sum(r.status is not Verdict.DECLINED for r in evidence.records)
+    made = sum(r.verdict is not Verdict.DECLINED for r in evidence.records)
     repeats = _repeats(evidence)
     declined = sum(o.verdict is Verdict.DECLINED for o in evidence.flat)
     cells = _cells(evidence)
@@ -177,11 +177,11 @@ def _counts(evidence: Evidence) -> Table:
     rows = []
     for solver in evidence.solvers:
         mine = [r for r in evidence.records if r.solver == solver]
-        count = Counter(r.status for r in mine)
+        count = Counter(r.verdict for r in mine)
         made = len(mine) - count[Verdict.DECLINED]
         row = [name_cell(solver), Cell(text=str(made), value=made)]
         for verdicts in _GROUPS.values():
-            those = [r for r in mine if r.status in verdicts]
+            those = [r for r in mine if r.verdict in verdicts]
             n = len(those)
             symbol, _ = VERDICTS[verdicts[0]]
             kind, symbol = (verdicts[0].value, symbol) if n else ("none", "")

@@ -82,7 +82,7 @@ def _charged(row: Mapping[str, Outcome], solvers: Sequence[str]) -> tuple[Cell, 
     own = charged.dualising
     assert own is not None
     totals = {s: o.with_dualising for s, o in row.items() if o.verified}
-    ranked = [t for s, t in totals.items() if t is not None and not row[s].first.arm]
+    ranked = [t for s, t in totals.items() if t is not None and not row[s].first.role]
     best = min((t.value for t in ranked), default=None)
     cells = []
     for solver in solvers:
@@ -139,7 +139,7 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
         return Cell(
             text=seconds(interval), after=words, kind="void", title=source(outcome)
         )
-    kind = "" if outcome.first.arm else _rank(interval, row)
+    kind = "" if outcome.first.role else _rank(interval, row)
     return Cell(
         text=seconds(interval),
         symbol="≈" if kind == "tied" else "",
@@ -152,7 +152,7 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
 def _rank(interval: Interval, row: Mapping[str, Outcome]) -> str:
     """Rank among the verified answers of a row; null arms do not compete."""
     rivals = [
-        o.seconds("total") for o in row.values() if o.verified and not o.first.arm
+        o.seconds("total") for o in row.values() if o.verified and not o.first.role
     ]
     fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
     overlaps = interval.low <= fastest.high and interval.samples > 1

@@ -25,7 +25,7 @@ def record(run_id="a", **changes):
     blank = Record(
         run_id=run_id, case="tiny/plain", family="tiny", params={"h": 1.0},
         form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
-        status=Verdict.VERIFIED,
+        verdict=Verdict.VERIFIED,
     )  # fmt: skip
     return blank.but(**changes)
 
@@ -129,7 +129,7 @@ def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
 
 
 def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(journal):
-    folder = journal(record("b"), record("a"), record("a", status=Verdict.WRONG))
+    folder = journal(record("b"), record("a"), record("a", verdict=Verdict.WRONG))
 
     with pytest.raises(InputError) as e:
         read_journal(folder)

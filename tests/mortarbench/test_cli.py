@@ -538,17 +538,21 @@ def test_wrong_input_is_one_line_with_the_remedy_and_exits_with_2(
 SUITE = "solvers = ['exact']\n[[problems]]\nfamily = 'well'\n"
 DEEP = "params = {{ depth = [{}] }}\n"
 DEEPER = """
-from dataclasses import replace
 from pathlib import Path
 from harness.registry import load_plugin
+
+well = load_plugin(Path({!r})).problems["well"]
+
+class Deeper:
+    name, defaults, forms = "deeper", well.defaults, well.forms
+    check, build = well.check, well.build
 
 class Nothing:
     name, defaults, forms = "nothing", {{}}, ("primal",)
     def build(self, form, params, reference):
         pass
 
-well = load_plugin(Path({!r})).problems["well"]
-PROBLEMS = {{"deeper": replace(well, name="deeper"), "nothing": Nothing()}}
+PROBLEMS = {{"deeper": Deeper(), "nothing": Nothing()}}
 """
 
 
@@ -633,7 +637,7 @@ def test_a_run_measures_in_workers_and_ends_in_a_summary_and_a_page(cli, pit):
     assert page == "out/pit/index.html"
     assert "12 measurements" in err.splitlines()
     assert err.splitlines()[-1].startswith("12/12 ")
-    statuses = {(r.solver, r.status) for r in read_journal(Path("out/pit"))}
+    statuses = {(r.solver, r.verdict) for r in read_journal(Path("out/pit"))}
     assert statuses == {
         ("times", "verified"), ("twice", "wrong"), ("near", "inaccurate")
     }  # fmt: skip

@@ -25,7 +25,7 @@ def command(*argv):
 def test_its_records_are_those_that_were_written(old):
     records = read_journal(old)
 
-    verdicts = [r.status for r in records if r.solver == "smalbe"]
+    verdicts = [r.verdict for r in records if r.solver == "smalbe"]
     assert verdicts.count(Verdict.VERIFIED) == 4  # two repeats of two dual forms
     assert verdicts.count(Verdict.DECLINED) == 1  # the primal has inequality rows
     assert {r.solver for r in records} == {"smalbe", "osqp", "clarabel", "proxqp"}
@@ -41,7 +41,7 @@ def test_its_answers_agree(old, capsys):
 
 
 def test_a_measurement_of_it_is_made_again(old, capsys):
-    (record, *_) = (r for r in read_journal(old) if r.status is Verdict.VERIFIED)
+    (record, *_) = (r for r in read_journal(old) if r.verdict is Verdict.VERIFIED)
 
     assert command("replay", old, record.run_id) == 0
     assert record.case in capsys.readouterr().out

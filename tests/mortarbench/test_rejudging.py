@@ -35,7 +35,7 @@ def record(claimed, found, tol, **changes):
     status = verdict(claimed, found, changes.get("accuracy") or tol)
     made = Record(
         run_id="r", case="box/dual", family="box", params={}, form="dual", sizes={},
-        solver="a", options={}, tol=tol, repeat=0, block=0, status=status,
+        solver="a", options={}, tol=tol, repeat=0, block=0, verdict=status,
         claimed=claimed.value, **found._asdict(),
     )  # fmt: skip
     return Record.from_json(made.but(**changes).to_json())
@@ -45,7 +45,7 @@ def record(claimed, found, tol, **changes):
 def test_at_ten_every_stored_status_comes_back(claimed, found, tol):
     stored = record(claimed, found, tol)
 
-    assert rejudged(stored, VERIFIED_FACTOR) is stored.status
+    assert rejudged(stored, VERIFIED_FACTOR) is stored.verdict
 
 
 @given(
@@ -87,21 +87,21 @@ def test_a_sweep_is_judged_at_its_accuracy_not_at_what_was_asked_for():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"status": Verdict.MEMORY_LIMIT},  # an answer, but beyond the limit
-        {"status": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
-        {"status": Verdict.TIME_LIMIT, "claimed": None},
+        {"verdict": Verdict.MEMORY_LIMIT},  # an answer, but beyond the limit
+        {"verdict": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
+        {"verdict": Verdict.TIME_LIMIT, "claimed": None},
     ],
 )
 def test_what_no_residual_decided_stands(changes, factor):
     stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).but(**changes)
 
-    assert rejudged(stored, factor) is changes["status"]
+    assert rejudged(stored, factor) is changes["verdict"]
 
 
 def test_an_answer_without_a_claim_of_success_keeps_the_name_of_its_failure():
     stored = record(Status.ITERATION_LIMIT, Residuals(0, 5e-6, 0, 0), 1e-6)
 
-    assert stored.status is Verdict.VERIFIED
+    assert stored.verdict is Verdict.VERIFIED
     assert rejudged(stored, 1) is Verdict.ITERATION_LIMIT
 
 
@@ -143,7 +143,7 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
     write_report(folder, ["parquet"], 0.1)
 
     assert pd.read_parquet(folder / "report/records.parquet").status[0] == "verified"
-    assert read_journal(folder)[0].status is Verdict.VERIFIED
+    assert read_journal(folder)[0].verdict is Verdict.VERIFIED
 
 
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
@@ -169,9 +169,9 @@ def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch)
                         (r.primal, r.dual, r.complementarity, r.gap))),
             r.tol,
         )
-        is r.status
+        is r.verdict
         for r in records
     }  # fmt: skip
 
     assert found == {True}
-    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.status for r in records}
+    assert {Verdict.VERIFIED, Verdict.DECLINED} < {r.verdict for r in records}

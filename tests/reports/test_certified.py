@@ -26,7 +26,7 @@ def record(solver="a", tol=1e-6, repeat=0, **changes):
         run_id=f"{solver}-{tol}-{repeat}-{changes.get('case', 'box/dual')}",
         case="box/dual", family="box", params={}, form="dual", sizes={},
         solver=solver, options={}, tol=tol, repeat=repeat, block=repeat,
-        status=Verdict.VERIFIED, claimed="solved", total_seconds=0.01, primal=1e-9,
+        verdict=Verdict.VERIFIED, claimed="solved", total_seconds=0.01, primal=1e-9,
         dual=1e-9, complementarity=1e-9, gap=1e-9, energy_bound=tol,
         started="2026-11-21T06:00:00.000+00:00",
     )  # fmt: skip
@@ -105,11 +105,11 @@ def test_two_tolerances_with_one_answer_are_one_point():
 @pytest.mark.parametrize(
     "ending",
     [
-        dict(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
-        dict(status=Verdict.TIME_LIMIT, claimed="time_limit"),
-        dict(status=Verdict.FAILED, claimed="failed"),
-        dict(status=Verdict.CRASHED, claimed=None, energy_bound=None),
-        dict(status=Verdict.MEMORY_LIMIT),
+        dict(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        dict(verdict=Verdict.TIME_LIMIT, claimed="time_limit"),
+        dict(verdict=Verdict.FAILED, claimed="failed"),
+        dict(verdict=Verdict.CRASHED, claimed=None, energy_bound=None),
+        dict(verdict=Verdict.MEMORY_LIMIT),
         dict(energy_bound=None),
     ],
 )
@@ -122,14 +122,14 @@ def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
 
 def test_one_repeat_that_failed_takes_the_point_away():
     records = sweep()
-    records[-1] = records[-1].but(status=Verdict.FAILED, claimed="failed")
+    records[-1] = records[-1].but(verdict=Verdict.FAILED, claimed="failed")
 
     assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
 
 
 def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
     """The loose end of a sweep that is judged at a strict accuracy."""
-    refuted = [r.but(status=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
+    refuted = [r.but(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
     assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
 
@@ -209,7 +209,7 @@ def test_intervals_that_overlap_are_marked_at_matched_errors(page):
 
 
 def test_a_null_arm_does_not_compete_at_matched_errors(page):
-    null = sweep("a null", lambda tol: 0.5e-3 * tol**-0.25, repeats=6, arm="null")
+    null = sweep("a null", lambda tol: 0.5e-3 * tol**-0.25, repeats=6, role="null")
     found, *_ = tables(page([*sweep(repeats=6), *null]), "accuracy")
 
     assert {row["a"].kind for row in found} == {"best"}
@@ -220,7 +220,7 @@ def test_the_table_says_why_there_is_no_time(page):
     direct = sweep("direct", repeats=2, energy_bound=1e-12)
     weak = [r for r in sweep("weak") if r.tol > 1e-5]
     none = dict(claimed="declined", energy_bound=None, total_seconds=None)
-    refusing = [record("c", tol, status=Verdict.DECLINED, **none) for tol in TOLS]
+    refusing = [record("c", tol, verdict=Verdict.DECLINED, **none) for tol in TOLS]
     found, *_ = tables(page([*sweep(), *direct, *weak, *refusing]), "accuracy")
     last = found[-1]
 
@@ -257,7 +257,7 @@ def test_two_tolerances_are_no_sweep(page):
 
 def test_the_curve_joins_what_counts_and_the_rest_is_hollow():
     records = [
-        r.but(claimed="iteration_limit", status=Verdict.ITERATION_LIMIT)
+        r.but(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-8 else r
         for r in sweep()
     ]  # fmt: skip
@@ -314,7 +314,7 @@ def test_answers_that_never_are_good_enough_have_no_price(page):
 
 def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
     records = [
-        r.but(claimed="iteration_limit", status=Verdict.ITERATION_LIMIT)
+        r.but(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-4 else r
         for r in sweep()
     ]  # fmt: skip

@@ -36,7 +36,7 @@ def measured():
             form=form, sizes={"variables": 14, "equalities": 3, "inequalities": 0,
                               "bounds": 10},
             solver=solver, options={}, tol=1e-8, repeat=repeat, block=repeat,
-            status=Verdict.VERIFIED, claimed="solved", iterations=7,
+            verdict=Verdict.VERIFIED, claimed="solved", iterations=7,
             prepare_seconds=0.001, solve_seconds=0.002, total_seconds=0.003,
             primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11,
             quantities=ELASTIC, environment="abc",
@@ -166,7 +166,7 @@ def test_physical_results_are_those_of_the_smallest_residual_and_say_whose(
         measured("tight", dual=9e-9, quantities=ELASTIC | {"tip": [1.0, 1.0]}),
         measured("best", tol=1e-6, dual=3e-9, quantities=ELASTIC | {"tip": [2.0, 2.0]}),
         measured("liar", dual=0.0, primal=0.0, gap=0.0, complementarity=0.0,
-                 status=Verdict.WRONG),
+                 verdict=Verdict.WRONG),
     ]  # fmt: skip
     (row,) = rows(section(page(records), "physics").tables[1])
     assert row["tip x in m"].value == 2.0
@@ -177,7 +177,7 @@ def test_active_rows_on_which_answers_differ_are_a_range(measured, page):
     records = [
         measured("a", quantities=ELASTIC | {"active": 5}),
         measured("b", dual=1e-9, quantities=ELASTIC | {"active": 6}),
-        measured("c", quantities=ELASTIC | {"active": 9}, status=Verdict.WRONG),
+        measured("c", quantities=ELASTIC | {"active": 9}, verdict=Verdict.WRONG),
     ]
     table = section(page(records), "physics").tables[1]
     assert rows(table)[0]["active"].text == "5–6"
@@ -201,7 +201,7 @@ def test_one_sign_means_one_thing(measured, page):
     times = {"fast": (1, 2, 3), "tied": (2, 3, 4), "bad": (1, 2, 3)}
     records = [
         measured(s, i, total_seconds=t / 1000,
-                 status=Verdict.INACCURATE if s == "bad" else Verdict.VERIFIED)
+                 verdict=Verdict.INACCURATE if s == "bad" else Verdict.VERIFIED)
         for s, ts in times.items() for i, t in enumerate(ts)
     ]  # fmt: skip
     made = page(records)
@@ -220,7 +220,7 @@ def test_a_busy_machine_is_flagged_in_the_summary(measured, page, load, said):
 def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
     three = [measured("a", i) for i in range(3)]
     ten = [measured("b", i) for i in range(10)]
-    declined = [measured("c", status=Verdict.DECLINED)]
+    declined = [measured("c", verdict=Verdict.DECLINED)]
     equal = " ".join(section(page(three + declined), "summary").prose)
     assert "unequal" not in equal
     assert "3 to 10" in " ".join(section(page(three + ten), "summary").prose)
@@ -229,7 +229,7 @@ def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
 def test_what_a_solver_declined_is_no_measurement(measured, page):
     records = [
         *(measured("a", i) for i in range(3)),
-        measured("shy", status=Verdict.DECLINED, total_seconds=None),
+        measured("shy", verdict=Verdict.DECLINED, total_seconds=None),
     ]
     made = section(page(records, suite={"repeats": 3}), "summary")
     assert made.prose[0].startswith(
@@ -253,7 +253,7 @@ def test_the_energy_bound_is_explained_only_where_there_is_one(measured, page):
 
 def test_where_no_answer_has_a_point_there_is_no_table_of_residuals(measured, page):
     none = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
-    lost = measured(status=Verdict.CRASHED, claimed=None, **none)
+    lost = measured(verdict=Verdict.CRASHED, claimed=None, **none)
     found = section(page([lost]), "errors")
 
     assert found.tables == ()
@@ -342,10 +342,10 @@ def test_a_wide_table_says_that_it_scrolls_and_keeps_its_first_column(
 def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
     records = [
         measured("sound"),
-        measured("hasty", status=Verdict.INACCURATE, gap=3e-6, message="Optimal"),
-        measured("blind", status=Verdict.INFEASIBLE_CLAIM, claimed="infeasible",
+        measured("hasty", verdict=Verdict.INACCURATE, gap=3e-6, message="Optimal"),
+        measured("blind", verdict=Verdict.INFEASIBLE_CLAIM, claimed="infeasible",
                  primal=None, dual=None, complementarity=None, gap=None),
-        measured("modest", status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        measured("modest", verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
     ]  # fmt: skip
     _, refuted = section(page(records), "verdicts").tables
     listed = {row["solver"].text: row for row in rows(refuted)}
@@ -376,7 +376,7 @@ def test_what_an_accuracy_allows_is_what_the_table_of_refuted_claims_says(
 ):
     """Asked for 1e-4, judged at 1e-6: a residual of 5e-5 is above 1e-5."""
     record = measured(
-        tol=1e-4, accuracy=1e-6, gap=5e-5, status=Verdict.INACCURATE, primal=0.0
+        tol=1e-4, accuracy=1e-6, gap=5e-5, verdict=Verdict.INACCURATE, primal=0.0
     )
     tables = [table for part in page([record]).sections for table in part.tables]
     (row,) = (r for table in tables for r in rows(table) if "evidence" in r)

@@ -40,7 +40,7 @@ def report(tmp_path_factory):
                     run_id=f"{i}-{size}{name}", case=f"{name}/{size}", family=name,
                     params={name: size}, form=name, sizes={"variables": size},
                     solver=name, options={name: name}, tol=1e-6, repeat=0, block=0,
-                    status=Verdict.WRONG if i % 2 else Verdict.VERIFIED, claimed=name,
+                    verdict=Verdict.WRONG if i % 2 else Verdict.VERIFIED, claimed=name,
                     message=name, iterations=size, counts={name: 3},
                     total_seconds=size / 1e4, primal=1e-9, dual=1e-9, gap=1e-9,
                     complementarity=1e-9, quantities={"dofs": size, name: name},

@@ -54,7 +54,7 @@ def write(folder, answers, tol=1e-8):
         for label, text, answer in answers:
             record = record_of(text, label, tol)
             if isinstance(answer, Verdict):
-                journal.append(record.but(status=answer, message="as it ended"))
+                journal.append(record.but(verdict=answer, message="as it ended"))
                 continue
             case = cases.setdefault(text, built(text))
             record = record.but(qp=qp_digest(case.qp, serialised=True))
@@ -705,7 +705,7 @@ def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
     folder = write(tmp_path / "out", [("exact", text, exact)])
     with Journal(folder, "there") as journal:
         old = record_of(text, "old").but(params={"size": 3}, case="obstacle/size=3/x")
-        journal.append(old.but(status=Verdict.FAILED))
+        journal.append(old.but(verdict=Verdict.FAILED))
 
     assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
         "obstacle/dim=1/n=12"

@@ -115,7 +115,7 @@ def beside_a_witness(tmp_path_factory):
         name = secrets.token_hex(8)
         patch.setenv("ATTACKED", name)
         bench = Bench(tmp_path_factory.mktemp("attacks"))
-        assert bench("witness").status is Verdict.VERIFIED
+        assert bench("witness").verdict is Verdict.VERIFIED
         alone = left(name)
 
         def measured_beside(attacker, time_limit):
@@ -123,7 +123,7 @@ def beside_a_witness(tmp_path_factory):
             try:
                 record = bench(attacker, time_limit=time_limit)
                 assert len(set(left(name)) - set(alone)) in (0, 2)  # worker, sub-reaper
-                assert bench("witness").status is Verdict.VERIFIED
+                assert bench("witness").verdict is Verdict.VERIFIED
                 return record
             finally:
                 bench.workers.pop(attacker).close()
@@ -212,7 +212,7 @@ def test_an_attack_costs_its_own_verdict_and_nothing_of_it_is_left(
     hangs = verdict is Verdict.TIME_LIMIT
     record = beside_a_witness(attacker, 1.0 if hangs else 30.0)
 
-    assert record.status is verdict, record.message
+    assert record.verdict is verdict, record.message
     assert re.search(message, record.message), record.message
     assert len(record.message) < 500
 
@@ -334,10 +334,10 @@ def check_neighbours(tmp_path, attacked, attackers):
     got = attack(tmp_path, "witness", *attackers, "honest")
 
     for neighbour in ("witness", "honest"):
-        found = [(r.status, r.message) for r in got[neighbour]]
+        found = [(r.verdict, r.message) for r in got[neighbour]]
         assert found == [(Verdict.VERIFIED, "")] * 2
     for attacker in attackers:
-        assert {r.status for r in got[attacker]} == {OUTCOMES[attacker][0]}
+        assert {r.verdict for r in got[attacker]} == {OUTCOMES[attacker][0]}
     assert left(attacked) == []
 
 
@@ -399,7 +399,7 @@ def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
     record = bench("killedoncewarmingup")
 
     assert (tmp_path / "killed").exists()
-    assert record.status is Verdict.VERIFIED
+    assert record.verdict is Verdict.VERIFIED
     assert record.threads is not None  # told by the warm-up
 
 
@@ -414,7 +414,7 @@ def test_a_kill_for_want_of_memory_is_the_solvers_where_it_held_the_memory(
         with pytest.raises(FaultError, match="SIGKILL: the machine ran out of memory"):
             bench("killsitself")
     else:
-        assert bench("killsitself").status is Verdict.MEMORY_LIMIT
+        assert bench("killsitself").verdict is Verdict.MEMORY_LIMIT
 
 
 def test_a_command_that_does_not_exist_is_a_fault(bench):
@@ -425,7 +425,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
 def test_a_plug_in_that_dies_of_its_import_fails_by_itself(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
-    assert record.status is Verdict.CRASHED
+    assert record.verdict is Verdict.CRASHED
 
 
 def test_a_log_that_cannot_be_written_is_a_fault(bench, tmp_path):
@@ -462,7 +462,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     bench("honest")
     os.kill(bench.process("honest"), signal.SIGKILL)
 
-    assert bench("honest").status is Verdict.VERIFIED
+    assert bench("honest").verdict is Verdict.VERIFIED
 
 
 RUNS = f"""

@@ -19,7 +19,7 @@ def record(run_id, **changes):
     blank = Record(
         run_id=run_id, case="tiny/plain", family="tiny", params={"h": 1.0},
         form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
-        status=Verdict.VERIFIED,
+        verdict=Verdict.VERIFIED,
     )  # fmt: skip
     return blank.but(**changes)
 
@@ -29,7 +29,7 @@ def ids(folder):
 
 
 def test_what_is_appended_is_read_back_in_order(tmp_path):
-    first, second = record("a", gap=1e-9), record("b", status=Verdict.WRONG)
+    first, second = record("a", gap=1e-9), record("b", verdict=Verdict.WRONG)
     with Journal(tmp_path, "here") as journal:
         journal.append(first)
         journal.append(second)
@@ -152,7 +152,7 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
     old, new = read_journal(tmp_path)
 
     assert (old.schema, new.schema) == (1, 2)
-    assert (old.primal, old.status) == (new.primal, new.status)
+    assert (old.primal, old.verdict) == (new.primal, new.verdict)
     assert json.loads(old.to_json())["schema"] == 1
 
 

@@ -92,7 +92,7 @@ def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, sol
     assert code == 0
     assert told["reproduced"] is True
     assert told["now"]["run_id"] == told["then"]["run_id"] == then.run_id
-    assert told["now"]["status"] == then.status
+    assert told["now"]["status"] == then.verdict
     assert (told["same_qp"], told["same_options"], told["same_counts"]) == (True,) * 3
     assert told["environment"] == []
 

@@ -118,7 +118,7 @@ def cli(capsys, monkeypatch, tmp_path):
 def measured(folder):
     """Every run_id in a journal with its verdict; fails on one that is there twice."""
     records = read_journal(Path(folder))
-    found = {r.run_id: r.status for r in records}
+    found = {r.run_id: r.verdict for r in records}
     assert len(found) == len(records)
     return found
 

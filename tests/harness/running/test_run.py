@@ -163,7 +163,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
     for case in ("tiny/h=0.5/plain", "tiny/plain"):
         got = {r.solver: r for r in records if r.case == case}
         for solver, (status, claimed, message) in OUTCOMES.items():
-            assert got[solver].status == status, (solver, case)
+            assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
             assert message in (None, got[solver].message)
 
@@ -189,7 +189,7 @@ def test_a_verified_record_holds_what_was_measured_and_what_the_case_says(
 def test_the_answer_to_another_problem_is_wrong(measure, tmp_path):
     measure(suite("answersanotherproblem", cases=[{"h": 0.5}, {"h": 1.0}]))
 
-    verdicts = [r.status for r in read_journal(tmp_path)]
+    verdicts = [r.verdict for r in read_journal(tmp_path)]
     assert verdicts == [Verdict.VERIFIED, Verdict.WRONG]
 
 
@@ -198,9 +198,13 @@ def test_a_record_tells_its_phases_and_where_it_was_measured(measure, tmp_path):
     got = {r.solver: r for r in read_journal(tmp_path)}
 
     quick, slow = got["honest"], got["sleeps"]
-    assert (slow.inner, slow.threads, slow.cpu) == (1, 1, max(os.sched_getaffinity(0)))
+    assert (slow.inner_loops, slow.threads, slow.cpu) == (
+        1,
+        1,
+        max(os.sched_getaffinity(0)),
+    )
     assert slow.solve_seconds >= 0.02
-    assert quick.inner > 1  # far below a millisecond
+    assert quick.inner_loops > 1  # far below a millisecond
     assert quick.total_seconds < 0.001
     assert min(quick.build_seconds, quick.recover_seconds, quick.canary_seconds) > 0
     assert quick.dualise_seconds is None
@@ -219,7 +223,7 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
 
     assert tally.total == len(records) == 12
     assert {r.mode for r in records} == {"sequence"}
-    assert {r.status for r in records} == {Verdict.VERIFIED}
+    assert {r.verdict for r in records} == {Verdict.VERIFIED}
     for repeat in (0, 1):
         chain = [r for r in records if (r.solver, r.repeat) == ("chains", repeat)]
         assert [(r.params["h"], r.iterations) for r in chain] == [
@@ -244,7 +248,7 @@ def test_a_sequence_that_breaks_says_where(measure, tmp_path):
     measure(three_steps("breaksitschain"))
 
     records = read_journal(tmp_path)
-    assert [r.status for r in records] == [
+    assert [r.verdict for r in records] == [
         Verdict.VERIFIED, Verdict.CRASHED, Verdict.CRASHED,
     ]  # fmt: skip
     assert records[2].message == "the sequence ended at tiny/plain: exit code 9"
@@ -265,7 +269,7 @@ def test_answers_of_a_sweep_are_judged_at_one_accuracy(measure, tmp_path):
     measure(sweep)
 
     records = read_journal(tmp_path)
-    assert {(r.tol, r.accuracy, r.solver, r.status) for r in records} == {
+    assert {(r.tol, r.accuracy, r.solver, r.verdict) for r in records} == {
         (0.1, 1e-6, "honest", Verdict.VERIFIED), (0.1, 1e-6, "zero", Verdict.WRONG),
         (1e-8, 1e-6, "honest", Verdict.VERIFIED), (1e-8, 1e-6, "zero", Verdict.WRONG),
     }  # fmt: skip
@@ -292,7 +296,7 @@ def test_a_damaged_case_on_disk_is_built_again(measure, tmp_path):
     built.write_bytes(whole[:-3] + b"bad")
     measure(suite("honest", repeats=2))
 
-    assert [r.status for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
+    assert [r.verdict for r in read_journal(tmp_path)] == [Verdict.VERIFIED] * 2
     assert built.read_bytes() == whole
 
 
@@ -309,7 +313,7 @@ def test_a_multiplier_of_the_wrong_sign_is_wrong(measure, tmp_path):
     measure(suite("honest", cases=[{"h": 3.0}]))
     (r,) = read_journal(tmp_path)
 
-    assert (r.status, r.claimed) == (Verdict.WRONG, "solved")
+    assert (r.verdict, r.claimed) == (Verdict.WRONG, "solved")
     assert r.primal == r.complementarity == r.gap == 0 < r.dual
     assert r.vectors is not None
     assert r.fields is None
@@ -463,7 +467,7 @@ def test_what_a_case_cannot_evaluate_costs_a_note(measure, tmp_path, fault, note
     measure(suite("honest", cases=[{"fault": fault}]))
     (r,) = read_journal(tmp_path)
 
-    assert (r.status, r.message) == (Verdict.VERIFIED, note)
+    assert (r.verdict, r.message) == (Verdict.VERIFIED, note)
     assert r.vectors is not None
 
 
@@ -620,7 +624,7 @@ def test_what_is_deleted_during_a_run_costs_no_measurement(measure, tmp_path, lo
 
     records = once_each(tmp_path, 4)
     assert (len(tally.records), tally.skipped, tally.total) == (4, 0, 4)
-    assert {r.solver: r.status for r in records} == {
+    assert {r.solver: r.verdict for r in records} == {
         "honest": Verdict.VERIFIED, "zero": Verdict.WRONG,
     }  # fmt: skip
     assert tally.faults == []
@@ -676,7 +680,7 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
 
     assert said == {"free some space, and the same command continues"}
     records = once_each(tmp_path, 2)
-    assert {r.status for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
+    assert {r.verdict for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
     assert writes > 6  # suite and environment alone are four
 
 
@@ -698,7 +702,7 @@ def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, siz
     assert read_journal(tmp_path) == []
 
     measure(whole)
-    assert {r.status for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
+    assert {r.verdict for r in once_each(tmp_path, 2)} == {Verdict.VERIFIED}
 
 
 @pytest.fixture

@@ -446,7 +446,7 @@ def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():
     paper = shipped("paper")
 
     assert len(paper.cases) == 30
-    assert [(s.label, s.arm) for s in paper.solvers if s.name == "smalbe"] == [
+    assert [(s.label, s.role) for s in paper.solvers if s.name == "smalbe"] == [
         ("smalbe", ""), ("smalbe (A/A)", "null"),
     ]  # fmt: skip
     assert (paper.precision, paper.max_repeats) == (0.1, 15)

@@ -263,8 +263,13 @@ def test_the_same_point_is_certified_once_and_another_one_anew(tmp_path, monkeyp
 
     monkeypatch.setattr(generator, "certified", counted)
     name = parse("beam-ring/Nr=4/Nh=3/step=1/dual", PROBLEMS)
-    of = {"family": name.family.name, "params": dict(name.params), "form": name.form}
-    at = {"describe": of, "point": str(tmp_path / "s.npz"), "fields": None, "keep": 1}
+    of = {"family": "beam-ring", "params": dict(name.params), "form": name.form}
+    at = {
+        "describe": {**of, "name": str(name)},
+        "point": str(tmp_path / "s.npz"),
+        "fields": None,
+        "keep": 1,
+    }
     made = generator.CaseWorker(PROBLEMS, reference_solution)
     qp = name.build(reference_solution).qp
     s = SOLVERS["clarabel"].prepare(qp, 1e-8)()

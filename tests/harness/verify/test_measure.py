@@ -79,7 +79,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
     assert (m.prepare_seconds, m.solve_seconds) == pytest.approx((0.001, 0.004))
     assert m.total_seconds == pytest.approx(0.005)
-    assert m.inner == (20 if sample_seconds else 1)
+    assert m.inner_loops == (20 if sample_seconds else 1)
     assert now[0] == pytest.approx(0.105 if sample_seconds else 0.005)
 
 

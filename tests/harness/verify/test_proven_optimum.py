@@ -144,7 +144,7 @@ def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
 
     measured = judged(new_record(), WEAK, SHORT, proves(reference_solution))
 
-    assert measured.status is Verdict.WRONG
+    assert measured.verdict is Verdict.WRONG
     assert measured.decided_by == "reference"
     assert measured.optimum_error == pytest.approx(0.025, rel=1e-3)  # ½ of 10·E, E = 2
     again = Record.from_json(measured.to_json())
@@ -155,7 +155,7 @@ def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
 def new_record(**changes):
     return Record(
         run_id="r", case="c/f", family="c", params={}, form="f", sizes={}, solver="s",
-        options={}, tol=TOL, repeat=0, block=0, status=Verdict.FAILED, **changes,
+        options={}, tol=TOL, repeat=0, block=0, verdict=Verdict.FAILED, **changes,
     )  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def test_an_answer_is_judged_at_the_accuracy_that_is_not_its_tolerance(
     s = at([1.001])
     measured = judged(new_record(accuracy=accuracy), qp_of([1], [-1]), s)
 
-    assert (measured.status is Verdict.VERIFIED) is expected
+    assert (measured.verdict is Verdict.VERIFIED) is expected
     assert measured.decided_by == "residuals"
 
 
@@ -180,7 +180,7 @@ def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
 
     measured = judged(new_record(), qp, broken, proves(reference_solution))
 
-    assert measured.status is Verdict.WRONG
+    assert measured.verdict is Verdict.WRONG
 
 
 def test_where_the_reference_fails_residuals_stand():
@@ -239,10 +239,10 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
 def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
     stored = new_record(decided_by="reference", optimum_error=5e-8).but(
         claimed="solved", primal=1e-6, dual=0.0, complementarity=0.0, gap=0.0,
-        status=verdict(Status.SOLVED, Residuals(1e-6, 0, 0, 0), TOL, error=5e-8),
+        verdict=verdict(Status.SOLVED, Residuals(1e-6, 0, 0, 0), TOL, error=5e-8),
     )  # fmt: skip
 
-    assert stored.status is Verdict.VERIFIED
+    assert stored.verdict is Verdict.VERIFIED
     assert rejudged(stored, 10) is Verdict.VERIFIED
     assert rejudged(stored, 1) is Verdict.INACCURATE
 

@@ -71,14 +71,14 @@ def test_what_was_declined_is_declined_and_has_no_residuals():
     answer = Solution.without_point(QP_, Status.DECLINED, "bounds only")
     got = judged(record(), QP_, answer)
 
-    assert (got.status, got.claimed) == (Verdict.DECLINED, "declined")
+    assert (got.verdict, got.claimed) == (Verdict.DECLINED, "declined")
     assert (got.message, got.objective) == ("bounds only", None)
 
 
 def test_a_solution_is_verified_and_has_its_objective():
     got = judged(record(), QP_, POINT)
 
-    assert got.status is Verdict.VERIFIED
+    assert got.verdict is Verdict.VERIFIED
     assert got.objective == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
 
 
@@ -90,7 +90,7 @@ def test_the_accuracy_of_a_suite_goes_before_the_tolerance(tol, accuracy, is_rig
     near = replace(POINT, x=POINT.x + np.array([-1e-3, 1e-3]))
     got = judged(record(tol, accuracy=accuracy), QP_, near)
 
-    assert (got.status is Verdict.VERIFIED) == is_right
+    assert (got.verdict is Verdict.VERIFIED) == is_right
 
 
 @pytest.mark.parametrize("name", ["x", "y", "z", "z_box"])

@@ -32,7 +32,7 @@ def record(solver="one", case=0, repeat=0, **changes):
         run_id=f"{solver}-{case}-{repeat}", case=f"box/n={case}/dual", family="box",
         params={"n": case}, form="dual", sizes={"variables": 10 + case}, solver=solver,
         options={"max_iter": 100}, tol=1e-6, repeat=repeat, block=repeat,
-        status=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.01,
+        verdict=Verdict.VERIFIED, claimed="solved", iterations=7, total_seconds=0.01,
         primal=1e-9, dual=2e-9, complementarity=3e-10, gap=4e-11, objective=-0.5,
         quantities={"energy": -1234.5}, qp="abc", environment="e1",
         canary_seconds=1e-5, started="2026-11-21T10:00:00+00:00",
@@ -204,7 +204,7 @@ def test_only_repeats_that_both_have_are_paired(changed):
 
 def test_an_unverified_answer_has_no_time_to_compare(changed):
     before = [record(repeat=i) for i in range(3)]
-    after = [r.but(status=Verdict.WRONG, total_seconds=1e-6) for r in before]
+    after = [r.but(verdict=Verdict.WRONG, total_seconds=1e-6) for r in before]
     c = changed(before, after)
 
     assert only(c).ratio is None
@@ -238,7 +238,7 @@ def test_a_solver_is_not_set_against_its_own_null_arm(changed):
     def run(seed, **slower):
         first = [r for r in suite(seed, **slower) if r.solver != "three"]
         twin = [
-            replace(r, solver="one (A/A)", run_id=f"null-{r.run_id}", arm="null")
+            replace(r, solver="one (A/A)", run_id=f"null-{r.run_id}", role="null")
             for r in first
             if r.solver == "one"
         ]
@@ -370,7 +370,7 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
 def test_lost_verdicts_are_worse_and_named_first(changed):
     before = suite(1, cases=2, repeats=3)
     after = [
-        r.but(status=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
+        r.but(verdict=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
         for r in suite(2, cases=2, repeats=3, three=3.0)
     ]
     c = changed(before, after)
@@ -407,7 +407,7 @@ def test_iterations_changed_if_no_repeat_agrees(changed, before, after, changed_
     ],
 )
 def test_verified_answers_that_differ_are_named(changed, energy, status, other):
-    after = record(quantities={"energy": energy}, status=status)
+    after = record(quantities={"energy": energy}, verdict=status)
     c = changed([record()], [after])
 
     assert only(c).other_answer is other

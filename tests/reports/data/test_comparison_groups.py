@@ -29,7 +29,7 @@ def record():
         defaults = dict(
             run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
             params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
-            repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
+            repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
             iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
             complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
         )  # fmt: skip
@@ -100,7 +100,7 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
     ]
     records += [
         record("b", case, 0.1, repeat,
-               status=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
+               verdict=Verdict.WRONG if (case, repeat) == (3, 1) else Verdict.VERIFIED,
                claimed="failed" if (case, repeat) == (5, 2) else "solved")
         for case in range(6)
         for repeat in range(3)
@@ -112,7 +112,7 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
 
 
 def test_null_arms_do_not_take_part(record, evidence):
-    null = [record("a (A/A)", case, 1e-4, arm="null") for case in range(6)]
+    null = [record("a (A/A)", case, 1e-4, role="null") for case in range(6)]
     (found,) = comparison_groups(evidence([*some_records(record, 2), *null]))
     assert found.solvers == ("s00", "s01")
 
@@ -121,7 +121,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     record, evidence
 ):
     def declined(solver, case):
-        return record(solver, case, None, status=Verdict.DECLINED, claimed=None)
+        return record(solver, case, None, verdict=Verdict.DECLINED, claimed=None)
 
     records = some_records(record, 2)
     records += [declined("never", case) for case in range(6)]
@@ -150,7 +150,7 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
 def test_of_a_sweep_the_cheapest_verified_answer_counts(record, evidence):
     records = [
         record(s, case, seconds * (2 if s == "b" else 1), tol=tol, accuracy=1e-6,
-               status=status)
+               verdict=status)
         for s in "ab"
         for case in range(6)
         for tol, seconds, status in (
@@ -166,10 +166,12 @@ def test_of_a_sweep_the_cheapest_verified_answer_counts(record, evidence):
 
 def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
     ends = {
-        0: dict(seconds=None, status=Verdict.TIME_LIMIT, claimed=None),
-        1: dict(seconds=7.0, status=Verdict.TIME_LIMIT, claimed="time_limit"),
-        2: dict(seconds=0.1, status=Verdict.WRONG),
-        3: dict(seconds=0.1, status=Verdict.ITERATION_LIMIT, claimed="iteration_limit"),
+        0: dict(seconds=None, verdict=Verdict.TIME_LIMIT, claimed=None),
+        1: dict(seconds=7.0, verdict=Verdict.TIME_LIMIT, claimed="time_limit"),
+        2: dict(seconds=0.1, verdict=Verdict.WRONG),
+        3: dict(
+            seconds=0.1, verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit"
+        ),
     }
     records = some_records(record, 1)
     records += [record("b", case, **ends.get(case, {})) for case in range(6)]
@@ -183,7 +185,7 @@ def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
 
 
 def test_a_cell_that_was_late_once_is_late(record, evidence):
-    late = dict(status=Verdict.TIME_LIMIT, claimed=None, seconds=None)
+    late = dict(verdict=Verdict.TIME_LIMIT, claimed=None, seconds=None)
     records = some_records(record, 2)
     records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
     records += [record("z", 2, repeat=2, **late)]
@@ -207,7 +209,7 @@ def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
 def test_few_cases_that_both_solved_make_no_ratio(record, evidence):
     some = [
         record(
-            "some", case, 1.0, status=Verdict.WRONG if case > 4 else Verdict.VERIFIED
+            "some", case, 1.0, verdict=Verdict.WRONG if case > 4 else Verdict.VERIFIED
         )
         for case in range(8)
     ]
@@ -218,7 +220,7 @@ def test_few_cases_that_both_solved_make_no_ratio(record, evidence):
 
 
 def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
-    bad = [record("bad", case, status=Verdict.WRONG) for case in range(6)]
+    bad = [record("bad", case, verdict=Verdict.WRONG) for case in range(6)]
     page = compose(evidence([*some_records(record, 2), *bad]))
     cells = rows(section(page, "means").tables[0])["bad"]
     assert cells["mean"].text == cells["mean up to the limit"].text == "none solved"
@@ -227,7 +229,7 @@ def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
 
 
 def test_a_liar_is_named_as_depending_on_the_convention(record, evidence):
-    liar = [record("liar", case, 1e-4, status=Verdict.WRONG) for case in range(6)]
+    liar = [record("liar", case, 1e-4, verdict=Verdict.WRONG) for case in range(6)]
     found = section(compose(evidence([*some_records(record, 2), *liar])), "ranking")
     cells = rows(found.tables[0])
     assert cells["liar"]["rank"].value == 3
@@ -350,7 +352,7 @@ def test_ratios_that_hold_one_are_ties(record, evidence):
     noise = [1.1, 0.9, 1.05, 0.97]
     records = [record("a", 0, 0.01, i) for i in range(4)]
     records += [record("b", 0, 0.0101 * e, i) for i, e in enumerate(noise)]
-    records += [record("c", 0, 0.001, i, status=Verdict.WRONG) for i in range(4)]
+    records += [record("c", 0, 0.001, i, verdict=Verdict.WRONG) for i in range(4)]
     (row,) = section(compose(evidence(records)), "ratios").tables[0].rows
     assert [cell.kind for cell in row[2:]] == ["best", "tied", ""]
     assert row[-1].value is None
@@ -396,10 +398,10 @@ def test_three_sizes_have_no_section_on_growth(record, evidence):
 def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
     ends = [
         dict(),
-        dict(status=Verdict.WRONG),
-        dict(status=Verdict.VERIFIED, claimed="failed"),
-        dict(status=Verdict.TIME_LIMIT, claimed=None),
-        dict(status=Verdict.DECLINED, claimed=None),
+        dict(verdict=Verdict.WRONG),
+        dict(verdict=Verdict.VERIFIED, claimed="failed"),
+        dict(verdict=Verdict.TIME_LIMIT, claimed=None),
+        dict(verdict=Verdict.DECLINED, claimed=None),
     ]
     records = [record("a", case, **end) for case, end in enumerate(ends)]
     (table,) = section(compose(evidence(records)), "tally").tables
@@ -410,7 +412,7 @@ def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
 
 def test_one_refuted_repeat_refutes_the_claim(record, evidence):
     records = [record("a", 0, repeat=i) for i in range(3)]
-    records[1] = records[1].but(status=Verdict.INACCURATE)
+    records[1] = records[1].but(verdict=Verdict.INACCURATE)
     (table,) = section(compose(evidence(records)), "tally").tables
     assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
 
@@ -458,7 +460,7 @@ def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
 
 def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
     records = some_records(record, 2)
-    records[0] = records[0].but(status=Verdict.WRONG)
+    records[0] = records[0].but(verdict=Verdict.WRONG)
     sheet = csv_tables(evidence(records))["contests"]
     by_cell = sheet.set_index(["case", "solver"])
     assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}

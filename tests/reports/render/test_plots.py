@@ -46,7 +46,7 @@ def record(run_id, solver="b"):
     return Record(
         run_id=run_id, case="c", family="f", params={}, form="", sizes={},
         solver=solver, options={}, tol=1e-6, repeat=0, block=0,
-        status=Verdict.VERIFIED,
+        verdict=Verdict.VERIFIED,
     )  # fmt: skip
 
 
