@@ -41,7 +41,7 @@ class Answer:
     @property
     def verdict(self) -> Verdict:
         """Our judgement, whatever the solver claimed."""
-        return self.record.status
+        return self.record.verdict
 
     @property
     def residuals(self) -> Residuals | None:

@@ -115,14 +115,14 @@ def in_words(record: Record) -> str:
     """Say in a line what came of a measurement."""
     seconds = record.total_seconds
     took = "" if seconds is None else f" in {seconds:.3g} s"
-    if record.status is Verdict.DECLINED and record.message:
+    if record.verdict is Verdict.DECLINED and record.message:
         took = f": {record.message[:_REASON]}"
-    return f"{record.solver} on {record.case}: {record.status}{took}"
+    return f"{record.solver} on {record.case}: {record.verdict}{took}"
 
 
 def stands_out(record: Record) -> bool:
     """Whether a measurement is worth a line above a bar: it was not verified."""
-    return record.status not in (Verdict.VERIFIED, Verdict.DECLINED)
+    return record.verdict not in (Verdict.VERIFIED, Verdict.DECLINED)
 
 
 class _Bar(_State):

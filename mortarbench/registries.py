@@ -25,8 +25,8 @@ from solvers import SOLVERS
 
 if TYPE_CHECKING:
     from harness.crossval.discretisation import Discretisation
+    from harness.operators import Maker
     from harness.qp import QP
-    from harness.recipe import Maker
     from harness.results.work_unit import Commands
     from harness.solution import Solution
 
@@ -86,7 +86,7 @@ class Registries:
     reference: Reference = reference
     report: Reporter = _report
     validation_page: ValidationPage = _validation_page
-    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.recipe`
+    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.operators`
     #: those of them that did not come in a file
     own_operators: Mapping[str, Maker] = field(default_factory=dict)
     suites: Path = field(default_factory=suites_folder)
@@ -149,7 +149,7 @@ class Registries:
         request = {"plugins": self._absolute_files()}
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
-            generator=[*self.start, "generator", json.dumps(request)],
+            case_worker=[*self.start, "generator", json.dumps(request)],
         )
 
     def environment(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from harness.errors import FaultError, InputError
 from harness.files.store import Arrays, digest_of, load_solution, point_arrays
 from harness.record import Record, finite
 from harness.results.folder import differences
-from harness.results.stored_run import StoredRun, block_of, open_capsule
+from harness.results.stored_run import StoredRun, open_stored_run, work_unit_of
 from harness.results.work_unit import Result, Unbuilt, Unmade
 from harness.running.executor import one_by_one
 from harness.solution import Status
@@ -47,11 +47,14 @@ class Replay:
     @property
     def reproduced(self) -> bool:
         """Whether the same QP got the same verdict."""
-        return self.same_qp is not False and self.then.status is self.now.status
+        return self.same_qp is not False and self.then.verdict is self.now.verdict
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        data: dict[str, Any] = finite({**asdict(self), "reproduced": self.reproduced})
+        lines = {"then": self.then.to_dict(), "now": self.now.to_dict()}
+        data: dict[str, Any] = finite(
+            {**asdict(self), **lines, "reproduced": self.reproduced}
+        )
         data["environment"] = [
             {"key": key, "then": then, "now": now}
             for key, then, now in self.environment
@@ -84,9 +87,9 @@ def replay(
     """
     registries = known(plugins) if registries is None else registries
     families, solvers = registries.families, registries.solvers
-    stored = open_capsule(Path(folder), run_id, families, solvers)
+    stored = open_stored_run(Path(folder), run_id, families, solvers)
     environment = registries.environment()
-    unit = block_of(stored, solvers, digest(environment))
+    unit = work_unit_of(stored, solvers, digest(environment))
     commands = registries.commands([stored.spec])
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
@@ -146,13 +149,13 @@ def render(c: Replay) -> str:
     elif c.same_qp is False:
         lines.append("Not reproduced: the case builds another QP than it did.")
     else:
-        lines.append(f"Not reproduced: {c.then.status} then, {c.now.status} now.")
+        lines.append(f"Not reproduced: {c.then.verdict} then, {c.now.verdict} now.")
     return "\n".join(lines)
 
 
 def _verdicts(c: Replay) -> Iterable[list[str]]:
     then, now = c.then, c.now
-    yield ["status", then.status, now.status, _same(then.status is now.status)]
+    yield ["status", then.verdict, now.verdict, _same(then.verdict is now.verdict)]
     yield [
         "claimed", _text(then.claimed), _text(now.claimed),
         _same(then.claimed == now.claimed),

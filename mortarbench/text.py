@@ -100,11 +100,11 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
     present = {r.solver for r in latest}
     for solver in dict.fromkeys([*solvers, *sorted(present)]):
         every = [r for r in latest if r.solver == solver]
-        declined = [r for r in every if r.status is Verdict.DECLINED]
-        own = [r for r in every if r.status is not Verdict.DECLINED]
+        declined = [r for r in every if r.verdict is Verdict.DECLINED]
+        own = [r for r in every if r.verdict is not Verdict.DECLINED]
         claimed = [r for r in own if r.claimed == CLAIMED_SOLVED]
-        verified = [r for r in own if r.status is Verdict.VERIFIED]
-        refuted = [r for r in claimed if r.status is not Verdict.VERIFIED]
+        verified = [r for r in own if r.verdict is Verdict.VERIFIED]
+        refuted = [r for r in claimed if r.verdict is not Verdict.VERIFIED]
         other = len(own) - len(verified) - len(refuted)
         counts = map(len, (own, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
@@ -125,7 +125,7 @@ def outcome_rows(r: Record) -> list[tuple[str, str]]:
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
         ("solver", f"{r.solver} ({options})" if options else r.solver),
         ("tolerance", f"{r.tol:g}"),
-        ("status", f"{r.status} (claimed {r.claimed})"),
+        ("status", f"{r.verdict} (claimed {r.claimed})"),
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),

@@ -40,14 +40,14 @@ def run(registries: Registries, options: Namespace) -> int:
     record = answer.record
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
-    elif record.status is not Verdict.DECLINED:
+    elif record.verdict is not Verdict.DECLINED:
         print(answer)
         _show_iterations(answer)
-    if record.status is Verdict.DECLINED:
+    if record.verdict is Verdict.DECLINED:
         say(f"{record.solver} declines {record.case}: {record.message}")
     if drawn:
         _draw(answer, options)
-    return 0 if record.status is Verdict.VERIFIED else 1
+    return 0 if record.verdict is Verdict.VERIFIED else 1
 
 
 def _show_iterations(answer: Answer) -> None:

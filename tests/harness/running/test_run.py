@@ -37,7 +37,7 @@ SOLVERS = load_plugin(PLUGIN).solvers
 FAMILIES = load_plugin(PLUGIN).problems
 
 
-class Tally:
+class Watcher:
     """A progress that remembers what it was told, and may act after some records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
@@ -98,7 +98,7 @@ def measure(tmp_path):
         out=tmp_path,
         environment=None,
     ):
-        tally = Tally(interrupt_after, after, act)
+        watched = Watcher(interrupt_after, after, act)
         missing = run(
             suite,
             out=out,
@@ -109,11 +109,11 @@ def measure(tmp_path):
             resolve=lambda spec: resolve(spec, SOLVERS),
             environment=environment or {"machine": "test"},
             digest=digest,
-            progress=tally,
+            progress=watched,
             fresh=fresh,
         )
-        tally.unbuilt, tally.faults = missing.unbuilt, missing.faults
-        return tally
+        watched.unbuilt, watched.faults = missing.unbuilt, missing.faults
+        return watched
 
     return measure
 
@@ -218,10 +218,10 @@ def three_steps(*solvers, **changes):
 
 
 def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
-    tally = measure(three_steps("chains", "honest", repeats=2))
+    watched = measure(three_steps("chains", "honest", repeats=2))
     records = read_journal(tmp_path)
 
-    assert tally.total == len(records) == 12
+    assert watched.total == len(records) == 12
     assert {r.mode for r in records} == {"sequence"}
     assert {r.verdict for r in records} == {Verdict.VERIFIED}
     for repeat in (0, 1):
@@ -338,11 +338,11 @@ def test_repeats_are_cold_and_the_state_is_stored_for_the_first_only(measure, tm
 
 def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
     two = suite("declines", "honest", repeats=2, tolerances=(1e-4, 1e-6))
-    tally = measure(two)
+    watched = measure(two)
     refusals = [r for r in read_journal(tmp_path) if r.solver == "declines"]
 
     assert [(r.tol, r.repeat) for r in refusals] == [(1e-4, 0), (1e-6, 0)]
-    assert (tally.total, len(tally.records), tally.skipped) == (8, 6, 2)
+    assert (watched.total, len(watched.records), watched.skipped) == (8, 6, 2)
     assert measure(two).records == []
 
 
@@ -400,12 +400,12 @@ def test_a_run_cut_off_continues_with_each_measurement_exactly_once(
     file.write_bytes(file.read_bytes()[:-cut])
     kept = len(read_journal(tmp_path))
 
-    tally = measure(whole)
+    watched = measure(whole)
     after = [r.run_id for r in read_journal(tmp_path)]
 
     assert kept < len(before) == 10
-    assert len(tally.records) == 10 - kept
-    assert len(tally.records) + tally.skipped == tally.total == 12
+    assert len(watched.records) == 10 - kept
+    assert len(watched.records) + watched.skipped == watched.total == 12
     assert sorted(after) == sorted(before)
     assert len(set(after)) == 10
 
@@ -448,10 +448,10 @@ def test_a_case_that_cannot_be_built_is_said_and_tried_again(
 
     assert {r.case for r in read_journal(tmp_path)} == {"tiny/plain"}
     assert (len(first.records), len(second.records)) == (4, 0)
-    for tally in (first, second):
-        assert tally.unbuilt == [case]
-        assert tally.warnings == [f"{case} could not be built: {reason}"]
-        assert len(tally.records) + tally.skipped == tally.total
+    for watched in (first, second):
+        assert watched.unbuilt == [case]
+        assert watched.warnings == [f"{case} could not be built: {reason}"]
+        assert len(watched.records) + watched.skipped == watched.total
     assert "Traceback" in caplog.text
     assert all(entry.levelno < logging.WARNING for entry in caplog.records)
 
@@ -562,7 +562,7 @@ def test_scratch_files_lie_in_the_folder_while_a_run_lasts(
     old = tmp_path / ".scratch" / "of a run that was killed"
     old.mkdir(parents=True)
     monkeypatch.setattr(
-        Tally, "advance", lambda *_: seen.append([*old.parent.iterdir()])
+        Watcher, "advance", lambda *_: seen.append([*old.parent.iterdir()])
     )
     measure(suite("honest"))
 
@@ -620,14 +620,14 @@ def test_what_is_deleted_during_a_run_costs_no_measurement(measure, tmp_path, lo
         path = tmp_path / lost
         path.unlink() if path.is_file() else shutil.rmtree(path)
 
-    tally = measure(suite("honest", "zero", repeats=2), after=1, act=delete)
+    watched = measure(suite("honest", "zero", repeats=2), after=1, act=delete)
 
     records = once_each(tmp_path, 4)
-    assert (len(tally.records), tally.skipped, tally.total) == (4, 0, 4)
+    assert (len(watched.records), watched.skipped, watched.total) == (4, 0, 4)
     assert {r.solver: r.verdict for r in records} == {
         "honest": Verdict.VERIFIED, "zero": Verdict.WRONG,
     }  # fmt: skip
-    assert tally.faults == []
+    assert watched.faults == []
     assert load_solution(tmp_path, records[-1].vectors, Status.SOLVED).x.size == 2
 
 
@@ -725,15 +725,15 @@ def test_a_measurement_that_a_fault_prevents_is_made_again_at_once(
 ):
     tries = []
     faults(lambda record: tries.append(record.run_id) or len(tries) == 2)
-    tally = measure(suite("honest", "zero"))
+    watched = measure(suite("honest", "zero"))
 
     once_each(tmp_path, 2)
     assert len(tries) == 3
     (fault,) = read_faults(tmp_path)
     assert (fault.tried_again, fault.run_id) == (True, tries[1])
     assert tries[1] == tries[2] != tries[0]
-    assert tally.faults == []
-    assert len(tally.records) == 2
+    assert watched.faults == []
+    assert len(watched.records) == 2
 
 
 def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
@@ -741,13 +741,13 @@ def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
 ):
     whole = suite("honest", "zero", repeats=2)
     faults(lambda record: (record.solver, record.repeat) == ("zero", 0))
-    tally = measure(whole)
+    watched = measure(whole)
 
     once_each(tmp_path, 3)
-    (fault,) = tally.faults
+    (fault,) = watched.faults
     assert (fault.solver, fault.case) == ("zero", "tiny/plain")
     assert [f.tried_again for f in read_faults(tmp_path)] == [True, False]
-    assert (len(tally.records), tally.skipped, tally.total) == (3, 1, 4)
+    assert (len(watched.records), watched.skipped, watched.total) == (3, 1, 4)
 
     faults(lambda record: False)
     again = measure(whole)
@@ -762,11 +762,11 @@ def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
 ):
     tries = []
     faults(lambda r: tries.append(r.params["h"]) or tries == [0.5, 1.0])
-    tally = measure(three_steps("chains"))
+    watched = measure(three_steps("chains"))
 
     assert tries == [0.5, 1.0, 0.5, 1.0, 1.5]
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
-    assert (len(tally.records), tally.skipped) == (3, 0)
+    assert (len(watched.records), watched.skipped) == (3, 0)
 
 
 def family(process):
@@ -800,9 +800,9 @@ def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
     measure, tmp_path, faults
 ):
     faults(lambda record: record.params["h"] == 1.0)
-    tally = measure(three_steps("chains"))
-    assert [f.case for f in tally.faults] == ["tiny/plain", "tiny/h=1.5/plain"]
-    assert (len(tally.records), tally.skipped, tally.total) == (1, 2, 3)
+    watched = measure(three_steps("chains"))
+    assert [f.case for f in watched.faults] == ["tiny/plain", "tiny/h=1.5/plain"]
+    assert (len(watched.records), watched.skipped, watched.total) == (1, 2, 3)
 
     faults(lambda record: False)
     measure(three_steps("chains"))
