@@ -12,7 +12,6 @@ from typing import Any
 
 from harness.errors import InputError, shown, unknown
 
-LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
 MOST_REPEATS = 1_000_000  #: of anything
 
 
@@ -47,19 +46,6 @@ def positive(where: str, value: Any) -> float:
     """Take a positive finite number."""
     if not is_number(value) or not 0 < value <= sys.float_info.max:
         raise InputError(f"{where} = {shown(value)}; expected a positive number")
-    return float(value)
-
-
-def physical(where: str, value: Any) -> float:
-    """Take a number whose products with others stay numbers, in SI units.
-
-    Zero, or between 1e-30 and 1e30 in size: Young's modulus of steel is 2e11 Pa.
-    """
-    if not is_number(value) or not (value == 0 or LEAST <= abs(value) <= MOST):
-        raise InputError(
-            f"{where} = {shown(value)}; expected a number between {LEAST:g} and "
-            f"{MOST:g} in size, or 0"
-        )
     return float(value)
 
 

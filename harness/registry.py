@@ -35,7 +35,7 @@ _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 class SolverSpec:
     """A solver as a suite asks for it."""
 
-    name: str  #: in the registry, e.g. "clarabel" or "qpsolvers:daqp"
+    name: str  #: in the registry, e.g. "NAME" or "PREFIX:BACKEND"
     label: str  #: in records and reports
     options: Mapping[str, Any] = field(
         default_factory=dict

@@ -158,10 +158,11 @@ class Registries:
         In a process that is not ours, other libraries and more threads are at work.
         """
         from harness.environment.environment import capture, capture_in
+        from solvers.common.libraries import PACKAGES
 
         if ONE_THREAD.items() <= os.environ.items():
-            return capture(self.files)
-        return capture_in(ONE_THREAD, self.files)
+            return capture(self.files, PACKAGES)
+        return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
         return [str(file.resolve()) for file in self.files]

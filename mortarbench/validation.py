@@ -23,6 +23,7 @@ from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, known
 from mortarbench.text import aligned, legible
 
+OURS = "smalbe"  #: the solver that every other one is set against
 _MOST = 12  #: entries of a list on the terminal; the page has them all
 
 
@@ -76,7 +77,7 @@ def validate(
     registries = known(plugins) if registries is None else registries
     path = Path(folder)
     found = validated(path, registries.families, registries.reference, progress)
-    data = as_data(found, path.resolve().name)
+    data = as_data(found, path.resolve().name, ours=OURS)
     if not (data["counts"]["answers"] or found.false_claims):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness import InputError
-from harness.checked import LEAST, MOST
+from harness.checked import is_number
+from harness.errors import shown
 from harness.limits import CASE_VARIABLE, case_limit_mib
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ PLANES = {"plane": ("strain", "stress")}
 SETTINGS: Mapping[str, Value] = {
     "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
 }  # fmt: skip
+LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
 MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
 COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
 
@@ -54,6 +56,19 @@ def positive(family: str, params: Mapping[str, Value], keys: Iterable[str]) -> N
             raise InputError(
                 f"{family}: {key}={params[key]} must be between {LEAST:g} and {MOST:g}"
             )
+
+
+def physical(where: str, value: Any) -> float:
+    """Take a number whose products with others stay numbers, in SI units.
+
+    Zero, or between 1e-30 and 1e30 in size: Young's modulus of steel is 2e11 Pa.
+    """
+    if not is_number(value) or not (value == 0 or LEAST <= abs(value) <= MOST):
+        raise InputError(
+            f"{where} = {shown(value)}; expected a number between {LEAST:g} and "
+            f"{MOST:g} in size, or 0"
+        )
+    return float(value)
 
 
 def fits(family: str, components: int) -> None:

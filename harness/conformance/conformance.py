@@ -180,7 +180,7 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Catch an optimum claimed at the start, as HiGHS does without any rows."""
+    """Catch an optimum claimed at the start, as some do where there are no rows."""
     _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 

@@ -17,7 +17,6 @@ from harness.record import finite
 from harness.verify.verdicts import plain
 
 SCHEMA = 1  #: of the data
-OURS = "smalbe"  #: the solver that every other one is set against, where it took part
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +38,11 @@ class Row:
     from_ours: float | None  #: worst distance of its answers from ours
 
 
-def as_data(found: Validation, folder: str) -> dict[str, Any]:
-    """Put a cross-validation together, summary first."""
+def as_data(found: Validation, folder: str, ours: str) -> dict[str, Any]:
+    """Put a cross-validation together, summary first.
+
+    ours : the solver that every other one is set against, where it took part
+    """
     answers = [a for p in found.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]
     wrong = [*map(_disagreement, refuted), *map(_without_point, found.false_claims)]
@@ -74,7 +76,7 @@ def as_data(found: Validation, folder: str) -> dict[str, Any]:
         "agreed": found.agreed,
         "headline": _headline(found.agreed, counts, wrong),
         "counts": counts,
-        "solvers": [asdict(row) for row in rows(found)],
+        "solvers": [asdict(row) for row in _rows(found, ours)],
         "disagreements": wrong,
         "unresolved": unresolved,
         "contradictions": broken,
@@ -87,19 +89,16 @@ def as_data(found: Validation, folder: str) -> dict[str, Any]:
     return dict(finite(plain(data)))
 
 
-def rows(found: Validation) -> list[Row]:
-    """Sum up every solver at every tolerance."""
+def _rows(found: Validation, ours: str) -> list[Row]:
+    """Sum up every solver at every tolerance, the loosest first, ours before others."""
     answers = [a for p in found.problems for a in p.answers]
     keys = {(a.solver, a.tol) for a in answers}
     keys |= {(x.solver, x.tol) for x in (*found.false_claims, *found.unanswered)}
-    return [_row(found, solver, tol) for solver, tol in sorted(keys, key=_loose_first)]
+    ordered = sorted(keys, key=lambda key: (-key[1], key[0] != ours, key[0]))
+    return [_row(found, solver, tol, ours) for solver, tol in ordered]
 
 
-def _loose_first(key: tuple[str, float]) -> tuple[float, bool, str]:
-    return -key[1], key[0] != OURS, key[0]
-
-
-def _row(found: Validation, solver: str, tol: float) -> Row:
+def _row(found: Validation, solver: str, tol: float, ours: str) -> Row:
     own = [
         a
         for p in found.problems
@@ -123,7 +122,7 @@ def _row(found: Validation, solver: str, tol: float) -> Row:
         balance=_worst(a.balance for a in measured),
         contradicted_rows=sum(len(a.rows) for a in measured),
         primal_dual=_worst(_between_forms(found.problems, solver, tol)),
-        from_ours=_worst(_from_ours(found.problems, solver, tol)),
+        from_ours=_worst(_between(found.problems, solver, ours, tol)),
     )
 
 
@@ -148,12 +147,14 @@ def _between_forms(
                 yield pair.distance
 
 
-def _from_ours(problems: Sequence[Problem], solver: str, tol: float) -> Iterable[float]:
-    """Yield how far a solver's answers are from ours, of any form."""
+def _between(
+    problems: Sequence[Problem], solver: str, other: str, tol: float
+) -> Iterable[float]:
+    """Yield how far a solver's answers are from another's, of any form."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
-            if a.tol == tol and sorted((a.solver, b.solver)) == sorted((solver, OURS)):
+            if a.tol == tol and sorted((a.solver, b.solver)) == sorted((solver, other)):
                 yield pair.distance
 
 

@@ -25,12 +25,8 @@ from threadpoolctl import threadpool_info
 
 from harness.digest import hex_digest
 
-PACKAGES = (
-    "mortarbench", "numpy", "scipy", "scikit-sparse", "qpsolvers", "osqp", "clarabel",
-    "proxsuite", "cvxpy", "pandas", "numba", "piqp", "highspy", "highspy-extras", "scs",
-    "daqp", "qpalm", "qoco", "qtqp", "py-mkl-pardiso", "quadprog", "cvxopt",
-    "sip-qp-python",
-)  # fmt: skip
+#: that measurements rest on, whichever solvers there are
+PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas", "numba")
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS", "OMP_THREAD_LIMIT", "OMP_DYNAMIC", "OMP_PROC_BIND", "OMP_PLACES",
@@ -54,12 +50,15 @@ _CPU = Path("/sys/devices/system/cpu")
 _CGROUP = Path("/sys/fs/cgroup")
 
 
-def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
+def capture(
+    plugins: Iterable[Path] = (), packages: Iterable[str] = ()
+) -> dict[str, Any]:
     """Describe this process: nested plain data, None where something is unreadable.
 
     The threads are those of the calling process: for a worker's, use `capture_in`.
 
     plugins : files whose code is measured along with ours
+    packages : of solvers, whose versions belong to it
     """
     # Only libraries in memory can be asked for their threads.
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
@@ -72,7 +71,7 @@ def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
     return {
         "machine": _machine(),
         "versions": {"python": platform.python_version()}
-        | {name: _version(name) for name in PACKAGES},
+        | {name: _version(name) for name in (*PACKAGES, *packages)},
         "source": source(Path(__file__).resolve().parents[2]),
         "plugins": _plugins(plugins),
         "threads": {
@@ -94,7 +93,9 @@ def capture(plugins: Iterable[Path] = ()) -> dict[str, Any]:
 
 
 def capture_in(
-    variables: Mapping[str, str], plugins: Iterable[Path] = ()
+    variables: Mapping[str, str],
+    plugins: Iterable[Path] = (),
+    packages: Iterable[str] = (),
 ) -> dict[str, Any]:
     """Describe a process that is started with some variables set, as workers are.
 
@@ -102,10 +103,12 @@ def capture_in(
     """
     program = (
         "import json, pathlib, sys, harness.environment.environment as e; "
-        "print(json.dumps(e.capture(map(pathlib.Path, sys.argv[1:]))))"
+        "plugins, packages = map(json.loads, sys.argv[1:]); "
+        "print(json.dumps(e.capture(map(pathlib.Path, plugins), packages)))"
     )
+    given = ([*map(str, plugins)], [*packages])
     done = subprocess.run(
-        [sys.executable, "-P", "-c", program, *map(str, plugins)],
+        [sys.executable, "-P", "-c", program, *map(json.dumps, given)],
         env=os.environ | variables,
         capture_output=True,
         text=True,
@@ -113,6 +116,12 @@ def capture_in(
     )
     captured: dict[str, Any] = json.loads(done.stdout)
     return captured
+
+
+def packages_of(environment: Mapping[str, Any]) -> list[str]:
+    """Name the packages of solvers whose versions an environment has."""
+    known = ("python", *PACKAGES)
+    return [name for name in environment.get("versions", ()) if name not in known]
 
 
 def digest(environment: Mapping[str, Any]) -> str:

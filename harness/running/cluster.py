@@ -19,6 +19,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
+from harness.environment.environment import packages_of
 from harness.errors import InputError, some
 from harness.operators import Maker
 from harness.results.folder import differences
@@ -90,7 +91,8 @@ def on_cluster(
             name = f"mortarbench-{client.id}"
             _forget_lost_runs(client)
             files = [file.resolve() for file in plugins]
-            node = ExecutorPlugin(commands, files, operators, _sharing(client))
+            sharing, packages = _sharing(client), packages_of(environment)
+            node = ExecutorPlugin(commands, files, operators, sharing, packages)
             client.register_plugin(node, name=name)
             stack.callback(_end, client, name)
             nodes = Nodes(environment, keep, warn)

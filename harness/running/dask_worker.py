@@ -51,6 +51,7 @@ class ExecutorPlugin(WorkerPlugin):
     operators : what puts an operator P together, less what is in `plugins`
     sharing : Dask workers on one machine; more than one disturb each other, which
         makes another environment
+    packages : whose versions the environment of a node has
     """
 
     def __init__(
@@ -59,11 +60,13 @@ class ExecutorPlugin(WorkerPlugin):
         plugins: Sequence[Path],
         operators: Mapping[str, Maker],
         sharing: int,
+        packages: Sequence[str],
     ) -> None:
         self._commands = commands
         self._plugins = plugins
         self._operators = dict(operators)
         self._sharing = sharing
+        self._packages = packages
         self._python = sys.executable
         self._open: _Open | None = None
         self._ended = False
@@ -163,7 +166,7 @@ class ExecutorPlugin(WorkerPlugin):
                     f"{platform.node()}: no plug-in {path}; "
                     "expected the same files under the same paths on every node"
                 )
-        environment = capture_in(ONE_THREAD, self._plugins)
+        environment = capture_in(ONE_THREAD, self._plugins, self._packages)
         if self._sharing > 1:
             environment["machine"]["shared_by_workers"] = self._sharing
         with ExitStack() as stack:

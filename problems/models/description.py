@@ -50,7 +50,7 @@ from problems.contact.bodies import Bodies, ContactPair, assemble
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
-from problems.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS
+from problems.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS, physical
 
 _KEYS = ("mesh", *SETTINGS, "units", "bodies", "supports", "loads", "contacts")
 
@@ -128,7 +128,7 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
         name = _one_of(named.surfaces, "physical surface", entry, "name")
         if name in found:
             raise InputError(f"body {name!r} is described twice; expected once")
-        E, nu = checked.physical("E", checked.positive("E", entry["E"])), entry["nu"]
+        E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
         if not checked.is_number(nu) or not -1 < nu < 0.5:
             raise InputError(f"nu = {shown(nu)}; expected a number between -1 and 0.5")
         found[name] = Material(E=E, nu=float(nu))
@@ -157,7 +157,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
     if len(vector) != 2 or not all(map(checked.is_number, vector)):
         raise InputError(f"{kinds[0]} = {shown(vector)}; expected two numbers, [x, y]")
-    vector = [checked.physical(kinds[0], component) for component in vector]
+    vector = [physical(kinds[0], component) for component in vector]
     nodes, edges = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
     if edges.size:  # ∫N over the boundary, m
@@ -207,12 +207,8 @@ def _units(
             raise InputError("the loads sum up to nothing; expected a load")
         extent = float(np.ptp(named.points, axis=0).max())
         return (
-            checked.physical(
-                "length", checked.positive("length", units.get("length", extent))
-            ),
-            checked.physical(
-                "force", checked.positive("force", units.get("force", total))
-            ),
+            physical("length", checked.positive("length", units.get("length", extent))),
+            physical("force", checked.positive("force", units.get("force", total))),
         )
 
 

@@ -10,11 +10,13 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
 from harness import QP, Status, kkt_residuals
 from harness.conformance.manufactured import infeasible, one_of_each, unbounded
+from harness.environment.environment import PACKAGES as OWN
 from harness.registry import options_of
 from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.adapters.cvxpy_ import REFUSED
 from solvers.common.conversion import csc, on_present_bounds
+from solvers.common.libraries import PACKAGES
 from solvers.common.sequence import only_vectors_differ
 from solvers.reference.solve import reference_solution
 
@@ -312,3 +314,9 @@ def test_qoco_is_not_believed_where_its_iterates_diverge():
     solution = solve("qoco", unbounded())
     assert solution.status is Status.FAILED
     assert solution.message == "diverged"
+
+
+def test_the_versions_of_all_libraries_belong_to_an_environment():
+    used = {s.about.package for s in SOLVERS.values() if s.about.package}
+
+    assert used <= {*PACKAGES, *OWN}
