@@ -59,7 +59,7 @@ def swept():
         r.but(
             run_id=f"{solver} {tol}", tol=tol, accuracy=1e-3, energy_bound=2 * tol,
             primal=2 * tol, dual=0.0, complementarity=0.0, gap=0.0,
-            status=Verdict.VERIFIED, claimed="solved",
+            verdict=Verdict.VERIFIED, claimed="solved",
         )
         for solver, r in first.items()
         for tol in TOLS
@@ -92,7 +92,7 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
         r.but(run_id=f"{solver} {n} {i}", solver=solver, case=f"box/n={n}/dual",
               family="box", form="dual", params={"n": n}, iterations=n,
               sizes={"variables": n}, quantities={"dofs": n}, total_seconds=1e-6 * n,
-              status=Verdict.VERIFIED)
+              verdict=Verdict.VERIFIED)
         for solver in ("a", "b")
         for n, r in zip((10, 20, 40, 80), records(1, 4, 1), strict=True)
         for i in range(3)
