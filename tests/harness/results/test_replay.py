@@ -145,7 +145,7 @@ def rewrite(record, **changes):
 
 def test_another_verdict_is_told_and_counts_as_no(cli, stored):
     then = stored["exact", 1, 0]
-    rewrite(then, status="wrong")
+    rewrite(then, verdict="wrong")
     code, out, _ = cli("replay", "done", then.run_id)
 
     assert code == 1
