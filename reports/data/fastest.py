@@ -138,7 +138,7 @@ def answers_of(evidence: Evidence) -> Answers:
     """Choose the answer of every solver to every case; null arms take no part."""
     found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
     for o in evidence.flat:
-        if not o.first.arm:
+        if not o.first.role:
             cases = found.setdefault(kind_of(o.first), {})
             cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
     return {

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from harness import Record, Verdict
+from harness.record import JOURNAL
 from reports.data.aggregation import (
     EVERY,
     USUAL,
@@ -68,7 +68,9 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _measurements(records: Sequence[Record]) -> pd.DataFrame:
     """Give every field of every record a column; what is nested is JSON text."""
-    columns = {f.name: [getattr(r, f.name) for r in records] for f in fields(Record)}
+    columns = {
+        name: [getattr(r, f.name) for r in records] for name, f in JOURNAL.items()
+    }
     for name, values in columns.items():
         if isinstance(values[0], Mapping | Verdict):
             columns[name] = list(texts(values))

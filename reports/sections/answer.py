@@ -248,7 +248,7 @@ def _best_at(swept: Sweeps, error: float) -> str:
         times = {
             solver: time_at_accuracy(outcomes, error)
             for solver, outcomes in row.items()
-            if not outcomes[0].first.arm
+            if not outcomes[0].first.role
         }
         kinds = places(times)
         best = [s for s, kind in kinds.items() if kind == "best"]

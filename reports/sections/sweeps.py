@@ -150,7 +150,7 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
             found = {
                 s: time_at_accuracy(outcomes, error) for s, outcomes in row.items()
             }
-            kinds = places({s: m for s, m in found.items() if not row[s][0].first.arm})
+            kinds = places({s: m for s, m in found.items() if not row[s][0].first.role})
             cells = [
                 _matched(found.get(s), row.get(s, ()), kinds.get(s, ""))
                 for s in present

@@ -195,7 +195,7 @@ def _ratio(outcome: Outcome, fastest: Outcome | None) -> Cell:
     return Cell(
         text=bracketed(ratio.value, ratio.low, ratio.high),
         symbol="≈" if tied else "",
-        kind="tied" if tied and not outcome.first.arm else "",
+        kind="tied" if tied and not outcome.first.role else "",
         value=ratio.value,
         title=source(outcome),
     )
@@ -206,7 +206,7 @@ def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
     medians = {
         s: median(times)
         for s, o in row.items()
-        if o.verified and not o.first.arm and (times := [*o.by_repeat.values()])
+        if o.verified and not o.first.role and (times := [*o.by_repeat.values()])
     }
     return row[min(medians, key=lambda s: medians[s])] if medians else None
 
@@ -241,7 +241,7 @@ def _null_ratios(evidence: Evidence) -> list[tuple[Outcome, Outcome, Ratio]]:
     """Pair every null arm with the solver that it repeats, by their blocks."""
     found = []
     for row in evidence.outcomes.values():
-        for null in (o for o in row.values() if o.first.arm == "null"):
+        for null in (o for o in row.values() if o.first.role == "null"):
             twin = row.get(null.solver.replace(NULL, "", 1))
             if twin is None or not (null.verified and twin.verified):
                 continue

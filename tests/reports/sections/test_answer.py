@@ -29,7 +29,7 @@ def record():
         defaults = dict(
             run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
             params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
-            repeat=repeat, block=repeat, status=Verdict.VERIFIED, claimed="solved",
+            repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
             iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
             complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
             environment="abc",
@@ -160,7 +160,7 @@ def test_of_equal_solvers_one_is_named_in_one_run_of_twenty_at_most(
 def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
     record, opened, make
 ):
-    lies = dict(status=Verdict.WRONG, claimed="solved", dual=0.03)
+    lies = dict(verdict=Verdict.WRONG, claimed="solved", dual=0.03)
     liar = [r.but(**lies) for r in make(record, liar=0.01)]
     statement = opened(make(record, honest=1.0, slow=2.0) + liar)["dual"]
     (claim,) = statement.claims
@@ -174,7 +174,7 @@ def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
 
 def test_one_refuted_repeat_is_enough_not_to_compete(record, opened):
     records = one_case(record, fast=0.1, honest=1.0, slow=2.0)
-    records[3] = records[3].but(status=Verdict.INACCURATE, dual=1e-3)
+    records[3] = records[3].but(verdict=Verdict.INACCURATE, dual=1e-3)
     statement = opened(records)["dual"]
     assert statement.claims[0].startswith("honest was the fastest")
     assert "fast claimed solved but inaccurate on 1 of 1 case" in statement.remarks[0]
@@ -184,7 +184,7 @@ def test_a_solver_that_fails_half_of_the_cases_is_not_the_fastest_of_all(
     record, opened
 ):
     half = [
-        r.but(status=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
+        r.but(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
         if r.params["n"] % 2 else r
         for r in many_cases(record, half=1e-4)
     ]  # fmt: skip
@@ -197,7 +197,7 @@ def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
     record, opened
 ):
     almost = many_cases(record, almost=0.5)
-    almost[0] = almost[0].but(status=Verdict.CRASHED)
+    almost[0] = almost[0].but(verdict=Verdict.CRASHED)
     statement = opened(many_cases(record, sure=1.0, slow=2.0) + almost)["dual"]
     assert statement.claims[0].startswith("sure was the fastest over 8 cases")
     faster = statement.remarks[0]
@@ -209,9 +209,9 @@ def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
 
 def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
     a, b = many_cases(record, a=1.0), many_cases(record, b=2.0)
-    a[0] = a[0].but(status=Verdict.TIME_LIMIT)
-    b[5] = b[5].but(status=Verdict.CRASHED, message="signal 11")
-    b[6] = b[6].but(status=Verdict.CRASHED, message="signal 11")
+    a[0] = a[0].but(verdict=Verdict.TIME_LIMIT)
+    b[5] = b[5].but(verdict=Verdict.CRASHED, message="signal 11")
+    b[6] = b[6].but(verdict=Verdict.CRASHED, message="signal 11")
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "Nobody is named over 8 cases at tol 1e-6: no solver was verified on all of "
@@ -222,7 +222,7 @@ def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
 
 def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, opened):
     records = [
-        r.but(status=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
+        r.but(verdict=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
         for r in many_cases(record, fast=1.0, slow=3.0)
     ]
     statement = opened(records)["dual"]
@@ -237,7 +237,7 @@ def test_a_single_solver_has_nobody_to_be_faster_than(record, opened):
 
 
 def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
-    failed = [r.but(status=Verdict.FAILED, message="gave up")
+    failed = [r.but(verdict=Verdict.FAILED, message="gave up")
               for r in one_case(record, other=0.5)]  # fmt: skip
     (claim,) = opened(one_case(record, lonely=1.0) + failed)["dual"].claims
     assert "Nobody is named" in claim
@@ -246,7 +246,7 @@ def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
 
 def test_a_form_without_a_verified_answer_says_so(record, opened):
     records = [
-        r.but(status=Verdict.ITERATION_LIMIT) for r in one_case(record, a=1.0, b=2.0)
+        r.but(verdict=Verdict.ITERATION_LIMIT) for r in one_case(record, a=1.0, b=2.0)
     ]
     assert opened(records)["dual"].claims == ("No answer was verified at tol 1e-6.",)
 
@@ -321,9 +321,9 @@ def test_many_tolerances_are_no_wall_of_text(record, opened):
 
 def test_a_null_arm_is_nobodys_rival(record, opened):
     records = one_case(record, a=1.0, b=2.0)
-    null = [r.but(solver="a (null)", arm="null", run_id=f"{r.run_id}-null")
+    null = [r.but(solver="a (null)", role="null", run_id=f"{r.run_id}-null")
             for r in one_case(record, seed=2, a=1.0)]  # fmt: skip
-    null[0] = null[0].but(status=Verdict.CRASHED)
+    null[0] = null[0].but(verdict=Verdict.CRASHED)
     statement = opened(records + null)["dual"]
     assert statement.claims[0].startswith("a was the fastest")
     assert not any("null" in line for line in statement.lines)
@@ -345,10 +345,10 @@ def test_sequences_are_compared_with_sequences(record, opened):
 def test_of_a_sweep_the_cheapest_verified_answers_compete_at_one_accuracy(
     record, opened
 ):
-    def swept(solver, tol, seconds, status=Verdict.VERIFIED):
+    def swept(solver, tol, seconds, verdict=Verdict.VERIFIED):
         return [
             record(solver, 0, seconds * (1 + i / 100), i, tol=tol, accuracy=1e-6,
-                   status=status)
+                   verdict=verdict)
             for i in range(4)
         ]  # fmt: skip
 
@@ -393,7 +393,7 @@ def test_times_of_different_environments_name_nobody(record, opened):
 
 def test_who_declined_is_told_apart_from_who_failed(record, opened):
     shy = record(
-        "shy", 0, None, status=Verdict.DECLINED, claimed="", message="too large"
+        "shy", 0, None, verdict=Verdict.DECLINED, claimed="", message="too large"
     )
     statement = opened([*one_case(record, a=1.0, b=2.0), shy])["dual"]
     assert "Declined: shy (too large)." in statement.remarks
@@ -402,7 +402,7 @@ def test_who_declined_is_told_apart_from_who_failed(record, opened):
 
 def test_many_failures_are_counted_not_listed(record, opened):
     lost = [
-        r.but(status=Verdict.FAILED, message="no")
+        r.but(verdict=Verdict.FAILED, message="no")
         for k in range(30) for r in one_case(record, blocks=2, **{f"s{k:02d}": 1.0})
     ]  # fmt: skip
     statement = opened([*one_case(record, a=1.0, b=2.0), *lost])["dual"]
@@ -458,7 +458,7 @@ def test_names_cannot_break_out_of_the_answer(record, evidence):
     names = ("<b>x</b>", r"\input{a}$", "| a |\n## b", "\u202eleft", "", "n" * 5000)
     records = [
         record(name, 0, 0.01 * (k + 1) * (1 + i / 100), i, form=form,
-               status=Verdict.WRONG if k == 2 else Verdict.VERIFIED, message=name,
+               verdict=Verdict.WRONG if k == 2 else Verdict.VERIFIED, message=name,
                run_id=f"{k}-{i}-{n}")
         for n, form in enumerate((*names, "dual"))
         for k, name in enumerate(names) for i in range(3)
@@ -498,7 +498,7 @@ def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
 
 
 def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence):
-    lost = [r.but(status=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
+    lost = [r.but(verdict=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
     made = evidence(one_case(record, a=1.0, b=2.0) + lost)
     (panel,) = fastest_figure(found(made), made.solvers).panels
     assert panel.y.ticks == ((0.0, "a"), (-1.0, "b"), (-2.0, "lost"))
@@ -509,7 +509,7 @@ def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence)
 
 
 def test_without_answers_there_is_no_figure(record, evidence):
-    lost = [r.but(status=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)]
+    lost = [r.but(verdict=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)]
     made = evidence(lost)
     assert fastest_figure(found(made), made.solvers) is None
     assert compose(made).sections[0].pictures == ()
