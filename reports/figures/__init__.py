@@ -1,1 +1,1 @@
-"""Figures, drawn with matplotlib in one style, and the measurements behind them."""
+"""Figures as values: what is drawn, how it looks, and the measurements behind it."""
