@@ -41,7 +41,7 @@ def existing(folder: Path) -> Path:
 
     """
     if not folder.is_dir():
-        what = "is a file" if folder.exists() else "no such folder"
+        what = "a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {what}; expected a result folder of `run`")
     return folder
 

@@ -62,9 +62,6 @@ def test_one_thing_is_done_in_one_place(name, homes):
 COLLECTIONS = {
     "solvers/adapters": "a library each",
     "problems/families": "a family each",
-    "reports/sections": "a section of the report each",
-    "mortarbench": "a function of the front door each, with what it returns",
-    "mortarbench/cli": "a command each",
 }
 
 

@@ -557,7 +557,7 @@ PROBLEMS = {{"deeper": Deeper(), "nothing": Nothing()}}
 
 
 def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli, monkeypatch):
-    monkeypatch.setattr("mortarbench.paper.measured_paper", paper)
+    monkeypatch.setattr("mortarbench.cli.paper.measured_paper", paper)
 
     assert cli("paper") == (
         0,

@@ -13,7 +13,7 @@ from harness.plugin import as_family
 from harness.registry import SolverSpec
 from harness.suite.overrides import with_overrides
 from harness.suite.suite import load_suite
-from mortarbench.paper import BEYOND
+from mortarbench.cli.paper import BEYOND
 from tests.support import ROOT
 
 

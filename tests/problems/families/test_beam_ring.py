@@ -7,7 +7,7 @@ import pytest
 
 from harness import InputError, kkt_residuals
 from harness.suite.suite import load_suite
-from mortarbench.registries import SUITES
+from mortarbench.registries import suites_folder
 from problems.contact.bodies import clamped, floating
 from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dual_bounds, dualise
@@ -291,7 +291,7 @@ def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
 
 def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
     """Verified at tol 1e-8, to 1e-6 relative; primal and dual."""
-    suite = load_suite(SUITES / "demo.toml", {FAMILY.name: FAMILY}, SOLVERS)
+    suite = load_suite(suites_folder() / "demo.toml", {FAMILY.name: FAMILY}, SOLVERS)
     energies = {}
     for name in suite.cases:
         case = FAMILY.build(name.form, name.params, reference_solution)
