@@ -127,9 +127,9 @@ def _verdict(data: Data) -> Section:
 def _errors(data: Data) -> tuple[Picture, ...]:
     """Draw the errors of all answers at the tightest tolerance."""
     answers = [a for p in data["problems"] for a in p["answers"]]
-    tol = min(a["tol"] for a in answers)
+    tol = min((a["tol"] for a in answers), default=0.0)
     figure = error_figure(answers, tol)
-    if figure is None:
+    if figure is None:  # as where all that was judged are claims without a point
         return ()
     caption = (
         f"Certified error of every answer, over ‖u*‖, at tol {tolerance(tol)}. It is "
