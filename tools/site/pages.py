@@ -1,7 +1,7 @@
 """The pages of the site that are made of something else, for mkdocs (a hook).
 
 README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; a notebook of
-docs/gallery is run and becomes a page; `commands.md` gets the help text of each command.
+docs/gallery is run and becomes a page; `commands.md` gets the help of each command.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def help_texts() -> str:
         done = subprocess.run(command, check=True, capture_output=True, text=True)
         return done.stdout
 
-    commands = re.findall(r"^    ([a-z-]+) ", printed(), re.M)
+    commands = re.findall(r"^    ([a-z-]+)(?: |$)", printed(), re.M)
     sections = (f"### {c}\n\n```text\n{printed(c)}```\n" for c in commands)
     return "\n".join(sections)
 
@@ -94,6 +94,8 @@ def gallery_page(path: Path) -> dict[str, str | bytes]:
         notebook, {"unique_key": path.stem, "output_files_dir": ""}
     )
     note = f"[Download this notebook]({path.name}){{ .download }}\n\n"
+    text = re.sub(r"<style scoped>.*?</style>", "", text, flags=re.S)
+    text = text.replace('<table border="1" class="dataframe">', "<table>")
     title, _, rest = text.lstrip().partition("\n")
     files: dict[str, str | bytes] = {
         f"gallery/{path.stem}.md": f"{title}\n\n{note}{rest}"
