@@ -38,8 +38,12 @@ def as_numpydoc(text: str) -> str:
     """Put descriptions of arguments below their names, in a section of their own."""
     text += "\n"
 
+    def entry(found: re.Match[str]) -> str:
+        names, description = found[0].split(" : ", 1)
+        return "".join(f"{name}\n    {description}" for name in names.split(", "))
+
     def entries(found: re.Match[str]) -> str:
-        return re.sub(r"^(\w+(?:, \w+)*) : ", r"\1\n    ", found[0], flags=re.M)
+        return re.sub(_ENTRY, entry, found[0])
 
     def section(found: re.Match[str]) -> str:
         return f"Parameters\n----------\n{entries(found)}"
