@@ -9,7 +9,7 @@ BIN := .venv/bin
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
-.PHONY: help setup browser demo test mutants bench docs weaknesses size synthetic check clean
+.PHONY: help setup browser demo test mutants bench docs site weaknesses size synthetic check clean
 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
@@ -24,6 +24,13 @@ browser: setup .venv/.browser  ## chromium and its driver, for the tests of the 
 
 .venv/.browser: .venv/.ready
 	@tools/setup.sh $(PYTHON) browser
+	@touch $@
+
+site: setup .venv/.site  ## the documentation as a site, in out/site; runs its notebooks
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+
+.venv/.site: .venv/.ready
+	@tools/setup.sh $(PYTHON) docs
 	@touch $@
 
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo

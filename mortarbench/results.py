@@ -132,7 +132,7 @@ def run(
     out : the result folder; ``out/NAME`` of the suite if not given
     solvers : only these; names that the suite has not are added
     cases : only these, patterns or names
-    repeats, time_limit (s), memory_limit (MiB) : instead of the suite's
+    repeats, time_limit, memory_limit : instead of the suite's; s, MiB
     fresh : forget first what the folder holds
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families

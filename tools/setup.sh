@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Make .venv ready: system packages, virtual environment, pinned Python packages.
-# Usage: tools/setup.sh PYTHON [browser]   (called by make; does only what is missing)
+# Usage: tools/setup.sh PYTHON [browser|docs]   (called by make; does only what is missing)
 # browser: what the tests of the report's page need besides, chromium and its driver
+# docs: what builds the site
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1

@@ -56,12 +56,41 @@ def test_the_page_of_solvers_tells_the_facts_of_each():
     assert "| `backend` | 'auto' | 'dense' | 'sparse' | auto: as P is stored |" in page
 
 
-def test_every_family_and_suite_that_the_readme_names_exists():
+def test_every_family_and_suite_that_commands_name_exists():
     from problems import PROBLEMS
 
-    text = (ROOT / "README.md").read_text()
+    pages = [ROOT / "README.md", ROOT / "docs" / "commands.md"]
+    text = "".join(page.read_text("utf-8") for page in pages)
 
     names = re.findall(r"mortarbench solve ([\w-]+)[/:]", text)
     assert {"beam-ring", "contact-patch", "file"} <= set(names) <= set(PROBLEMS)
     for suite in re.findall(r"suites/[\w-]+\.toml", text):
         assert (ROOT / suite).is_file()
+
+
+def test_the_readme_is_at_most_120_lines():
+    assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 120
+
+
+def test_every_file_that_a_page_names_exists():
+    """A path in backquotes or in a link, from the root or from the page's folder."""
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
+    rooms = "harness|problems|solvers|reports|mortarbench|tests|suites|benchmarks|docs"
+    for page in pages:
+        text = page.read_text("utf-8")
+        named = re.findall(rf"`((?:{rooms})/[\w./-]+\.\w+)`", text)
+        lost = [n for n in named if not (ROOT / n).exists() and "NAME" not in n]
+        assert lost == [], page
+        links = re.findall(r"\]\((?!\w+:)([^)#]+)", text)
+        assert [n for n in links if not (page.parent / n).exists()] == [], page
+
+
+def test_every_page_has_a_place_on_the_site():
+    """`make site` would refuse others; this tells so without building it."""
+    nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
+    folder = ROOT / "docs"
+    found = {p.name for p in folder.glob("*.md")}
+    found |= {f"gallery/{p.stem}.md" for p in folder.glob("gallery/*.ipynb")}
+    made = {"index.md", "contributing.md", "changelog.md"}
+
+    assert set(re.findall(r": (\S+\.md)$", nav, re.M)) == found | made

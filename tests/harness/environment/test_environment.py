@@ -359,6 +359,7 @@ def test_every_dependency_is_pinned():
         *project["project"]["dependencies"],
         *project["project"]["optional-dependencies"]["dev"],
         *project["project"]["optional-dependencies"]["browser"],
+        *project["project"]["optional-dependencies"]["docs"],
         *project["build-system"]["requires"],
     ]
     wanted = {normal(re.match(r"[\w.-]+", requirement)[0]) for requirement in named}

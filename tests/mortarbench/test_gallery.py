@@ -1,0 +1,107 @@
+"""The notebooks of docs/gallery run as they are, and show what their text says.
+
+Each runs in a kernel of its own, in an empty folder.
+"""
+
+import json
+from collections import Counter
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+from tests.support import ROOT
+
+GALLERY = ROOT / "docs" / "gallery"
+
+
+@pytest.fixture
+def execute(tmp_path, monkeypatch):
+    """Run a notebook; give what expressions are worth at its end."""
+    for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / name.lower()))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    folder = tmp_path / "work"
+    folder.mkdir()
+
+    def run(name, *expressions):
+        notebook = nbformat.read(GALLERY / f"{name}.ipynb", as_version=4)
+        told = f"import json; print(json.dumps([{','.join(expressions)}]))"
+        end = nbformat.v4.new_code_cell(told)
+        notebook.cells.append(end)
+        client = NotebookClient(
+            notebook,
+            timeout=300,
+            resources={"metadata": {"path": str(folder)}},
+        )
+        client.execute()
+        return json.loads(end.outputs[0].text), kinds(notebook.cells[:-1])
+
+    return run
+
+
+def kinds(cells):
+    """Count what cells show, by the richest form."""
+    outputs = [o for c in cells for o in c.get("outputs", []) if "data" in o]
+    return Counter(
+        next(
+            kind for kind in ("image/png", "text/html", "text/plain") if kind in o.data
+        )
+        for o in outputs
+    )
+
+
+def test_notebooks_are_stored_without_outputs():
+    for path in GALLERY.glob("*.ipynb"):
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+        assert not any(cell.outputs or cell.execution_count for cell in code), path
+
+
+def test_a_first_comparison(execute):
+    """All is verified, and at one tolerance errors differ tenfold, below √tol."""
+    (statuses, spread, worst), shown = execute(
+        "first-comparison",
+        "sorted(results.df.status.unique())",
+        "(errors.loc['dual'].max() / errors.loc['dual'].min()).min()",
+        "max(errors[tol].max() / tol**0.5 for tol in errors)",
+    )
+    assert statuses == ["declined", "verified"]
+    assert spread > 5
+    assert worst < 1
+    assert shown["image/png"] == 2
+
+
+def test_your_own_solver(execute):
+    """Plain gradients fall by 1 − 1/κ per step; some claims of success are refuted."""
+    (rate, expected, refuted, grades, code), shown = execute(
+        "own-solver",
+        "float(moves[-1] / moves[-2])",
+        "float(rates['plain'])",
+        "sorted(set(results.df[results.df.status == 'inaccurate'].solver))",
+        "sorted(checks.grade.unique())",
+        "done.returncode",
+    )
+    assert rate == pytest.approx(expected, rel=1e-3)
+    assert refuted == ["momentum", "plain"]
+    assert (grades, code) == (["decline", "pass"], 0)
+    assert shown["image/png"] == 1
+
+
+def test_your_own_bodies(execute):
+    """Mortar pressures come nearer to Hertz with the mesh, others do not."""
+    (rows,), shown = execute("own-bodies", "rows")
+    off = {
+        (row["contact"], row["cells per half width"]): abs(row["largest pressure"])
+        for row in rows
+    }
+    l2 = {(r["contact"], r["cells per half width"]): r["pressure, L2"] for r in rows}
+
+    assert {row["verdict"] for row in rows} == {"verified"}
+    assert all(abs(row["total force"]) < 1e-8 for row in rows)
+    assert off["mortar", 30] < 0.005
+    assert l2["mortar", 30] < l2["mortar", 10] / 3
+    assert off["nts", 30] > 0.02
+    assert shown["image/png"] == 2

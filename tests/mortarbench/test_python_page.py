@@ -1,0 +1,19 @@
+"""docs/python.md, read from top to bottom in an empty folder, shows what happens."""
+
+import doctest
+import re
+
+from tests.support import ROOT
+
+
+def test_the_page_shows_what_happens(tmp_path, monkeypatch, capsys):
+    """Every example, in its order."""
+    page = (ROOT / "docs" / "python.md").read_text("utf-8")
+    examples = "\n".join(re.findall(r"```pycon\n(.*?)```", page, re.S))
+    test = doctest.DocTestParser().get_doctest(examples, {}, "python.md", None, 0)
+    monkeypatch.chdir(tmp_path)
+
+    result = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test)
+
+    assert result.failed == 0, capsys.readouterr().out
+    assert result.attempted > 30

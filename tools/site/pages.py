@@ -1,0 +1,106 @@
+"""The pages of the site that are made of something else, for mkdocs (a hook).
+
+README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; a notebook of
+docs/gallery is run and becomes a page; `commands.md` gets the help of each command.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}  #: file of the root → page of the site
+HELP = "<!-- help of every command -->"  #: is replaced in commands.md
+#: one thread in every library, as in the processes of a run
+ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that lie elsewhere, and those that notebooks become."""
+    from mkdocs.structure.files import File
+
+    os.environ.update(ENVIRONMENT)
+    for name, page in PAGES.items():
+        text = from_root((ROOT / name).read_text("utf-8"))
+        files.append(File.generated(config, page, content=text))
+    for notebook in sorted((ROOT / "docs" / "gallery").glob("*.ipynb")):
+        for path, content in gallery_page(notebook).items():
+            files.append(File.generated(config, path, content=content))
+    return files
+
+
+def on_page_markdown(
+    markdown: str, *, page: Page, config: MkDocsConfig, files: Files
+) -> str:
+    """Send links out of docs/, and to notebooks, to their pages; insert help texts."""
+    up = "../" * page.file.src_uri.count("/")
+    for name, target in PAGES.items():
+        markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
+    if not page.file.src_uri.startswith("gallery/"):
+        markdown = re.sub(r"\]\((gallery/[\w-]+)\.ipynb", r"](\1.md", markdown)
+    return markdown.replace(HELP, help_texts()) if HELP in markdown else markdown
+
+
+def from_root(text: str) -> str:
+    """Have the links of a file of the root lead from a page beside those of docs/."""
+    text = re.sub(r"\]\(docs/", "](", text)
+    for name, page in PAGES.items():
+        text = text.replace(f"]({name}", f"]({page}")
+    return text
+
+
+def help_texts() -> str:
+    """Give the help of each command, a section each."""
+
+    def printed(*arguments: str) -> str:
+        command = [sys.executable, "-m", "mortarbench", *arguments, "--help"]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        return done.stdout
+
+    commands = re.findall(r"^    ([a-z-]+)(?: |$)", printed(), re.M)
+    sections = (f"### {c}\n\n```text\n{printed(c)}```\n" for c in commands)
+    return "\n".join(sections)
+
+
+def gallery_page(path: Path) -> dict[str, str | bytes]:
+    """Run a notebook in an empty folder: its page, and the pictures that this shows."""
+    import nbformat
+    from nbconvert import MarkdownExporter
+    from nbconvert.preprocessors import ExecutePreprocessor
+
+    notebook = nbformat.read(path, as_version=4)
+    with tempfile.TemporaryDirectory() as folder:
+        ExecutePreprocessor(timeout=300).preprocess(
+            notebook, {"metadata": {"path": folder}}
+        )
+    exporter = MarkdownExporter()
+    prefix = f"{path.stem}_"
+    text, resources = exporter.from_notebook_node(
+        notebook, {"unique_key": path.stem, "output_files_dir": ""}
+    )
+    note = f"[Download this notebook]({path.name}){{ .download }}\n\n"
+    text = re.sub(r"<style scoped>.*?</style>", "", text, flags=re.S)
+    text = text.replace('<table border="1" class="dataframe">', "<table>")
+    title, _, rest = text.lstrip().partition("\n")
+    files: dict[str, str | bytes] = {
+        f"gallery/{path.stem}.md": f"{title}\n\n{note}{rest}"
+    }
+    for name, content in resources["outputs"].items():
+        files[f"gallery/{name}"] = content
+    assert all(name.startswith(prefix) for name in resources["outputs"])
+    return files
