@@ -22,7 +22,7 @@ from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
 from mortarbench.case import Case, build, built_case
-from mortarbench.registries import Plugins
+from mortarbench.registries import Plugins, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def solve(
         environment=digest(registries.environment()),
     )
     command = registries.worker_command(spec)
-    with redirect_stdout(stderr):  # whatever the family prints
+    with one_thread(), redirect_stdout(stderr):  # whatever the family prints
         record, solution = measured_once(
             command, case.made, record, registries.reference
         )

@@ -12,7 +12,7 @@ from harness.errors import InputError
 from harness.names import CaseId, parse, unbuilt
 from harness.verify.verdicts import plain
 from mortarbench.arguments import EXPORTS, writable
-from mortarbench.registries import Plugins, Registries, known
+from mortarbench.registries import Plugins, Registries, known, one_thread
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -127,7 +127,8 @@ def built_case(case: CaseId, registries: Registries) -> Case:
     """
     origin = registries.origins.get(case.family.name)
     try:
-        made = case.build(registries.reference)
+        with one_thread():
+            made = case.build(registries.reference)
     except InputError:
         raise
     except (Exception, SystemExit) as e:

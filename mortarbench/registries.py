@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
@@ -46,6 +47,21 @@ def suites_folder() -> Path:
     """Say where the suites lie: in the package, or beside it in a checkout."""
     inside = Path(__file__).parent / "suites"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "suites"
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Keep every library to one thread, as the processes of a run do.
+
+    Sums in another order would make another QP of the same case, in its last digits.
+    """
+    from scipy import linalg  # libraries that are loaded, and only they, can be told
+    from sksparse import cholmod
+    from threadpoolctl import threadpool_limits
+
+    del linalg, cholmod
+    with threadpool_limits(limits=1):
+        yield
 
 
 def reference(qp: QP) -> Solution:

@@ -20,7 +20,7 @@ from harness.names import assemble
 from harness.results.journal import read_journal
 from mortarbench.arguments import budget as checked_budget
 from mortarbench.progress import ignore
-from mortarbench.registries import Plugins, Registries, known
+from mortarbench.registries import Plugins, Registries, known, one_thread
 from mortarbench.text import aligned, legible
 
 OURS = "smalbe"  #: the solver that every other one is set against
@@ -76,6 +76,16 @@ def validate(
     checked_budget(budget)
     registries = known(plugins) if registries is None else registries
     path = Path(folder)
+    with one_thread():
+        return _validated(path, budget, progress, registries)
+
+
+def _validated(
+    path: Path,
+    budget: float,
+    progress: Callable[[str], None],
+    registries: Registries,
+) -> Validation:
     found = validated(path, registries.families, registries.reference, progress)
     data = as_data(found, path.resolve().name, ours=OURS)
     if not (data["counts"]["answers"] or found.false_claims):

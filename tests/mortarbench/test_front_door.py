@@ -1,6 +1,7 @@
 """The library that the command line and notebooks call."""
 
 import json
+import os
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -335,3 +336,20 @@ def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
 )
 def test_what_is_left_takes_as_long_as_what_is_done(done, total, seconds, said):
     assert remaining(done, total, seconds) == said
+
+
+def test_a_case_built_in_many_threads_is_the_one_that_was_measured(tmp_path):
+    """A program of the user's own, whose libraries use all cores."""
+    many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "8")
+    program = (
+        "import mortarbench as mb\n"
+        "found = mb.run('smoke', out='o', cases=['*/dual'], solvers=['smalbe'])\n"
+        "checked = found.validate(budget=0)\n"
+        "print(checked.data['counts']['answers'], checked.agreed)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | many,
+        cwd=tmp_path, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+    assert done.stdout.split() == ["1", "True"]
