@@ -43,8 +43,8 @@ class Results:
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
     solvers: tuple[str, ...] = ()  #: of the suite, in its order
-    missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
     #: what was not measured; the same call tries it again
+    missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
     def df(self) -> DataFrame:
