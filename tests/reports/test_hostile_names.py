@@ -13,6 +13,8 @@ from reports.document.formatting import clean
 from reports.render.latex import escaped as tex
 from reports.render.markdown import escaped as md
 
+pytestmark = pytest.mark.xdist_group("hostile-names")  # one report for all of them
+
 NAMES = (
     "<b onmouseover=a()>&amp;</b><!--",
     r"\end{table}\input|x$^^M%",

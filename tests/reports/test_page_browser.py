@@ -26,6 +26,10 @@ except ModuleNotFoundError:
 from tests.support.synthetic_results import records as synthetic
 from tests.support.synthetic_results import write
 
+pytestmark = pytest.mark.xdist_group(
+    "page"
+)  # one browser, long pages
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOLVERS, CASES, REPEATS = 4, 120, 3
 #: what is off the screen is not laid out, and what is not has no text
