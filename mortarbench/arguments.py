@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from harness.errors import InputError
+from harness.errors import InputError, unknown
 
 EXPORTS = (".npz", ".mat", ".parquet")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")
+FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
 GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
 
 
@@ -72,3 +74,17 @@ def budget(seconds: float, where: str = "budget") -> float:
     if not seconds >= 0:  # a NaN, too
         raise InputError(f"{where} {seconds:g}; expected a number of seconds ≥ 0")
     return seconds
+
+
+def check_formats(formats: Sequence[str], where: str) -> None:
+    """Refuse what is no format of a report.
+
+    Raises
+    ------
+    InputError
+        With what would be right.
+
+    """
+    for form in formats:
+        if form not in FORMATS:
+            raise unknown("format", form, FORMATS, where=where)

@@ -8,12 +8,10 @@ from html import escape
 from pathlib import Path
 
 from harness.checked import positive
-from harness.errors import unknown
 from harness.files.durable import full_disk_told
 from harness.record import VERIFIED_FACTOR
+from mortarbench.arguments import FORMATS, check_formats
 from mortarbench.registries import Registries
-
-FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,17 +72,3 @@ def report(
     with full_disk_told(after):
         said, files = write_comparison(before, after, formats, factor)
     return Report(files=tuple(files), said=tuple(said))
-
-
-def check_formats(formats: Sequence[str], where: str) -> None:
-    """Refuse what is no format of a report.
-
-    Raises
-    ------
-    InputError
-        With what would be right.
-
-    """
-    for form in formats:
-        if form not in FORMATS:
-            raise unknown("format", form, FORMATS, where=where)

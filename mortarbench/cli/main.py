@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
-from harness.files.durable import FULL
-from harness.record import VERIFIED_FACTOR
+from mortarbench.arguments import FORMATS
 from mortarbench.registries import Registries, installed
-from mortarbench.reporting import FORMATS
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 
@@ -52,11 +50,9 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
     except BrokenPipeError:  # as of `mortarbench list solvers | head -1`
         _print_no_more()
         return 0
-    except Exception as e:
-        if isinstance(e, OSError) and e.filename is not None:
-            return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
-        if isinstance(e, OSError) and e.errno in FULL:
-            return _complain(f"a file could not be written: {e.strerror}")
+    except OSError as e:
+        return _told(e)
+    except Exception:
         traceback.print_exc()
         return 3
 
@@ -75,6 +71,18 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
     code = run(registries, options)
     print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
+
+
+def _told(e: OSError) -> int:
+    """Name the file that something is wrong with, or the disk that is full."""
+    from harness.files.durable import FULL  # late: a help text needs no files
+
+    if e.filename is not None:
+        return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
+    if e.errno in FULL:
+        return _complain(f"a file could not be written: {e.strerror}")
+    traceback.print_exc()
+    return 3
 
 
 def _remedied(e: OSError, path: Path) -> str:
@@ -197,7 +205,6 @@ def _add_report_options(command: _Parser) -> None:
         "--factor",
         metavar="F",
         type=float,
-        default=VERIFIED_FACTOR,
         help="verified: every residual within F times the tolerance; default: 10",
     )
 

@@ -5,23 +5,26 @@ from __future__ import annotations
 from argparse import Namespace
 
 from harness.checked import positive
-from mortarbench.arguments import existing
+from mortarbench.arguments import check_formats, existing
 from mortarbench.registries import Registries
-from mortarbench.reporting import check_formats, report
 
 
 def run(registries: Registries, options: Namespace) -> int:
     """Write the report on a result folder, or what changed between two."""
     formats = options.format.split(",")
     check_formats(formats, "--format")
-    factor = positive("--factor", options.factor)
+    if options.factor is not None:
+        positive("--factor", options.factor)
     for folder in filter(None, (options.folder, options.other)):
         existing(folder)
+    from harness.record import VERIFIED_FACTOR
+    from mortarbench.reporting import report
+
     found = report(
         options.folder,
         options.other,
         formats=formats,
-        factor=factor,
+        factor=VERIFIED_FACTOR if options.factor is None else options.factor,
         registries=registries,
     )
     pages = [file for file in found.files if file.suffix == ".html"]

@@ -26,9 +26,7 @@ except ModuleNotFoundError:
 from tests.support.synthetic_results import records as synthetic
 from tests.support.synthetic_results import write
 
-pytestmark = pytest.mark.xdist_group(
-    "page"
-)  # one browser, long pages
+pytestmark = pytest.mark.xdist_group("page")  # one browser, long pages
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOLVERS, CASES, REPEATS = 4, 120, 3
