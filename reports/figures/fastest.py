@@ -65,7 +65,7 @@ def _rows(f: FastestSolver) -> tuple[Competitor, ...]:
 def _height(f: FastestSolver) -> float:
     """Height of all rows, inches."""
     shared = _has_reference(f) and any(c.compared for c in f.others)
-    return max(len(_rows(f)), 2) * (_TALL if shared else _ROW)
+    return max(len(_rows(f)), 4) * (_TALL if shared else _ROW)
 
 
 def _panel(f: FastestSolver, solvers: Sequence[str]) -> Panel:
