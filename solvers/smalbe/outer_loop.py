@@ -166,7 +166,7 @@ def smalbe(
         lagrangian = at.outer[-1].lagrangian
         if small(Point(run.x, run.g), run.face):
             return at._replace(status=Status.SOLVED)
-        if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
+        if (not run.stopped or at.stalled) and infeasible(problem, at.nu):
             return at._replace(status=Status.INFEASIBLE)
         if not run.stopped or left < 0 or (at.stalled and at.rho >= MOST_RHO):
             return at
@@ -195,7 +195,7 @@ def _updated(
     return _with_penalty(problem, new, constants.rho_growth * rho)
 
 
-def _infeasible(problem: Projected, nu: Vector) -> bool:
+def infeasible(problem: Projected, nu: Vector) -> bool:
     """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
 
     By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum
