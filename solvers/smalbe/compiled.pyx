@@ -18,7 +18,7 @@ are compiled twice, for processors with AVX2 and for all others.
 
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.string cimport memcpy, memset
-from scipy.linalg.cython_blas cimport dgemv
+from scipy.linalg.cython_blas cimport dgemv, dsymv
 from scipy.linalg.cython_lapack cimport (
     dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev, dtrtrs,
 )
@@ -34,7 +34,6 @@ cdef extern from *:
     #else
     #define TWICE
     #endif
-    TWICE static void symmetric(const double *, const double *, double *, Py_ssize_t);
     TWICE static void sparse(const int *, const int *, const double *, const double *,
                              double *, Py_ssize_t);
     TWICE static double dot(const double *, const double *, Py_ssize_t);
@@ -48,10 +47,6 @@ cdef extern from *:
         const double *, double, double *, double *, Py_ssize_t, double *);
     TWICE static double conjugate(const double *, double *, const double *, Py_ssize_t,
         double);
-    TWICE static void rows_times(const double *, const double *, double *, Py_ssize_t,
-        Py_ssize_t);
-    TWICE static void columns_times(const double *, const double *, double *,
-        Py_ssize_t, Py_ssize_t);
     TWICE static void add_gram(double, const double *, double *, Py_ssize_t);
     TWICE static void tilted(const double *, const double *, double, const double *,
         const double *, double *, double *, Py_ssize_t);
@@ -60,39 +55,6 @@ cdef extern from *:
 
 
 # --- loops over vectors -------------------------------------------------------------
-
-
-cdef void symmetric "symmetric"(
-    const double *F, const double *v, double *y, Py_ssize_t n
-) noexcept nogil:
-    """y ← Fv, reading the lower triangle of F (n, n) once, four rows at a time."""
-    cdef Py_ssize_t i, j, k, whole = n - n % 4
-    cdef double va, vb, vc, vd, sa, sb, sc, sd, t
-    cdef const double *a
-    cdef const double *b
-    cdef const double *c
-    cdef const double *d
-    for j in range(0, whole, 4):
-        a, b, c, d = F + j * n, F + (j + 1) * n, F + (j + 2) * n, F + (j + 3) * n
-        va, vb, vc, vd = v[j], v[j + 1], v[j + 2], v[j + 3]
-        sa = sb = sc = sd = 0.0
-        for i in range(j):
-            y[i] += va * a[i] + vb * b[i] + vc * c[i] + vd * d[i]
-            sa += a[i] * v[i]
-            sb += b[i] * v[i]
-            sc += c[i] * v[i]
-            sd += d[i] * v[i]
-        y[j] = sa + va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
-        y[j + 1] = sb + va * b[j] + vb * b[j + 1] + vc * c[j + 1] + vd * d[j + 1]
-        y[j + 2] = sc + va * c[j] + vb * c[j + 1] + vc * c[j + 2] + vd * d[j + 2]
-        y[j + 3] = sd + va * d[j] + vb * d[j + 1] + vc * d[j + 2] + vd * d[j + 3]
-    for j in range(whole, n):
-        a = F + j * n
-        t, va = a[j] * v[j], v[j]
-        for i in range(j):
-            y[i] += va * a[i]
-            t += a[i] * v[i]
-        y[j] = t
 
 
 cdef void sparse "sparse"(
@@ -202,45 +164,16 @@ cdef double conjugate "conjugate"(
     return gamma
 
 
-cdef void rows_times "rows_times"(
-    const double *V, const double *v, double *out, Py_ssize_t n, Py_ssize_t k
-) noexcept nogil:
-    """out ← Vᵀv for V (n, k)."""
-    cdef Py_ssize_t i, j
-    cdef double s
-    cdef const double *row
-    memset(out, 0, k * sizeof(double))
-    for i in range(n):
-        s, row = v[i], V + i * k
-        if s != 0:
-            for j in range(k):
-                out[j] += s * row[j]
-
-
-cdef void columns_times "columns_times"(
-    const double *V, const double *c, double *out, Py_ssize_t n, Py_ssize_t k
-) noexcept nogil:
-    """out ← Vc for V (n, k)."""
-    cdef Py_ssize_t i, j
-    cdef double s
-    cdef const double *row
-    for i in range(n):
-        s, row = 0.0, V + i * k
-        for j in range(k):
-            s += row[j] * c[j]
-        out[i] = s
-
-
 cdef void add_gram "add_gram"(
-    double s, const double *row, double *S, Py_ssize_t k
+    double s, const double *v, double *S, Py_ssize_t k
 ) noexcept nogil:
-    """S ← S + s vvᵀ, its lower triangle."""
+    """S ← S + s vvᵀ (k, k)."""
     cdef Py_ssize_t i, j
     cdef double t
     for i in range(k):
-        t = s * row[i]
-        for j in range(i + 1):
-            S[i * k + j] += t * row[j]
+        t = s * v[i]
+        for j in range(k):
+            S[i * k + j] += t * v[j]
 
 
 cdef void tilted "tilted"(
@@ -304,8 +237,11 @@ cdef class Product:
     cdef int apply(self, const double *v, double *y) except -1:
         self.count += 1
         cdef double[::1] vector, result
+        cdef int n = self.n, one = 1
+        cdef double unit = 1.0, zero = 0.0
         if self.dense:
-            symmetric(self.dense, v, y, self.n)
+            dsymv(b"U", &n, &unit, <double *> self.dense, &n, <double *> v, &one, &zero,
+                  y, &one)
         elif self.data:
             sparse(self.indptr, self.indices, self.data, v, y, self.n)
         elif self.n:
@@ -325,15 +261,34 @@ cdef double *first(double[:, ::1] M) noexcept:
     return &M[0, 0] if M.shape[0] and M.shape[1] else NULL
 
 
+cdef void rows_times(
+    const double *U, const double *v, double *out, Py_ssize_t k, Py_ssize_t n
+) noexcept nogil:
+    """out ← Uv for U (k, n) by rows."""
+    cdef int columns = k, order = n, one = 1
+    cdef double unit = 1.0, zero = 0.0
+    if k and n:
+        dgemv(b"T", &order, &columns, &unit, <double *> U, &order, <double *> v, &one,
+              &zero, out, &one)
+
+
+cdef void add_combination(
+    double s, const double *U, const double *c, double *out, Py_ssize_t k, Py_ssize_t n
+) noexcept nogil:
+    """out ← out + s Uᵀc for U (k, n) by rows."""
+    cdef int columns = k, order = n, one = 1
+    cdef double unit = 1.0
+    if k and n:
+        dgemv(b"N", &order, &columns, &s, <double *> U, &order, <double *> c, &one,
+              &unit, out, &one)
+
+
 cdef void without(
     const double *C, Py_ssize_t r, double *v, double *Cv, Py_ssize_t n
 ) noexcept nogil:
     """v ← v − CᵀCv with Cv (r,), which is kept."""
-    cdef Py_ssize_t i
-    for i in range(r):
-        Cv[i] = dot(C + i * n, v, n)
-    for i in range(r):
-        add(-Cv[i], C + i * n, v, n)
+    rows_times(C, v, Cv, r, n)
+    add_combination(-1.0, C, Cv, v, r, n)
 
 
 # --- preparation --------------------------------------------------------------------
@@ -397,6 +352,14 @@ def _orthonormal(unit, Py_ssize_t w):
 
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+
+
+def multipliers(Py_ssize_t m, R, kept, size, a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
+    y = np.zeros(m)
+    if len(kept):
+        y[kept] = _triangular(R, a, b"N") / size[kept]
+    return y
 
 
 def _triangular(R, b, char *transposed):
@@ -476,27 +439,78 @@ cdef struct Until:
 
 
 cdef class Model:
-    """B = τI + V diag(w) Vᵀ with orthonormal columns V (n, k), and what changes τ."""
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n).
 
-    cdef Py_ssize_t n, k
+    It keeps U_F U_Fᵀ for the face F for which it was asked last.
+    """
+
+    cdef Py_ssize_t n, k, flips
+    cdef bint entered
     cdef double tau
-    cdef double[:, ::1] V
-    cdef double[::1] w
+    cdef double[:, ::1] U, gram
+    cdef double[::1] w, root, held, column
 
-    def __cinit__(self, V, w, double tau):
-        self.V, self.w, self.tau = V, w, tau
-        self.n, self.k = V.shape
+    @staticmethod
+    cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
+        """Leave out the rows whose w is not positive."""
+        cdef Model B = Model.__new__(Model)
+        cdef Py_ssize_t i, k = 0
+        for i in range(w.shape[0]):
+            k += w[i] > 0
+        if k < w.shape[0]:
+            kept = np.asarray(w) > 0
+            U, w = np.asarray(U)[kept], np.asarray(w)[kept]
+        B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
+        return B
+
+    cdef double *rows(self) noexcept:
+        return &self.U[0, 0] if self.k else NULL
 
     @staticmethod
     cdef Model of_norm(double norm, Py_ssize_t n):
-        return Model(np.zeros((n, 0)), np.zeros(0), norm)
+        cdef Model B = Model.__new__(Model)
+        B.tau, B.n = norm, n
+        return B
 
     cdef Model with_tail(self, double tau):
         """Change τ and leave w + τ as it is, where that is above τ."""
-        w = np.asarray(self.w) + (self.tau - tau)
-        if w.size and w.min() > 0:
-            return Model(self.V, w, tau)
-        return Model(np.ascontiguousarray(np.asarray(self.V)[:, w > 0]), w[w > 0], tau)
+        cdef double[::1] w = np.array(self.w) if self.k else np.zeros(0)
+        cdef Py_ssize_t i
+        if not self.k:
+            return Model.of_norm(tau, self.n)
+        for i in range(self.k):
+            w[i] += self.tau - tau
+        return Model.above_tail(self.U, w, tau)
+
+    cdef int enter(self, const double *piece) except -1:
+        """Have the Gram matrix be that of the face where `piece` is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew.
+        """
+        cdef Py_ssize_t i, j
+        cdef double was, held
+        cdef double *gram
+        if not self.entered:
+            self.entered = True
+            self.root, self.column = np.sqrt(self.w), np.empty(self.k)
+            self.gram, self.held = np.eye(self.k), np.zeros(self.n)
+        gram = &self.gram[0, 0]
+        if self.flips > self.n:
+            self.flips = 0
+            memset(gram, 0, self.k * self.k * sizeof(double))
+            for i in range(self.k):
+                gram[i * self.k + i] = 1.0
+            memset(&self.held[0], 0, self.n * sizeof(double))
+        for i in range(self.n):
+            was, held = self.held[i], piece[i] != 0
+            if was != held:
+                for j in range(self.k):
+                    self.column[j] = self.U[j, i]
+                add_gram(was - held, &self.column[0], gram, self.k)
+                self.held[i] = held
+                self.flips += 1
+        return 0
 
 
 def _whole(a):
@@ -521,10 +535,10 @@ cdef class Solver:
     cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, s2, held_free
     cdef double[::1] piece, piece2, Cv, Cw, Ge, told
     cdef double tail, phi_square, beta_square, reduced_square
-    cdef Model preconditioner, B
-    cdef double[::1] y, dy, y2, slope, slope2, c, c2, root
-    cdef double[:, ::1] gram, core, inverse
-    cdef bint has_core
+    cdef Model preconditioner, B, known
+    cdef double known_rho
+    cdef double[::1] y, dy, y2, slope, slope2, c, c2
+    cdef double[:, ::1] core, inverse
 
     def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
         rows, spectrum = problem.rows, problem.spectrum
@@ -541,11 +555,12 @@ cdef class Solver:
         self.newton_proportions = rules.proportioning == "model"
         self.plain = rules.expansion != "model"
         self.preconditioned = preconditioned
-        k = self.r
+        k = 0
         if spectrum.ritz is not None:
             above, vectors, self.tail = problem.upper_end()
-            self.above, self.vectors = _whole(above), _whole(vectors)
-            k += len(self.above)
+            self.above = np.append(above, np.zeros(self.r)) - self.tail
+            self.vectors = np.vstack([vectors, rows.C])
+            k = self.above.shape[0]
         n = self.n
         self.room = np.empty((14, n))
         (self.x, self.g, self.p, self.Hp, self.phi, self.free, self.z, self.s, self.Hs,
@@ -553,9 +568,9 @@ cdef class Solver:
         self.rhs, self.piece, self.piece2 = np.empty((3, n))
         self.Cv, self.Cw = np.empty((2, self.r))
         self.Ge, self.told = np.empty(self.m), np.empty(4)
-        (self.y, self.dy, self.y2, self.slope, self.slope2, self.c, self.c2,
-         self.root) = np.empty((8, k))
-        self.gram, self.core, self.inverse = np.empty((3, k, k))
+        (self.y, self.dy, self.y2, self.slope, self.slope2, self.c,
+         self.c2) = np.empty((7, k))
+        self.core, self.inverse = np.empty((2, k, k))
 
     # the operator
 
@@ -571,18 +586,18 @@ cdef class Solver:
         without(first(self.C), self.r, Pv, &self.Cv[0], n)
         self.F.apply(Pv, out)
         scale(self.inverse_norm, out, n)
+        rows_times(first(self.C), out, &self.Cw[0], self.r, n)
         for i in range(self.r):
-            self.Cw[i] = self.rho * self.Cv[i] - dot(&self.C[i, 0], out, n)
-        for i in range(self.r):
-            add(self.Cw[i], &self.C[i, 0], out, n)
+            self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
+        add_combination(1.0, first(self.C), &self.Cw[0], out, self.r, n)
         return 0
 
     cdef double infeasibility(self, const double *x):
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
         cdef Py_ssize_t i
         cdef double square = 0.0
+        rows_times(first(self.C), x, pointer(self.Cv), self.r, self.n)
         for i in range(self.r):
-            self.Cv[i] = dot(&self.C[i, 0], x, self.n)
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
 
@@ -590,36 +605,26 @@ cdef class Solver:
 
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
-        w = np.append(self.above, np.full(self.r, rho)) - self.tail
-        V = np.vstack([self.vectors, self.C])[w > 0]
-        return Model(np.ascontiguousarray(V.T), w[w > 0], self.tail)
+        cdef Py_ssize_t i, k = self.above.shape[0]
+        cdef double[::1] w
+        if self.known is None or self.known_rho != rho:
+            w = np.array(self.above)
+            for i in range(k - self.r, k):
+                w[i] += rho
+            self.known, self.known_rho = Model.above_tail(self.vectors, w, self.tail), rho
+        return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
-        """Factorise τI + W¹ᐟ² V_FᵀV_F W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k, held = 0
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
+        cdef Py_ssize_t i, j, k = B.k
         cdef double *S = first(self.core)
-        cdef const double *V = first(B.V)
         cdef int order = k, info = 0
-        for i in range(self.n):
-            held += piece[i] != 0
-        memset(S, 0, k * k * sizeof(double))
-        if held <= self.n - held:  # the columns are orthonormal
-            for i in range(k):
-                S[i * k + i] = 1.0
-            for i in range(self.n):
-                if piece[i] != 0:
-                    add_gram(-1.0, V + i * k, S, k)
-        else:
-            for i in range(self.n):
-                if piece[i] == 0:
-                    add_gram(1.0, V + i * k, S, k)
+        B.enter(piece)
         for i in range(k):
-            self.root[i] = sqrt(B.w[i])
-        for i in range(k):
-            for j in range(i + 1):
-                S[i * k + j] *= self.root[i] * self.root[j]
+            for j in range(k):
+                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i, j]
             S[i * k + i] += B.tau
-        dpotrf(b"U", &order, S, &order, &info)  # its rows are LAPACK's columns
+        dpotrf(b"U", &order, S, &order, &info)
         if info:
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
@@ -627,16 +632,16 @@ cdef class Solver:
     cdef void tilt(self, Model B, const double *x, const double *g, const double *lower,
                    const double *upper, const double *y, double *s, double *piece,
                    double *slope) noexcept:
-        """Find s(y), its piece and the slope Vᵀs − W⁻¹y."""
+        """Find s(y), its piece and the slope Us − W⁻¹y."""
         cdef Py_ssize_t i, n = self.n
         cdef double *t = pointer(self.t)
         if not B.k:
             tilted(x, g, B.tau, lower, upper, s, piece, n)
             return
-        columns_times(first(B.V), y, t, n, B.k)
-        add(1.0, g, t, n)
+        memcpy(t, g, n * sizeof(double))
+        add_combination(1.0, B.rows(), y, t, B.k, n)
         tilted(x, t, B.tau, lower, upper, s, piece, n)
-        rows_times(first(B.V), s, slope, n, B.k)
+        rows_times(B.rows(), s, slope, B.k, n)
         for i in range(B.k):
             slope[i] -= y[i] / B.w[i]
 
@@ -662,10 +667,10 @@ cdef class Solver:
         for newton in range(NEWTON_STEPS):
             self.factor(B, piece)
             for i in range(k):
-                dy[i] = self.root[i] * slope[i]
+                dy[i] = B.root[i] * slope[i]
             dpotrs(b"U", &order, &one, first(self.core), &order, dy, &order, &info)
             for i in range(k):
-                dy[i] *= self.root[i] * B.tau
+                dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
             begun = dot(slope, dy, k)
             self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
@@ -692,7 +697,7 @@ cdef class Solver:
             memcpy(y, there, k * sizeof(double))
             memcpy(slope, slope_there, k * sizeof(double))
             memcpy(piece, piece_there, n * sizeof(double))
-        largest = B.tau + np.max(B.w)
+        largest = B.tau + np.max(B.w)  # seldom
         return self.step_of_model(
             Model.of_norm(largest, n), x, g, lower, upper, s
         )
@@ -702,7 +707,7 @@ cdef class Solver:
         cdef Py_ssize_t i
         cdef double square = dot(s, s, self.n), rest = square, missing, tau
         missing = sHs - B.tau * square
-        rows_times(first(B.V), s, pointer(self.c), self.n, B.k)
+        rows_times(B.rows(), s, pointer(self.c), B.k, self.n)
         for i in range(B.k):
             rest -= self.c[i] * self.c[i]
             missing -= B.w[i] * self.c[i] * self.c[i]
@@ -725,15 +730,16 @@ cdef class Solver:
         cdef int order, info = 0
         if not self.preconditioned or not self.preconditioner.k:
             return 0
-        k = order = self.preconditioner.k
+        cdef Model M = self.preconditioner
+        k = order = M.k
         for i in range(self.n):
             self.piece[i] = 1 - self.free[i]
-        self.factor(self.preconditioner, &self.piece[0])
+        self.factor(M, &self.piece[0])
         memcpy(N, first(self.core), k * k * sizeof(double))
         dpotri(b"U", &order, N, &order, &info)
         for i in range(k):
             for j in range(i + 1):
-                N[i * k + j] *= self.root[i] * self.root[j]
+                N[i * k + j] *= M.root[i] * M.root[j]
                 N[j * k + i] = N[i * k + j]
         return 0
 
@@ -741,21 +747,20 @@ cdef class Solver:
         """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
         cdef Py_ssize_t i, n = self.n, k
         cdef double tau
-        cdef const double *V
+        cdef const double *U
+        cdef double *z = &self.z[0]
         if not self.preconditioned:
             return &self.phi[0]
         k, tau = self.preconditioner.k, self.preconditioner.tau
-        V = first(self.preconditioner.V)
+        U = self.preconditioner.rows()
+        memcpy(z, &self.phi[0], n * sizeof(double))
         if k:
-            rows_times(V, &self.phi[0], &self.c[0], n, k)
-            for i in range(k):
-                self.c2[i] = dot(first(self.inverse) + i * k, &self.c[0], k)
-            columns_times(V, &self.c2[0], &self.z[0], n, k)
-        else:
-            memset(&self.z[0], 0, n * sizeof(double))
+            rows_times(U, z, &self.c[0], k, n)
+            rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
+            add_combination(-1.0, U, &self.c2[0], z, k, n)
         for i in range(n):
-            self.z[i] = (self.phi[i] - self.z[i]) / tau if self.free[i] else 0.0
-        return &self.z[0]
+            z[i] *= self.free[i] / tau
+        return z
 
     # MPRGP
 
@@ -1090,7 +1095,7 @@ cdef class Solver:
         cdef Py_ssize_t i, j, n = self.n, m = e.shape[0]
         cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
         cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-        cdef double[::1] forces = np.array(z_box)
+        cdef double[::1] forces = np.array(z_box), size = self.s
         if not self.diagonal.shape[0]:
             return INFINITY
         for i in range(m):
@@ -1127,18 +1132,21 @@ cdef class Solver:
                 terms = x[i] - lb[i] if Fx[i] + self.q[i] + forces[i] > 0 else ub[i] - x[i]
                 own = fmin(own, step * fmin(known, terms) / energy)
             worst = fmax(worst, own)
+        for j in range(n if m else 0):
+            step = INFINITY
+            if self.diagonal[j] > 0:
+                step = sqrt(energy / self.diagonal[j])
+            if self.q[j]:
+                step = fmin(step, energy / fabs(self.q[j]))
+            size[j] = 0.0
+            if isfinite(step):
+                size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
         for i in range(m):
             violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
             for j in range(n):
                 violated += G[i, j] * x[j]
                 terms += fabs(G[i, j] * x[j])
-                step = INFINITY
-                if self.diagonal[j] > 0:
-                    step = sqrt(energy / self.diagonal[j])
-                if self.q[j]:
-                    step = fmin(step, energy / fabs(self.q[j]))
-                if isfinite(step):
-                    known += fabs(G[i, j]) * fmax(fmin(fabs(x[j]), 1e3 * step), step)
+                known += fabs(G[i, j]) * size[j]
             total += violated
             if violated:
                 worst = fmax(worst, fabs(violated) / known)

@@ -54,7 +54,7 @@ class Carry(NamedTuple):
     block: FreeBlock | None
 
 
-Solve = Callable[[], tuple[Solution, Carry | None]]
+Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,7 +85,7 @@ def prepared(
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
-        return lambda: (nowhere, None)
+        return lambda: (nowhere, _nothing)
     if eliminated is not None and eliminated.columns:
         problem.F.count += eliminated.columns
         problem.counts["factorised_columns"] += eliminated.columns
@@ -183,7 +183,7 @@ def _compiled_loop(
     return Iterate(nu, g, mu, M, rho, outer, Status(status))
 
 
-def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
+def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | None]]:
     """Tighten the tolerance until the original problem's KKT residuals agree."""
     options, problem, at = task.options, task.problem, task.start
     tighter, best, waited = 1.0, np.inf, 0
@@ -191,14 +191,14 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
         at = task.solve(tighter * tol, at)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
-            return Solution.without_point(task.qp, at.status, message), None
+            return Solution.without_point(task.qp, at.status, message), _nothing
         if not np.isfinite(at.nu).all():
             message = "the iterates diverged"
-            return Solution.without_point(task.qp, Status.FAILED, message), None
+            return Solution.without_point(task.qp, Status.FAILED, message), _nothing
         point, Fx = _point(task, at)
         worst = _worst_residual(task, point, Fx, CLAIM * tol)
         if worst <= CLAIM * tol:
-            return _counted(task, point), _carry(task, at)
+            return _counted(task, point), partial(_carry, task, at)
         waited = 0 if worst < best / 2 else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == PATIENCE:
@@ -209,7 +209,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
     point = replace(point, status=Status.ITERATION_LIMIT, message=message)
-    return _counted(task, point), None
+    return _counted(task, point), _nothing
 
 
 def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
@@ -217,6 +217,10 @@ def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
     x = problem.rows.x_tilde + at.nu
     fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
     return fresh._replace(outer=at.outer)
+
+
+def _nothing() -> None:
+    """Leave nothing for the next problem."""
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:

@@ -149,7 +149,7 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     mismatch = np.abs(dense @ x_tilde - e) / size
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
 
-    multipliers = partial(_multipliers, e.size, R, kept, size)
+    multipliers = partial(compiled.multipliers, e.size, R, kept, size)
     consistent = bool((mismatch <= 1e-8 * scale).all())
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
     pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
@@ -160,16 +160,6 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
 def _dense(G: Matrix) -> NDArray[np.float64]:
     dense = G.toarray() if hasattr(G, "toarray") else G
     return np.ascontiguousarray(dense, dtype=float)
-
-
-def _multipliers(
-    m: int, R: NDArray[np.float64], kept: NDArray[np.int64], size: Vector, a: Vector
-) -> Vector:
-    """Return y (m,) with Gᵀy = Cᵀa, from the QR factorisation of normalised rows."""
-    y = np.zeros(m)
-    if len(kept):
-        y[kept] = solve_triangular(R, a) / size[kept]
-    return y
 
 
 def projected_problem(
@@ -192,7 +182,7 @@ def prepared_problem(qp: QP, steps: int) -> Projected:
         qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
     )
     found = Ritz(*ritz)
-    rows = Rows(*rows, partial(_multipliers, qp.b.size, *triangle))
+    rows = Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
     return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
 
 
