@@ -40,6 +40,7 @@ from solvers.smalbe.spectrum import random_start
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
+FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -139,8 +140,9 @@ def _means(
 ) -> InnerSolver:
     """Choose what the inner problems are solved with."""
     rules = Rules(
-        options.Gamma, options.expansion, options.proportioning, options.reduced
-    )
+        options.Gamma, options.expansion, options.proportioning, options.reduced,
+        options.alpha,
+    )  # fmt: skip
     plain = partial(problem.plain_model, alpha=options.alpha)
     return InnerSolver(
         rules=rules,
@@ -228,7 +230,7 @@ def _point(task: _Task, at: Iterate) -> Solution:
     r = problem.F(x) + qp.q
     free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
-    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free])[0]
+    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free], rcond=FREE_RANK)[0]
     r = r + C.T @ a
     z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)

@@ -12,10 +12,12 @@ Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …
 until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
 is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
 What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
-‖b‖ may be the gap of supports, beside which contact is small.
+‖b‖ may be the gap of supports, beside which contact is small. It may cost half as many
+products again, no more: where stiffnesses differ much, rounding can keep it away.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
-MOST_RHO; and CᵀCν is tried as proof that there is no feasible point.
+MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10 down to
+LEAST_M; and CᵀCν is tried as proof that there is no feasible point.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ from solvers.smalbe.projected import Projected
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products
+FOR_ENERGY = 1.5  #: factor of the products spent that its error may still cost
+LEAST_M = 1e-10  #: beyond which M‖Cν‖ is rounding
 MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
 
 
@@ -132,18 +136,8 @@ def smalbe(
     b_size = _norm(b) or _norm(at.g)
     left = constants.max_steps - len(at.steps) - len(at.outer)
     lagrangian = -np.inf
+    small = _accuracy(problem, tol, b_size, constants.energy)
     until = Until(tol * b_size, constants.eta * b_size, at.M)
-
-    def accurate(here: Point, face: Face) -> bool:
-        error = problem.energy_error(here.x, face.phi + face.beta)
-        return error <= constants.energy * tol
-
-    def small(here: Point, face: Face) -> bool:
-        return (
-            face.projected_norm <= until.small
-            and problem.rows.met(here.x, tol, b_size)
-            and (not constants.energy or accurate(here, face))
-        )
 
     def precise(here: Point, face: Face) -> bool:
         size = face.projected_norm
@@ -168,10 +162,46 @@ def smalbe(
             return at._replace(status=Status.SOLVED)
         if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
             return at._replace(status=Status.INFEASIBLE)
-        if not run.stopped or left < 0 or (at.stalled and at.rho >= MOST_RHO):
+        if not run.stopped or left < 0:
             return at
         if at.stalled:
-            at = _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
+            stricter = _after_stall(
+                problem, at, met=problem.rows.met(at.nu, tol, b_size)
+            )
+            if stricter is None:
+                return at
+            at = stricter
+
+
+def _accuracy(
+    problem: Projected, tol: float, b_size: float, energy: float
+) -> Callable[[Point, Face], bool]:
+    """Make the test that ends the outer loop."""
+    most = 0  # products, once all but the energy is as accurate as asked for
+
+    def reached(here: Point, face: Face) -> bool:
+        nonlocal most
+        if face.projected_norm > tol * b_size:
+            return False
+        if not problem.rows.met(here.x, tol, b_size):
+            return False
+        spent = problem.counts["P_products"]
+        most = most or int(FOR_ENERGY * spent)
+        if energy == 0 or spent >= most:
+            return True
+        error = problem.energy_error(here.x, face.phi + face.beta)
+        return error <= energy * tol
+
+    return reached
+
+
+def _after_stall(problem: Projected, at: Iterate, *, met: bool) -> Iterate | None:
+    """Be stricter with the rows, or, where they are `met`, with the gradient."""
+    if met:
+        return at._replace(M=at.M / 10) if at.M >= LEAST_M else None
+    if at.rho >= MOST_RHO:
+        return None
+    return _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
 
 
 def _updated(
