@@ -422,10 +422,12 @@ cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
 # --- MPRGP and the outer loop -------------------------------------------------------
 
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
+cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
 
 cdef enum:
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
+    MOST_IDLE = 5
     STD = 0
     PROJCG = 1
     MIXED = 2
@@ -532,11 +534,12 @@ cdef class Solver:
     cdef double[:, ::1] C, GC, vectors, room
     cdef const double[::1] q, diagonal
     cdef double[::1] x_tilde, b, lower, upper, above, rhs
-    cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, s2, held_free
+    cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
     cdef double[::1] piece, piece2, Cv, Cw, Ge, told
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
     cdef double known_rho
+    cdef long most_products  # where the energy error may still cost something
     cdef double[::1] y, dy, y2, slope, slope2, c, c2
     cdef double[:, ::1] core, inverse
 
@@ -564,7 +567,7 @@ cdef class Solver:
         n = self.n
         self.room = np.empty((14, n))
         (self.x, self.g, self.p, self.Hp, self.phi, self.free, self.z, self.s, self.Hs,
-         self.t, self.x2, self.g2, self.s2, self.held_free) = self.room
+         self.t, self.x2, self.g2, self.box_lower, self.box_upper) = self.room
         self.rhs, self.piece, self.piece2 = np.empty((3, n))
         self.Cv, self.Cw = np.empty((2, self.r))
         self.Ge, self.told = np.empty(self.m), np.empty(4)
@@ -711,6 +714,8 @@ cdef class Solver:
         for i in range(B.k):
             rest -= self.c[i] * self.c[i]
             missing -= B.w[i] * self.c[i] * self.c[i]
+        if missing <= 0:
+            return B
         tau = B.tau + missing / rest if rest > 0 else INFINITY
         return B.with_tail(fmin(fmax(tau, B.tau), 10 * B.tau))
 
@@ -777,7 +782,7 @@ cdef class Solver:
         move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
              &self.x[0], &self.g[0], self.n)
 
-    cdef int along_step_of_model(self) except -1:
+    cdef int step_by_model(self) except -1:
         """Minimise the model over the box, then the cost along that step.
 
         0 where there is nothing to gain, or the cost falls without end.
@@ -806,12 +811,12 @@ cdef class Solver:
         self.to(length, s, Hs)
         return 1
 
-    cdef int proportion(self) except -1:
+    cdef int proportion(self, bint by_model) except -1:
         """Take a step that frees components; 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double *beta = &self.s[0]
-        if self.newton_proportions:
-            return self.along_step_of_model()
+        if by_model:
+            return self.step_by_model()
         for i in range(n):
             beta[i] = 0.0
             if not self.free[i] and (
@@ -827,7 +832,7 @@ cdef class Solver:
         self.to(fmin(self.told[0], self.told[1]), beta, &self.Hs[0])
         return 1
 
-    cdef int expand(self, double cg, double feasible) except -1:
+    cdef int expand(self, double cg, double feasible, bint is_first) except -1:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
@@ -842,17 +847,64 @@ cdef class Solver:
                 memcpy(&self.x[0], &self.x2[0], n * sizeof(double))
                 memcpy(&self.g[0], &self.g2[0], n * sizeof(double))
                 return b"e"
-        self.to(feasible, &self.p[0], &self.Hp[0])
         if self.expansion == MODEL:
-            if not self.along_step_of_model() and not feasible > 0:
-                return 0
-            return b"e"
+            return self.expand_by_model(cg, feasible, is_first)
+        self.to(feasible, &self.p[0], &self.Hp[0])
         self.split()
         for i in range(n):
             step = self.x[i] - self.phi[i] / self.B.tau  # cuts φ to φ̃
             self.x[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
         self.gradient(&self.x[0], &self.g[0])
         return b"f" if self.expansion == MIXED else b"e"
+
+    cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
+        """Project x − α_cg p on the box in the metric of the model."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double *p = &self.p[0]
+        cdef double *Hp = &self.Hp[0]
+        cdef double *s = &self.s[0]
+        cdef double *Hs = &self.Hs[0]
+        cdef double *lower = &self.box_lower[0]
+        cdef double *upper = &self.box_upper[0]
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
+        cdef bint held, moves = False
+        change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
+        self.to(feasible, p, Hp)
+        for i in range(n):
+            held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
+            held = held and not is_first
+            lower[i] = self.x[i] if held else self.lower[i]
+            upper[i] = self.x[i] if held else self.upper[i]
+            self.x2[i] = self.x[i] - beyond * p[i]
+            self.g2[i] = self.g[i] - beyond * Hp[i]
+        tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
+        self.step_of_model(self.B, &self.x2[0], &self.g2[0], lower, upper, s)
+        self.B.tau = tau
+        for i in range(n):
+            held = lower[i] == upper[i] and not is_first
+            s[i] = 0.0 if held else self.x2[i] + s[i] - self.x[i]
+        if dot(&self.g[0], s, n) >= 0:
+            beyond = 0.0
+            self.step_of_model(self.B, &self.x[0], &self.g[0], lower, upper, s)
+        for i in range(n):
+            moves = moves or s[i] != 0
+        if not moves:
+            return b"e"
+        self.H(s, Hs)
+        scale(-1.0, s, n)
+        scale(-1.0, Hs, n)
+        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
+                &self.told[0])
+        length = fmin(self.told[0], fmax(1.0, self.told[1]))
+        if isinf(length):
+            return 0
+        if -self.told[2] + 0.5 * self.told[3] + change < 0:
+            length = fmax(length, 1.0)
+        self.to(length, s, Hs)
+        add(-beyond, p, s, n)
+        add(-beyond, Hp, Hs, n)
+        self.B = self.raised(self.B, s, dot(s, Hs, n))
+        return b"e"
 
     cdef int gradient(self, const double *x, double *g) except -1:
         """g ← Hx − b; one product."""
@@ -863,8 +915,9 @@ cdef class Solver:
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
                       long most, bytearray trace) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
-        cdef long steps = 0
+        cdef long steps = 0, idle = 0
         cdef int letter
+        cdef bint by_model = self.newton_proportions, has_expanded = False
         cdef double curvature, weight
         self.split()
         self.enter_face()
@@ -876,7 +929,9 @@ cdef class Solver:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
-                letter = b"p" if self.proportion() else 0
+                by_model = by_model and idle < MOST_IDLE
+                idle += 1
+                letter = b"p" if self.proportion(by_model) else 0
             else:
                 self.H(&self.p[0], &self.Hp[0])
                 lengths(&self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
@@ -888,11 +943,13 @@ cdef class Solver:
                     letter = b"c"
                     self.to(self.told[0], &self.p[0], &self.Hp[0])
                 else:
-                    letter = self.expand(self.told[0], self.told[1])
+                    letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                    has_expanded = True
             if not letter:
                 return 0
             self.split()
             if letter == b"c":
+                idle = 0
                 conjugate(self.preconditioned_gradient(), &self.p[0], &self.Hp[0],
                           self.n, curvature)
             else:
@@ -913,21 +970,26 @@ cdef class Solver:
         return size <= until.small and self.small(tol, energy, b_size)
 
     cdef bint small(self, double tol, double energy, double b_size):
-        """Whether the rows are met and the energy error is small, as estimated."""
+        """Whether rows are met and the energy error is small or has cost its share."""
+        if not self.met(tol, b_size):
+            return False
+        if not self.most_products:
+            self.most_products = <long> (1.5 * self.F.count)
+        if not energy or self.F.count >= self.most_products:
+            return True
+        return self.energy_error() <= energy * tol
+
+    cdef bint met(self, double tol, double b_size):
+        """Whether the equality rows are met, as `Rows.met` says."""
         cdef double error = self.infeasibility(&self.x[0]), square = 0.0, part
         cdef Py_ssize_t i
         if self.e_size == 0:
             part = sqrt(dot(&self.x[0], &self.x[0], self.n))
-            if not error <= tol * fmax(part, b_size):
-                return False
-        else:
-            for i in range(self.m):
-                part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0
-                square += part * part
-            if not (error <= tol * self.x_tilde_size
-                    and sqrt(square) <= tol * self.e_size):
-                return False
-        return not energy or self.energy_error() <= energy * tol
+            return error <= tol * fmax(part, b_size)
+        for i in range(self.m):
+            part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0
+            square += part * part
+        return error <= tol * self.x_tilde_size and sqrt(square) <= tol * self.e_size
 
     cdef double energy_error(self):
         """Estimate the relative energy error, as `Projected.energy_error` does."""
@@ -965,7 +1027,7 @@ cdef class Solver:
         cdef bint stopped, enough, solved, stalled
         cdef Until until
         np.asarray(self.x)[:], np.asarray(self.g)[:] = at.nu, at.g
-        self.rho = at.rho
+        self.rho, self.most_products = at.rho, 0
         cdef double[::1] mu = np.array(at.mu)
         cdef double b_size = sqrt(dot(pointer(self.b), pointer(self.b), n))
         b_size = b_size or sqrt(dot(&self.g[0], &self.g[0], n))
@@ -1013,9 +1075,15 @@ cdef class Solver:
             if (not stopped or stalled) and infeasible(np.asarray(self.x)):
                 status = "infeasible"
                 break
-            if not stopped or left < 0 or (stalled and self.rho >= MOST_RHO):
+            if not stopped or left < 0:
                 break
-            if stalled:
+            if stalled and self.met(tol, b_size):
+                if M < LEAST_M:
+                    break
+                M /= 10
+            elif stalled:
+                if self.rho >= MOST_RHO:
+                    break
                 self.change_penalty(fmin(10 * self.rho, MOST_RHO))
         return (np.array(self.x), np.array(self.g), np.asarray(mu), M, self.rho, done,
                 status)

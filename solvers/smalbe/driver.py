@@ -41,6 +41,7 @@ from solvers.smalbe.spectrum import random_start
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
+FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -149,8 +150,9 @@ def _outer_loop(
 ) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
     """Choose what runs the outer loop: compiled, or as it is written."""
     rules = Rules(
-        options.Gamma, options.expansion, options.proportioning, options.reduced
-    )
+        options.Gamma, options.expansion, options.proportioning, options.reduced,
+        options.alpha,
+    )  # fmt: skip
     constants = Constants(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
@@ -271,7 +273,7 @@ def recovered(
     r = Fx + qp.q
     free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
-    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free])[0]
+    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free], rcond=FREE_RANK)[0]
     r = r + C.T @ a
     z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)

@@ -21,6 +21,7 @@ from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
+FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
 TAIL = 1e-4  #: least τ of a model, relative to the norm
 
 
@@ -114,8 +115,10 @@ class Projected:
 
         The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
         what the Ritz vectors before it leave (the last, where the process came to its
-        end); ρQ is taken as it is. Where that is too
-        little, as in flat spectra, MPRGP raises τ by what its products show.
+        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
+        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
+        a short process finds not even the first eigenvector, and Ritz vectors that are
+        none would slow CG down: then only the norm is used.
         """
         C, (above, U, tail) = self.rows.C, self.upper_end()
         w = np.append(above, np.full(len(C), rho))
@@ -129,6 +132,10 @@ class Projected:
         above = (ritz.values + ritz.residuals) / self.spectrum.norm
         ended = ritz.residuals[-1] <= 1e-10 * ritz.values[0]
         kept = max(len(above) - (1 if ended else 2), 0)
+        unknown = np.flatnonzero(ritz.residuals > ritz.values)
+        kept = min([kept, *unknown[:1]])
+        if ritz.residuals[0] > FOUND * ritz.values[0]:
+            kept = 0
         return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
     def plain_model(self, rho: float, *, alpha: float) -> Model:

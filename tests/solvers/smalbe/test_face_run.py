@@ -66,6 +66,8 @@ def test_compiled_steps_take_the_path_that_is_written(qp, preconditioner, expans
     for compiled in (False, True):
         problem = projected(qp)
         with_model = preconditioner == "model"
+        plain = problem.plain_model(1.0, alpha=1.9)
+        B = problem.model(1.0) if expansion == "model" else plain
         lower, b = problem.bounds[0], problem.b
         x = np.maximum(-problem.rows.x_tilde, lower)
         stop = 1e-5 * np.linalg.norm(b)
@@ -73,7 +75,7 @@ def test_compiled_steps_take_the_path_that_is_written(qp, preconditioner, expans
         steps = mprgp(
             partial(problem.H, rho=1.0), b, problem.bounds,
             (x, problem.H(x, 1.0) - b),
-            B=problem.plain_model(1.0, alpha=1.9), rules=rules,
+            B=B, rules=rules,
             stop=lambda at, face, stop=stop: face.projected_norm <= stop,
             precondition=problem.model(1.0).inverse_in if with_model else None,
             run=run(1.0, Until(stop, 0.0, 0.0)) if compiled else None, max_steps=20,
