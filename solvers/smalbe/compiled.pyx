@@ -427,7 +427,7 @@ cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
 cdef enum:
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
-    MOST_IDLE = 5
+    MOST_IDLE = 2
     STD = 0
     PROJCG = 1
     MIXED = 2
@@ -917,7 +917,8 @@ cdef class Solver:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
         cdef long steps = 0, idle = 0
         cdef int letter
-        cdef bint by_model = self.newton_proportions, has_expanded = False
+        cdef bint by_model, has_expanded = False
+        cdef double chopped = INFINITY
         cdef double curvature, weight
         self.split()
         self.enter_face()
@@ -929,8 +930,9 @@ cdef class Solver:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
-                by_model = by_model and idle < MOST_IDLE
-                idle += 1
+                idle = idle + 1 if self.beta_square > chopped / 2 else 0
+                chopped = self.beta_square
+                by_model = self.newton_proportions and idle < MOST_IDLE
                 letter = b"p" if self.proportion(by_model) else 0
             else:
                 self.H(&self.p[0], &self.Hp[0])
@@ -949,7 +951,6 @@ cdef class Solver:
                 return 0
             self.split()
             if letter == b"c":
-                idle = 0
                 conjugate(self.preconditioned_gradient(), &self.p[0], &self.Hp[0],
                           self.n, curvature)
             else:
