@@ -40,6 +40,7 @@ from solvers.smalbe.spectrum import random_start
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
+LEAST_LANCZOS = 5
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
@@ -116,7 +117,10 @@ def _find(
         now = float(v @ PFP(v)) / float(v @ v or 1.0)
         if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
             return carry.spectrum.orthogonal_to(rows)
-    return by_lanczos(PFP, rows, steps=options.lanczos_steps)
+    most = max(
+        LEAST_LANCZOS, rows.x_tilde.size // 6
+    )  # they would outweigh few CG steps
+    return by_lanczos(PFP, rows, steps=min(options.lanczos_steps, most))
 
 
 def _start(

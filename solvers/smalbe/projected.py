@@ -198,7 +198,7 @@ def _mean_eigenvalue(P: Matrix) -> float:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    ritz = lanczos(PFP, rows.project(random_start(rows.x_tilde.size)), min(steps, max(5, rows.x_tilde.size // 6)))
+    ritz = lanczos(PFP, rows.project(random_start(rows.x_tilde.size)), steps)
     return Spectrum(ritz.norm or 1.0, ritz)
 
 
