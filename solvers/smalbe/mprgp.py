@@ -279,8 +279,8 @@ def _model_expansion(
     relaxation, as gradient projection steps are longer than 1/‖H‖. What the half step
     left at a bound stays there, unless this is the `first` expansion, before which the
     active set is a guess, and the model knows more than a norm. From the half step it
-    goes all the way to z + r if the cost ends below that at x, else as far as it lessens
-    the cost.
+    goes all the way to z + r if the cost ends below that at x, else as far as that
+    lessens the cost.
     """
     (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
     release = first and len(B.U) > 0
