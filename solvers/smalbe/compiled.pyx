@@ -39,8 +39,10 @@ cdef extern from "vectors.h" nogil:
     void split(const double *x, const double *g, const double *lower,
                const double *upper, double tau, double *phi, double *free,
                Py_ssize_t n, double *told)
-    void conjugate(const double *z, double *p, const double *Hp, double curvature,
-                   Py_ssize_t n)
+    void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
+                 const double *lower, const double *upper, double tau, double *phi,
+                 double *free, Py_ssize_t n, double *told)
+    void turn(const double *z, double gamma, double *p, Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
@@ -277,6 +279,7 @@ cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
 # --- MPRGP and the outer loop -------------------------------------------------------
 
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
+cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
 
 cdef enum:
@@ -719,12 +722,12 @@ cdef class Solver:
         cdef double *lower = &self.box_lower[0]
         cdef double *upper = &self.box_upper[0]
         cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
-        cdef bint held, moves = False
+        cdef bint held, moves = False, release = is_first and self.B.k > 0
         change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
         self.to(feasible, p, Hp)
         for i in range(n):
             held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
-            held = held and not is_first
+            held = held and not release
             lower[i] = self.x[i] if held else self.lower[i]
             upper[i] = self.x[i] if held else self.upper[i]
             self.x2[i] = self.x[i] - beyond * p[i]
@@ -733,7 +736,7 @@ cdef class Solver:
         self.step_of_model(self.B, &self.x2[0], &self.g2[0], lower, upper, s)
         self.B.tau = tau
         for i in range(n):
-            held = lower[i] == upper[i] and not is_first
+            held = lower[i] == upper[i] and not release
             s[i] = 0.0 if held else self.x2[i] + s[i] - self.x[i]
         if dot(&self.g[0], s, n) >= 0:
             beyond = 0.0
@@ -771,7 +774,7 @@ cdef class Solver:
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
-        cdef double curvature, weight
+        cdef double weight
         self.split()
         self.enter_face()
         memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
@@ -784,33 +787,43 @@ cdef class Solver:
             if self.beta_square > self.Gamma_square * weight:
                 idle = idle + 1 if self.beta_square > chopped / 2 else 0
                 chopped = self.beta_square
-                by_model = self.newton_proportions and idle < MOST_IDLE
+                by_model = idle < MOST_IDLE or not self.B.k
+                by_model = by_model and self.newton_proportions
                 letter = b"p" if self.proportion(by_model) else 0
             else:
                 self.H(&self.p[0], &self.Hp[0])
                 lengths(&self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
                         &self.lower[0], &self.upper[0], self.n, &self.told[0])
-                curvature = self.told[3]
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
-                    letter = b"c"
-                    self.to(self.told[0], &self.p[0], &self.Hp[0])
-                else:
-                    letter = self.expand(self.told[0], self.told[1], not has_expanded)
-                    has_expanded = True
+                    self.minimise_along_p()
+                    trace.append(b"c")
+                    steps += 1
+                    continue
+                letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                has_expanded = True
             if not letter:
                 return 0
             self.split()
-            if letter == b"c":
-                conjugate(self.preconditioned_gradient(), &self.p[0], &self.Hp[0],
-                          curvature, self.n)
-            else:
-                self.enter_face()
-                memcpy(&self.p[0], self.preconditioned_gradient(),
-                       self.n * sizeof(double))
+            self.enter_face()
+            memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
             trace.append(letter)
             steps += 1
+
+    cdef void minimise_along_p(self):
+        """Take the CG step whose `lengths` are told, and find the next direction."""
+        cdef double curvature = self.told[3], z_Hp
+        cdef const double *z
+        advance(self.told[0], &self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
+                &self.lower[0], &self.upper[0], self.B.tau, &self.phi[0],
+                &self.free[0], self.n, &self.told[0])
+        self.phi_square, self.beta_square = self.told[0], self.told[1]
+        self.reduced_square, z_Hp = self.told[2], self.told[3]
+        z = self.preconditioned_gradient()
+        if z != &self.phi[0]:
+            z_Hp = dot(z, &self.Hp[0], self.n)
+        turn(z, z_Hp / curvature, &self.p[0], self.n)
 
     # when to stop
 
@@ -827,7 +840,7 @@ cdef class Solver:
         if not self.met(tol, b_size):
             return False
         if not self.most_products:
-            self.most_products = <long> (1.5 * self.F.count)
+            self.most_products = <long> (FOR_ENERGY * self.F.count)
         if not energy or self.F.count >= self.most_products:
             return True
         return self.energy_error() <= energy * tol

@@ -41,6 +41,7 @@ from solvers.smalbe.spectrum import random_start
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
+LEAST_LANCZOS = 5  #: steps, however few unknowns there are
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
@@ -102,7 +103,7 @@ def prepared(
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
     if carry is None and options.norm == "lanczos" and not options.history:
-        return prepared_problem(qp, options.lanczos_steps)
+        return prepared_problem(qp, _lanczos_steps(options, qp.q.size))
     return projected_problem(qp, partial(_find, options, carry))
 
 
@@ -126,7 +127,12 @@ def _find(
         now = float(v @ PFP(v)) / float(v @ v or 1.0)
         if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
             return carry.spectrum.orthogonal_to(rows)
-    return by_lanczos(PFP, rows, steps=options.lanczos_steps)
+    return by_lanczos(PFP, rows, steps=_lanczos_steps(options, rows.x_tilde.size))
+
+
+def _lanczos_steps(options: Options, n: int) -> int:
+    """Take few of them for few unknowns, where they would outweigh the CG steps."""
+    return min(options.lanczos_steps, max(LEAST_LANCZOS, n // 6))
 
 
 def _start(

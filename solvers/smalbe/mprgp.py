@@ -14,8 +14,8 @@ Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient
 length ᾱ takes beyond a bound.
 
 Every step but projcg's lessens the cost. Expansion never frees a component that the
-half step left at a bound, but for the first expansion by the model: from one
-proportioning to the next the active set only grows. docs/smalbe.md says what follows.
+half step left at a bound, but for the first expansion by a model of directions: from
+one proportioning to the next the active set only grows. docs/smalbe.md: what follows.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ Precondition = Callable[[Mask], Operator]  #: free components → their precondi
 #: the CG step as far as it is feasible was all)
 Expansion = Literal["std", "projcg", "mixed", "model"]
 #: cg: minimise along −β, as far as feasible (the book's; 1 product)
-#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); but cg where
-#: from one to the next `MOST_IDLE` times in a row ‖β‖² was not halved
+#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); else cg
+#: where from one to the next `MOST_IDLE` times in a row ‖β‖² was not halved
 Proportioning = Literal["cg", "model"]
 MOST_IDLE = 2
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
@@ -150,7 +150,9 @@ def mprgp(
         if _disproportional(task, at, face, B):
             idle = idle + 1 if face.beta_square > chopped / 2 else 0
             chopped = face.beta_square
-            step = _proportion(task, at, face, B, by_model=idle < MOST_IDLE)
+            step = _proportion(
+                task, at, face, B, by_model=idle < MOST_IDLE or not len(B.U)
+            )
         else:
             Hp = H(p)
             step = _minimise_or_expand(task, at, p, Hp, B, first="e" not in trace)
@@ -250,11 +252,13 @@ def _model_expansion(
     and z + r is where the right side is least, with the tail of B divided by the
     relaxation, as gradient projection steps are longer than 1/‖H‖. What the half step
     left at a bound stays there, unless this is the `first` expansion, before which the
-    active set is a guess. From the half step it goes all the way to z + r if the cost
-    ends below that at x, else as far as it lessens the cost.
+    active set is a guess, and the model knows more than a norm. From the half step it
+    goes all the way to z + r if the cost ends below that at x, else as far as that
+    lessens the cost.
     """
     (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
-    held = ((half.x <= lower) | (half.x >= upper)) & (not first)
+    release = first and len(B.U) > 0
+    held = ((half.x <= lower) | (half.x >= upper)) & (not release)
     box = np.where(held, half.x, lower), np.where(held, half.x, upper)
     beyond = cg - feasible if math.isfinite(cg) else 0.0
     z = Point(half.x - beyond * p, half.g - beyond * Hp)

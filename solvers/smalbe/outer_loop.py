@@ -12,8 +12,8 @@ Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …
 until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
 is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
 What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
-‖b‖ may be the gap of supports, beside which contact is small. It may cost half as many
-products again, no more: where stiffnesses differ much, rounding can keep it away.
+‖b‖ may be the gap of supports, beside which contact is small. It may cost a quarter
+more products, not more: where stiffnesses differ much, rounding can keep it away.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
 MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10 down to
@@ -44,7 +44,7 @@ from solvers.smalbe.projected import Projected
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products
-FOR_ENERGY = 1.5  #: factor of the products spent that its error may still cost
+FOR_ENERGY = 1.25  #: factor of the products spent that its error may still cost
 LEAST_M = 1e-10  #: beyond which M‖Cν‖ is rounding
 MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
 

@@ -50,28 +50,40 @@ TWICE static void scale(double s, double *a, Py_ssize_t n)
         a[i] *= s;
 }
 
+#define BLOCK 256 /* components that stay in the cache from one loop to the next */
+typedef long long __attribute__((may_alias)) ordered; /* as doubles ≥ 0 are */
+
 /* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. */
 TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
                           out told)
 {
-    double curvature = 0, slope = 0, feasible = INFINITY;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double bound = p[i] > 0 ? lower[i] : upper[i];
-        double room = (x[i] - bound) / p[i];
-        room = p[i] != 0 ? room : INFINITY;
-        feasible = room < feasible ? room : feasible;
-        curvature += p[i] * Hp[i];
-        slope += g[i] * p[i];
+    double curvature = 0, slope = 0, room[BLOCK], feasible = INFINITY;
+    ordered least = *(ordered *) &feasible;
+    for (Py_ssize_t first = 0; first < n; first += BLOCK) {
+        Py_ssize_t size = n - first < BLOCK ? n - first : BLOCK;
+        for (Py_ssize_t j = 0; j < size; j++) {
+            Py_ssize_t i = first + j;
+            double bound = p[i] > 0 ? lower[i] : upper[i];
+            double to = (x[i] - bound) / p[i];
+            to = to > 0 ? to : 0;
+            room[j] = p[i] != 0 ? to : INFINITY;
+            curvature += p[i] * Hp[i];
+            slope += g[i] * p[i];
+        }
+        for (Py_ssize_t j = 0; j < size; j++) {
+            ordered to = *(ordered *) (room + j);
+            least = to < least ? to : least;
+        }
     }
+    feasible = *(double *) &least;
     told[0] = curvature > 0 ? slope / curvature : INFINITY;
     told[1] = feasible;
     told[2] = slope;
     told[3] = curvature;
 }
 
-/* x = x - αp and g = g - αHp; what is nearer to a bound than rounding is on it. */
-TWICE static void move(double alpha, out x, out g, in p, in Hp, in lower, in upper,
-                       Py_ssize_t n)
+static inline __attribute__((always_inline)) void
+move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
         double step = alpha * p[i], to = x[i] - step;
@@ -84,9 +96,10 @@ TWICE static void move(double alpha, out x, out g, in p, in Hp, in lower, in upp
     }
 }
 
-/* φ, free components (1, others 0); told = ‖φ‖², ‖β‖², φ̃ᵀφ with ᾱ = 1/τ. */
-TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out free,
-                        Py_ssize_t n, out told)
+/* Adds to told, which begins as zeros. */
+static inline __attribute__((always_inline)) void
+split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ssize_t n,
+            out told)
 {
     double phi_square = 0, beta_square = 0, reduced = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -104,18 +117,46 @@ TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out
         beta_square += b * b;
         reduced += cut * f;
     }
-    told[0] = phi_square;
-    told[1] = beta_square;
-    told[2] = reduced;
+    told[0] += phi_square;
+    told[1] += beta_square;
+    told[2] += reduced;
 }
 
-/* p = z - (zᵀHp/pᵀHp) p. */
-TWICE static void conjugate(in z, out p, in Hp, double curvature, Py_ssize_t n)
+/* x = x - αp and g = g - αHp; what is nearer to a bound than rounding is on it. */
+TWICE static void move(double alpha, out x, out g, in p, in Hp, in lower, in upper,
+                       Py_ssize_t n)
 {
-    double gamma = 0;
-    for (Py_ssize_t i = 0; i < n; i++)
-        gamma += z[i] * Hp[i];
-    gamma /= curvature;
+    move_block(alpha, x, g, p, Hp, lower, upper, n);
+}
+
+/* φ, free components (1, others 0); told = ‖φ‖², ‖β‖², φ̃ᵀφ with ᾱ = 1/τ. */
+TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out free,
+                        Py_ssize_t n, out told)
+{
+    told[0] = told[1] = told[2] = 0;
+    split_block(x, g, lower, upper, tau, phi, free, n, told);
+}
+
+/* What `move` and `split` do, in one go through memory; told[3] = φᵀHp. */
+TWICE static void advance(double alpha, out x, out g, in p, in Hp, in lower, in upper,
+                          double tau, out phi, out free, Py_ssize_t n, out told)
+{
+    told[0] = told[1] = told[2] = told[3] = 0;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        double phi_Hp = 0;
+        move_block(alpha, x + i, g + i, p + i, Hp + i, lower + i, upper + i, size);
+        split_block(x + i, g + i, lower + i, upper + i, tau, phi + i, free + i, size,
+                    told);
+        for (Py_ssize_t j = i; j < i + size; j++)
+            phi_Hp += phi[j] * Hp[j];
+        told[3] += phi_Hp;
+    }
+}
+
+/* p = z - γp. */
+TWICE static void turn(in z, double gamma, out p, Py_ssize_t n)
+{
     for (Py_ssize_t i = 0; i < n; i++)
         p[i] = z[i] - gamma * p[i];
 }

@@ -1,5 +1,7 @@
 """The path that MPRGP takes, which no test of its answer can see."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -360,3 +362,43 @@ def test_a_rounded_model_is_never_lowered():
     s = np.array([0.0, 1.0])
 
     assert B.raised(s, 0.5).tau == 1.0
+
+
+def model_run(problem, rules, B=None, tol=1e-6):
+    """Run with the letter, the active set and the cost of each step kept."""
+    A, b, lower = problem
+    upper, seen = np.full(b.size, np.inf), []
+
+    def watch(letter, at, face):
+        seen.append((letter, ~face.free, float(at.x @ (at.g - b)) / 2))
+
+    norm = np.linalg.norm(A, 2)
+    run, products = minimise(
+        A, b, lower, upper, rules=rules, watch=watch, tol=tol * np.linalg.norm(b),
+        B=B or Model.of_norm(norm, b.size),
+    )  # fmt: skip
+    assert run.stopped
+    return seen, products
+
+
+def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it():
+    """Else an expansion undoes the one before, and conjugate gradients never run."""
+    seen, products = model_run(string(), Rules())
+    expansions = 0
+    for (_, before, _), (letter, after, _) in pairwise(seen):
+        if letter == "e":
+            expansions += 1
+            assert (after | ~before).all()
+            assert after.sum() > before.sum()
+
+    assert expansions > 5
+    assert products <= 267  # of PERMON's rules
+
+
+def test_every_step_by_the_model_lessens_the_cost():
+    for expansion in ("model", "std"):
+        costs = [
+            cost for _, _, cost in model_run(string(), Rules(expansion=expansion))[0]
+        ]
+
+        assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()

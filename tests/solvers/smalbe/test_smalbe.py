@@ -223,14 +223,14 @@ def test_every_product_with_F_is_counted(dual):
 
 
 def test_products_are_explained_by_the_steps(dual):
-    """12 Lanczos, homogenisation, start gradient; 1 per c or p, 2 per e, 3 per f; the
-    residual on the original problem and its check."""
+    """5 Lanczos (n = 30), homogenisation, start gradient; 1 per c or p, 2 per e, 3 per
+    f; the residual on the original problem and its check."""
     s = SMALBE().prepare(dual(271828), 1e-6)()
     c = s.counts
 
     steps = c.get("cg", 0) + c.get("proportioning", 0)
     steps += 2 * c.get("expansion", 0) + 3 * c.get("fallback", 0)
-    assert c["P_products"] == 12 + 1 + 1 + steps + 1
+    assert c["P_products"] == 5 + 1 + 1 + steps + 1
 
 
 def test_with_equalities_only_it_agrees_with_the_saddle_point_system():
