@@ -8,6 +8,8 @@ import pytest
 from harness import QP, Solution
 from harness.conformance.manufactured import manufactured as drawn
 from harness.limits import ONE_THREAD
+from harness.processes import supervisor
+from tests.support.fork_server import Forks
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -29,6 +31,25 @@ def state(tmp_path_factory):
     """The key that signs built cases lies elsewhere than that of the user."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def forks():
+    """What forks the processes of runs from interpreters that have loaded modules."""
+    forks = Forks()
+    yield forks
+    forks.close()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def how_processes_start(forks):
+    """Runs in this process start theirs as forks, see `tests.support.fork_server`.
+
+    Where how they start is tested, a fixture of this name lets them start as they do.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(supervisor, "subprocess", forks)
         yield
 
 
