@@ -23,6 +23,7 @@ import time
 import traceback
 from ctypes import CDLL
 from importlib import import_module
+from pathlib import Path
 from threading import Lock
 
 from harness.limits import ONE_THREAD
@@ -38,6 +39,13 @@ PLUGINS = ("mortarbench.cli.main", "mortarbench.cli.processes")
 OURS = (
     *PLUGINS, "solvers.smalbe.kernels", "problems.fem.kernels", "sksparse.cholmod",
 )  # fmt: skip
+
+#: has a program of its own, such as a notebook's kernel, start its workers as forks
+INSTALL = (
+    f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+    "import fork_server; from harness.processes import supervisor; "
+    "supervisor.subprocess = fork_server.Forks()\n"
+)
 
 
 class Forks:
