@@ -1,5 +1,6 @@
 """Shared by all tests: a CPU for each pytest worker, QPs of known solution."""
 
+import gc
 import os
 from collections.abc import Callable
 
@@ -24,6 +25,12 @@ def pytest_configure(config: pytest.Config) -> None:
         cpus = sorted(os.sched_getaffinity(0))
         index = int(worker["workerid"].removeprefix("gw")) % len(cpus)
         os.sched_setaffinity(0, cpus[index :: worker["workercount"]])
+
+
+def pytest_collection_finish() -> None:
+    """Keep tests and libraries out of the collections before every measurement."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
