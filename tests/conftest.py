@@ -33,6 +33,11 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    """Let the end of the process free what is left: some libraries look at that."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory):
     """The key that signs built cases lies elsewhere than that of the user."""
