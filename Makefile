@@ -3,6 +3,8 @@ PYTHON ?= python3
 # one thread in every library: what tests and benchmarks measure does not depend on it
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
+# modules are compiled once, not by each of the processes that tests start
+unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 
 # that stand for the wildcards of the registry
@@ -38,7 +40,7 @@ demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 
 test: setup browser check  ## check, then run the tests on all CPUs
 	$(BIN)/pytest -q -n auto --dist loadgroup -m 'not slow and not alone'
-	$(BIN)/pytest -q -m 'alone and not slow'
+	$(BIN)/pytest -q -m 'alone and not slow' $$(grep -rl 'mark\.alone' tests --include='*.py')
 
 mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
 	@$(BIN)/python tools/mutants.py

@@ -1,5 +1,6 @@
 """Shared by all tests: a CPU for each pytest worker, QPs of known solution."""
 
+import gc
 import os
 from collections.abc import Callable
 
@@ -8,6 +9,8 @@ import pytest
 from harness import QP, Solution
 from harness.conformance.manufactured import manufactured as drawn
 from harness.limits import ONE_THREAD
+from harness.processes import supervisor
+from tests.support.fork_server import Forks
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -24,11 +27,41 @@ def pytest_configure(config: pytest.Config) -> None:
         os.sched_setaffinity(0, cpus[index :: worker["workercount"]])
 
 
+def pytest_collection_finish() -> None:
+    """Keep tests and libraries out of the collections before every measurement."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    """Let the end of the process free what is left: some libraries look at that."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory):
     """The key that signs built cases lies elsewhere than that of the user."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def forks():
+    """What forks the processes of runs from interpreters that have loaded modules."""
+    forks = Forks()
+    yield forks
+    forks.close()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def how_processes_start(forks):
+    """Runs in this process start theirs as forks, see `tests.support.fork_server`.
+
+    Where how they start is tested, a fixture of this name lets them start as they do.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(supervisor, "subprocess", forks)
         yield
 
 

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,14 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("harness", "problems", "solvers", "reports", "mortarbench")
 
 
+@cache
 def modules(*packages):
     """All modules of the five packages, or of others, by their path, parsed."""
-    for package in packages or PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            yield str(path.relative_to(ROOT)), ast.parse(path.read_text("utf-8"))
+    return [
+        (str(path.relative_to(ROOT)), ast.parse(path.read_text("utf-8")))
+        for package in packages or PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+    ]
 
 
 def users(name):

@@ -11,6 +11,7 @@ import pytest
 from nbclient import NotebookClient
 
 from tests.support import ROOT
+from tests.support.fork_server import INSTALL
 
 GALLERY = ROOT / "docs" / "gallery"
 
@@ -29,6 +30,7 @@ def execute(tmp_path, monkeypatch):
         notebook = nbformat.read(GALLERY / f"{name}.ipynb", as_version=4)
         told = f"import json; print(json.dumps([{','.join(expressions)}]))"
         end = nbformat.v4.new_code_cell(told)
+        notebook.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))
         notebook.cells.append(end)
         client = NotebookClient(
             notebook,
@@ -36,7 +38,7 @@ def execute(tmp_path, monkeypatch):
             resources={"metadata": {"path": str(folder)}},
         )
         client.execute()
-        return json.loads(end.outputs[0].text), kinds(notebook.cells[:-1])
+        return json.loads(end.outputs[0].text), kinds(notebook.cells[1:-1])
 
     return run
 
@@ -60,6 +62,7 @@ def test_notebooks_are_stored_without_outputs():
         assert not any(cell.outputs or cell.execution_count for cell in code), path
 
 
+@pytest.mark.slow
 def test_a_first_comparison(execute):
     """All is verified, and at one tolerance errors differ tenfold, below √tol."""
     (statuses, spread, worst), shown = execute(
@@ -90,6 +93,7 @@ def test_your_own_solver(execute):
     assert shown["image/png"] == 1
 
 
+@pytest.mark.slow
 def test_your_own_bodies(execute):
     """Mortar pressures come nearer to Hertz with the mesh, others do not."""
     (rows,), shown = execute("own-bodies", "rows")

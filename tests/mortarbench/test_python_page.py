@@ -3,9 +3,12 @@
 import doctest
 import re
 
+import pytest
+
 from tests.support import ROOT
 
 
+@pytest.mark.slow
 def test_the_page_shows_what_happens(tmp_path, monkeypatch, capsys):
     """Every example, in its order."""
     page = (ROOT / "docs" / "python.md").read_text("utf-8")

@@ -127,7 +127,7 @@ def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
 
 
 @pytest.mark.parametrize("name", WARM)
-@pytest.mark.parametrize("jump", [1e2, 1e4])
+@pytest.mark.parametrize("jump", [1e2, pytest.param(1e4, marks=pytest.mark.slow)])
 def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(
     manufactured, name, jump
 ):

@@ -21,6 +21,7 @@ from harness.results.journal import read_journal
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.fork_server import INSTALL
 
 pytest.importorskip("distributed")
 
@@ -66,11 +67,14 @@ class Cluster:
     def address(self):
         return json.loads(self._file.read_text())["address"]
 
-    def join(self, nthreads=1):
+    def join(self, nthreads=1, preload=INSTALL):
+        preloaded = self.folder / "preloaded.py"
+        preloaded.write_text(preload)
         worker = started(
             "worker", "--scheduler-file", str(self._file), "--nthreads", str(nthreads),
             "--no-nanny", "--no-dashboard", "--memory-limit", "0",
-            "--local-directory", str(self.folder), env=self._env,
+            "--local-directory", str(self.folder), "--preload", str(preloaded),
+            env=self._env,
         )  # fmt: skip
         self.workers.append(worker)
         return worker
@@ -281,7 +285,7 @@ def descendants(process):
 
 
 def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
-    worker = cluster.join()
+    worker = cluster.join(preload="")
     idle = []
 
     def look():
@@ -300,7 +304,7 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
 def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     cli, cluster, tmp_path
 ):
-    worker = cluster.join()
+    worker = cluster.join(preload="")
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "

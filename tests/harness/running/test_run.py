@@ -20,6 +20,7 @@ from harness.errors import FaultError
 from harness.files.store import load_fields, load_solution
 from harness.names import assemble
 from harness.processes import measurement as remote
+from harness.processes import supervisor
 from harness.registry import SolverSpec, load_plugin, resolve
 from harness.results.faults import left, read_faults
 from harness.results.journal import read_journal
@@ -778,6 +779,12 @@ def family(process):
                 yield from family(int(child))
 
 
+@pytest.fixture
+def own_interpreters(monkeypatch):
+    """Processes are started as a run does: forks show no command in /proc."""
+    monkeypatch.setattr(supervisor, "subprocess", subprocess)
+
+
 def kill_worker(solver):
     """Kill what serves a solver: our processes with its name as an argument."""
     for process in list(family(os.getpid()))[1:]:
@@ -788,7 +795,7 @@ def kill_worker(solver):
 
 
 def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
-    measure, tmp_path
+    measure, tmp_path, own_interpreters
 ):
     measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))
 

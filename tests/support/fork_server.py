@@ -1,0 +1,200 @@
+"""Starts the processes of runs as forks of one interpreter that has loaded libraries.
+
+An interpreter of its own takes each worker half a second of CPU time for imports, more
+than most tests have it do. What `Server.popen` gives in its place is a process like any
+other: it has its own memory, signals and exit code, its files, environment and limits
+are those that it is started with, the sub-reaper above it is the one of
+`harness.processes.reaper`, and that one's parent is the process that asked. Only what
+an interpreter does before it runs a program is left out. Where that is tested, or
+`/proc/PID/environ` is, processes are started as users start them.
+
+Run as a program with a socket and modules to import, it is the server.
+"""
+
+import gc
+import json
+import os
+import resource
+import runpy
+import socket
+import subprocess
+import sys
+import time
+import traceback
+from ctypes import CDLL
+from importlib import import_module
+from pathlib import Path
+from threading import Lock
+
+from harness.limits import ONE_THREAD
+from harness.processes import reaper
+
+LONGEST = 2**20  #: bytes of a request
+LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIMIT_"]
+PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+
+#: what is loaded for plug-ins, which start as ``python -P FILE``
+PLUGINS = ("mortarbench.cli.main", "mortarbench.cli.processes")
+#: what is loaded for ``python -P -m mortarbench``, whose solvers and cases are ours
+OURS = (
+    *PLUGINS, "solvers.smalbe.kernels", "problems.fem.kernels", "sksparse.cholmod",
+)  # fmt: skip
+
+#: has a program of its own, such as a notebook's kernel, start its workers as forks
+INSTALL = (
+    f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
+    "import fork_server; from harness.processes import supervisor; "
+    "supervisor.subprocess = fork_server.Forks()\n"
+)
+
+
+class Forks:
+    """Stands for the module `subprocess` in `harness.processes.supervisor`."""
+
+    PIPE = subprocess.PIPE
+    TimeoutExpired = subprocess.TimeoutExpired
+
+    def __init__(self):
+        self._servers = {}
+        self._lock = Lock()
+
+    def Popen(self, args, **how):
+        """Start a worker below its sub-reaper, and all else as it is."""
+        own = [sys.executable, "-I", "-S", reaper.__file__]
+        if args[:4] != own or args[7:9] != [sys.executable, "-P"] or args[9] == "-c":
+            return subprocess.Popen(args, **how)
+        modules = OURS if args[9] == "-m" else PLUGINS
+        with self._lock:
+            if modules not in self._servers:
+                self._servers[modules] = Server(modules)
+            return Forked(self._servers[modules], args[4:], **how)
+
+    def close(self):
+        for server in self._servers.values():
+            server.close()
+
+
+class Server:
+    """The parent's side of an interpreter that has loaded some modules."""
+
+    def __init__(self, modules):
+        self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            fd = theirs.fileno()
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", __file__, str(fd), *modules],
+                pass_fds=[fd],
+                env=os.environ | ONE_THREAD,
+            )
+
+    def close(self):
+        self._ours.close()
+        self._process.wait()
+
+    def start(self, arguments, env, fds):
+        """Have a sub-reaper forked, and be its parent; returns its number."""
+        request = {
+            "arguments": arguments,
+            "env": env,
+            "cwd": os.getcwd(),
+            "cpus": sorted(os.sched_getaffinity(0)),
+            "limits": [resource.getrlimit(limit) for limit in LIMITS],
+        }
+        adopt(True)
+        try:
+            socket.send_fds(self._ours, [json.dumps(request).encode()], fds)
+            return int(self._ours.recv(LONGEST))
+        finally:
+            adopt(False)
+
+
+class Forked:
+    """What the supervisor uses of a `subprocess.Popen`."""
+
+    def __init__(self, server, arguments, *, env, stdin, stdout, stderr, **how):
+        assert stdin == subprocess.PIPE
+        assert how.pop("start_new_session")
+        assert list(how) == ["pass_fds"]
+        assert list(map(str, how["pass_fds"])) == arguments[1:3]
+        theirs, ours = os.pipe()
+        try:
+            fds = [theirs, stdout.fileno(), stderr.fileno(), *how["pass_fds"]]
+            self.pid = server.start(arguments, dict(env), fds)
+        finally:
+            os.close(theirs)
+        self.stdin = open(ours, "wb")  # noqa: SIM115
+
+    def wait(self, timeout=float("inf")):
+        deadline = time.monotonic() + timeout
+        while os.waitpid(self.pid, os.WNOHANG) == (0, 0):
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("a fork", timeout)
+            time.sleep(0.001)
+
+    def kill(self):
+        os.kill(self.pid, 9)
+
+
+def adopt(orphans):
+    """Become the parent of orphaned descendants, or no longer."""
+    CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(orphans), 0, 0, 0)
+
+
+def serve(asked):
+    """Fork a process for each request, and leave it to the one that asked."""
+    while True:
+        message, fds, _, _ = socket.recv_fds(asked, LONGEST, 5)
+        if not message:
+            return
+        told, tells = os.pipe()
+        if (between := os.fork()) == 0:
+            if child := os.fork():
+                os.write(tells, str(child).encode())
+                os._exit(0)
+            for fd in (told, tells, asked.detach()):
+                os.close(fd)
+            become(json.loads(message), fds)
+        os.waitpid(between, 0)  # from here on the child is an orphan
+        asked.send(os.read(told, 20))
+        for fd in (told, tells, *fds):
+            os.close(fd)
+
+
+def become(request, fds):
+    """Be the sub-reaper that was asked for; below it, the program."""
+    os.setsid()
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["env"])
+    os.sched_setaffinity(0, request["cpus"])
+    for limit, values in zip(LIMITS, request["limits"], strict=True):
+        resource.setrlimit(limit, values)
+    for fd, at in zip(fds[:3], (0, 1, 2), strict=True):
+        os.dup2(fd, at)
+        os.close(fd)
+    cpu, _, _, *command = request["arguments"]
+    os.execvp = run
+    reaper.main([cpu, *map(str, fds[3:]), *command])
+
+
+def run(_, command):
+    """Do what python does with ``-P FILE ARGUMENT…`` or ``-P -m MODULE ARGUMENT…``."""
+    sys.argv = command[2:]
+    try:
+        if sys.argv[0] == "-m":
+            sys.argv = sys.argv[1:]
+            runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+        else:
+            runpy.run_path(sys.argv[0], run_name="__main__")
+    except OSError:  # would be taken for one of execvp
+        traceback.print_exc()
+        sys.exit(1)
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    _, own, *loaded = sys.argv
+    for module in loaded:
+        import_module(module)
+    gc.freeze()  # pages that no collection writes to stay shared
+    serve(socket.socket(fileno=int(own)))
