@@ -31,10 +31,7 @@ def compiled() -> list[Path]:
 
     with tempfile.TemporaryDirectory() as folder:
         extensions = cythonize(
-            [
-                _extension(name, flags)
-                for name, flags in MODULES.items()
-            ],
+            [_extension(name, flags) for name, flags in MODULES.items()],
             build_dir=folder,
             quiet=True,
         )
@@ -74,4 +71,3 @@ class Extensions(BuildHookInterface):  # type: ignore[type-arg]
         build_data["artifacts"] += [
             str(library.relative_to(ROOT)) for library in compiled()
         ]
-

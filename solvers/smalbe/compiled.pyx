@@ -972,8 +972,8 @@ cdef class Solver:
     def point(self, nu, mu, const double[::1] lb, const double[::1] ub):
         """Return x, a, z_box and Fx of the problem with the rows Cx = Cx̃; one product.
 
-        As `solvers.smalbe.driver` has it; a (r,) belongs to those rows. a is None where
-        the rows are too nearly dependent on the free components for normal equations.
+        As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
+        they are too nearly dependent on the free components for normal equations.
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
@@ -1005,7 +1005,7 @@ cdef class Solver:
             dpotrf(b"U", &order, &S[0, 0], &order, &info)
             for i in range(r):
                 if info or S[i, i] < 1e-4:
-                    return np.asarray(x), None, None, np.asarray(Fx)
+                    return None
             dpotrs(b"U", &order, &one, &S[0, 0], &order, &da[0], &order, &info)
         for i in range(r):
             a[i] -= da[i]

@@ -157,7 +157,7 @@ def outer_loop(
     options: Options,
     history: History | None = None,
     *,
-    compile: bool = True,
+    is_compiled: bool = True,
 ) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
     """Choose what runs the outer loop: compiled where it can be, or as it is written.
 
@@ -171,7 +171,7 @@ def outer_loop(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
     )  # fmt: skip
-    if compile and history is None and options.preconditioner in WITHOUT_P:
+    if is_compiled and history is None and options.preconditioner in WITHOUT_P:
         with_model = options.preconditioner == "model"
         solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
         return partial(_compiled_loop, solver, problem, constants), solver
@@ -192,10 +192,10 @@ def _compiled_loop(
     tol: float,
     at: Iterate,
 ) -> Iterate:
-    nu, g, mu, M, rho, outer, status = solver.smalbe(
+    nu, g, mu, M, rho, done, status = solver.smalbe(
         constants, tol, at, partial(infeasible, problem)
     )
-    outer = (*at.outer, *map(OuterIteration._make, outer))
+    outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
     return Iterate(nu, g, mu, M, rho, outer, Status(status))
 
 
@@ -252,12 +252,8 @@ def _carry(task: _Task, at: Iterate) -> Carry:
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     """Return to the problem as given; the product of what was solved with its x."""
     qp, problem = task.inner, task.problem
-    if task.solver is None:
-        x, a, z_box, Fx = recovered(problem, qp, at)
-    else:
-        x, a, z_box, Fx = task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
-        if a is None:
-            x, a, z_box, Fx = recovered(problem, qp, at)
+    found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+    x, a, z_box, Fx = found or recovered(problem, qp, at)
     steps = Counter(STEPS[letter] for letter in at.steps)
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),

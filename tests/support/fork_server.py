@@ -37,7 +37,7 @@ PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 PLUGINS = ("mortarbench.cli.main", "mortarbench.cli.processes")
 #: what is loaded for ``python -P -m mortarbench``, whose solvers and cases are ours
 OURS = (
-    *PLUGINS, "solvers.smalbe.kernels", "problems.fem.kernels", "sksparse.cholmod",
+    *PLUGINS, "solvers.smalbe.solver", "problems.fem.kernels", "sksparse.cholmod",
 )  # fmt: skip
 
 #: has a program of its own, such as a notebook's kernel, start its workers as forks

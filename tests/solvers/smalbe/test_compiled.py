@@ -111,7 +111,7 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
     qp, runs = random_qp(seed, kind), []
     for written in (False, True):
         problem = projected_problem(qp, partial(by_lanczos, steps=12))
-        solve, solver = outer_loop(problem, qp, options, compile=not written)
+        solve, solver = outer_loop(problem, qp, options, is_compiled=not written)
         assert (solver is None) == written
         start = first_iterate(
             problem, problem.rows.x_tilde * 0, np.zeros(len(problem.rows.C)),
@@ -151,16 +151,21 @@ def test_the_way_back_is_as_it_is_written(seed):
         problem, 0 * qp.q, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4
     )
     at = solve(1e-8, start)
-    x, a, z_box, Px = solver.point(at.nu, at.mu, qp.lb, qp.ub)
+    found = solver.point(at.nu, at.mu, qp.lb, qp.ub)
     also_x, also_a, also_z, _ = recovered(problem, qp, at)
 
+    free = (at.nu > problem.bounds[0]) & (at.nu < problem.bounds[1])
+    least = np.linalg.svd(problem.rows.C[:, free], compute_uv=False).min(initial=1)
+    assert (found is None) == (least == 0 or free.sum() < len(problem.rows.C))
+    if found is None:
+        return
+    x, a, z_box, Px = found
     assert x == pytest.approx(also_x)
     assert Px == pytest.approx(qp.P @ x, rel=1e-9, abs=1e-9)
-    if a is not None:
-        assert z_box == pytest.approx(also_z, abs=1e-6 * (1 + np.abs(also_z).max()))
-        assert problem.rows.C.T @ a == pytest.approx(
-            problem.rows.C.T @ also_a, abs=1e-6 * (1 + np.abs(also_a).max(initial=0))
-        )
+    assert z_box == pytest.approx(also_z, abs=1e-6 * (1 + np.abs(also_z).max()))
+    assert problem.rows.C.T @ a == pytest.approx(
+        problem.rows.C.T @ also_a, abs=1e-6 * (1 + np.abs(also_a).max(initial=0))
+    )
 
 
 @pytest.mark.parametrize("seed", range(200))
@@ -174,6 +179,7 @@ def test_no_point_has_residuals_above_the_bound(seed):
     _, solver = outer_loop(prepared_problem(qp, 12), qp, SOLVERS["smalbe"])
     G = np.ascontiguousarray(qp.A.toarray() if hasattr(qp.A, "toarray") else qp.A)
     for size in (0.0, 1e-9, 1e-6, 1e-3, 1.0, 1e3):
+
         def noise(v, size=size):
             return v + size * (1 + np.abs(v)) * rng.standard_normal(v.size)
 

@@ -1,0 +1,60 @@
+from collections.abc import Callable
+import numpy as np
+from numpy.typing import NDArray
+
+from harness import Matrix, Vector
+from solvers.smalbe.mprgp import Rules
+from solvers.smalbe.outer_loop import Constants, Iterate
+from solvers.smalbe.projected import Projected
+
+Array = NDArray[np.float64]
+Kept = NDArray[np.int64]
+
+class Product:
+    count: int
+    def __init__(self, P: Matrix, n: int) -> None: ...
+    def __call__(self, v: Vector) -> Vector: ...
+
+class Solver:
+    def __init__(
+        self,
+        problem: Projected,
+        F: Product,
+        rules: Rules,
+        alpha: float,
+        preconditioned: bool,
+    ) -> None: ...
+    def smalbe(
+        self,
+        constants: Constants,
+        tol: float,
+        at: Iterate,
+        infeasible: Callable[[Vector], bool],
+    ) -> tuple[
+        Vector,
+        Vector,
+        Vector,
+        float,
+        float,
+        list[tuple[str, float, float, float, float]],
+        str,
+    ]: ...
+    def point(
+        self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
+    ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
+    def residual_bound(
+        self,
+        x: Vector,
+        y: Vector,
+        z_box: Vector,
+        Fx: Vector,
+        lb: Vector,
+        ub: Vector,
+        G: Array,
+        e: Vector,
+    ) -> float: ...
+
+def prepare(
+    P: Matrix, n: int, G: Array, e: Vector, start: Vector, steps: int
+) -> tuple[Product, tuple[Any, ...], tuple[Array, Kept, Vector], tuple[Any, ...]]: ...
+def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...
