@@ -56,5 +56,10 @@ class Solver:
 
 def prepare(
     P: Matrix, n: int, G: Array, e: Vector, start: Vector, steps: int
-) -> tuple[Product, tuple[Any, ...], tuple[Array, Kept, Vector], tuple[Any, ...]]: ...
+) -> tuple[
+    Product,
+    tuple[Array, Array, Array, float, float, Vector, bool],
+    tuple[Array, Kept, Vector],
+    tuple[Vector, Vector, Array, float],
+]: ...
 def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...
