@@ -1,4 +1,5 @@
 from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 

@@ -185,11 +185,11 @@ def projected_problem(
 def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
     start = random_start(qp.q.size)
-    F, rows, triangle, ritz = compiled.prepare(
+    F, orthonormal, triangle, ritz = compiled.prepare(
         qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
     )
     found = Ritz(*ritz)
-    rows = Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
+    rows = Rows(*orthonormal, partial(compiled.multipliers, qp.b.size, *triangle))
     return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
 
 
