@@ -20,6 +20,7 @@ from problems.fem.elasticity import (
 from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import (
     GeneralisedInverse,
+    Interface,
     floating_inverse,
     regular_inverse,
     supported_inverse,
@@ -141,8 +142,9 @@ def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     parts = [points[owner == b] for b in range(len(bodies.names))]
     kernels = [rigid_modes(part) for part in parts]
     fixing = [fixing_nodes(part) for part in parts]
-    touched = np.union1d(bodies.interface, bodies.B_D.indices) if condense else None
-    return floating_inverse(bodies.K, kernels, fixing, touched)
+    touched = np.union1d(bodies.interface, bodies.B_D.indices)
+    interface = Interface(touched, bodies.mesh.points) if condense else None
+    return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
 def clamped(bodies: Bodies) -> GeneralisedInverse:
@@ -162,13 +164,15 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
             "exist; expected form primal or dual"
         )
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), held)
-    return regular_inverse(bodies.K, free, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
+    return regular_inverse(bodies.K, free, interface)
 
 
 def supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, and what else a body needs."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
-    return supported_inverse(bodies.K, free, bodies.rigid, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
+    return supported_inverse(bodies.K, free, bodies.rigid, interface)
 
 
 def _elasticity_matrices(
