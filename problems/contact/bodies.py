@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csc_array, csr_array, eye_array
+from scipy.linalg import block_diag
+from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import InputError, Vector
 from problems.fem.elasticity import (
@@ -84,7 +85,7 @@ class Bodies:
         """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
         owner, points = self.body_of_node, self.mesh.points
         modes = [rigid_modes(points[owner == b]) for b in range(len(self.names))]
-        return np.asarray(block_diag([csr_array(R) for R in modes]).toarray())
+        return np.asarray(block_diag(*modes))
 
     @property
     def mesh_size(self) -> float:

@@ -26,13 +26,15 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 from scipy.linalg import lapack, null_space, qr
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
 from harness import Matrix, Vector
+from problems.fem.kernels import congruence
 from problems.fem.mesh import Nodes, dofs_of
-from problems.fem.multifrontal import Multifrontal, multifrontal
+from problems.fem.multifrontal import Multifrontal, multifrontal, spread_symmetric
 
 
 NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
@@ -62,6 +64,9 @@ class GeneralisedInverse(Protocol):
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n), exactly symmetric."""
 
+    def at_constraints(self, b: Vector) -> Vector:
+        """Return K⁺b (n,) where constraints can touch, for b (n,) that acts there."""
+
 
 @dataclass(frozen=True, eq=False)
 class Factorised:
@@ -83,6 +88,10 @@ class Factorised:
         F = B @ self(B.T.toarray())
         return np.asarray((F + F.T) / 2)
 
+    def at_constraints(self, b: Vector) -> Vector:
+        """Solve: this is right everywhere."""
+        return self(b)
+
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
@@ -102,11 +111,18 @@ class Condensed:
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ; ValueError where B touches other components."""
-        B_c = csr_array(B)[:, self.interface]
-        if B_c.count_nonzero() != B.count_nonzero():
+        B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
+        number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
+        F, within = congruence(B.indptr, B.indices, B.data, number, self.compliance)
+        if not within:
             raise ValueError("rows touch components outside the condensed interface")
-        F = B_c @ (B_c @ self.compliance).T
-        return np.asarray((F + F.T) / 2)
+        return F
+
+    def at_constraints(self, b: Vector) -> Vector:
+        """Multiply with (K⁺)_cc; zero elsewhere."""
+        u = np.zeros(b.size)
+        u[self.interface] = self.compliance @ b[self.interface]
+        return u
 
 
 def regular_inverse(
@@ -151,9 +167,8 @@ def floating_inverse(
     R_star = csc_array(block_diag(starred))
     rho = K.diagonal().max()
     K_rho = csc_array(K + rho * (R_star @ R_star.T))
-    whole = np.asarray(block_diag([csr_array(R) for R in kernels]).toarray())
-    free = np.arange(K.shape[0])
-    return _inverse(K_rho, free, whole, interface, np.concatenate(fixed))
+    free, kernel = np.arange(K.shape[0]), linalg.block_diag(*kernels)
+    return _inverse(K_rho, free, kernel, interface, np.concatenate(fixed))
 
 
 def supported_inverse(
@@ -194,14 +209,13 @@ def _inverse(
         K_ff = csc_matrix(K[free][:, free])
         factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
         return Factorised(factor, free, kernel, perf_counter() - start)
-    touched = np.unique(interface.components)
+    touched = interface.components
     last = np.concatenate([touched, fixed])
     factor = multifrontal(K, free, interface.points, last)
+    number = np.full(K.shape[0], -1, dtype=np.int32)
+    number[touched] = np.arange(touched.size, dtype=np.int32)
     compliance = np.zeros((touched.size, touched.size))
     for components, U in factor.trailing():
-        upper, _ = lapack.dpotri(U)
-        among = np.isin(components, touched)
-        here = np.searchsorted(touched, components[among])
-        block = np.triu(upper) + np.triu(upper, 1).T
-        compliance[np.ix_(here, here)] = block[np.ix_(among, among)]
+        lower, _ = lapack.dpotri(U.T, lower=1)
+        spread_symmetric(lower.T, number[components], compliance)
     return Condensed(factor, touched, compliance, kernel, perf_counter() - start)

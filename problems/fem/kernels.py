@@ -1,4 +1,4 @@
-"""Compiled loops of the stiffness assembly.
+"""Compiled loops of the stiffness assembly, and of the congruence with its inverse.
 
 Bilinear quadrilaterals couple each node to few others, so the sparsity pattern is
 found node by node, and each cell adds its 64 entries straight into the CSC arrays: no
@@ -142,3 +142,28 @@ def add_stiffness(
                 data[at + row] += Ke[2 * i + 1, 2 * j]
                 data[at + row + 1] += Ke[2 * i + 1, 2 * j + 1]
     return data
+
+
+@njit(cache=True)
+def congruence(
+    ptr: Ints, idx: Ints, data: Floats, number: Ints, C: Floats
+) -> tuple[Floats, bool]:
+    """Multiply BCBᵀ (m, m), exactly symmetric, for sparse rows B (m, n) in CSR.
+
+    Column j of B belongs to row number[j] of the symmetric C (c, c); also returned:
+    whether every entry of B has one (number[j] ≥ 0).
+    """
+    m = len(ptr) - 1
+    F, row = np.empty((m, m)), np.empty(len(C))
+    for i in range(m):
+        row[:] = 0
+        for t in range(ptr[i], ptr[i + 1]):
+            if number[idx[t]] < 0:
+                return F, False
+            row += data[t] * C[number[idx[t]]]
+        for j in range(i + 1):
+            total = 0.0
+            for t in range(ptr[j], ptr[j + 1]):
+                total += row[number[idx[t]]] * data[t]
+            F[i, j] = F[j, i] = total
+    return F, True

@@ -99,36 +99,62 @@ def eliminate(
 ) -> bool:  # fmt: skip
     """Write the rows of U front by front; say whether all pivots were positive."""
     place = np.zeros(len(order), dtype=np.int32)  # in the front, of a position
-    waiting = [(np.empty((0, 0)), np.empty(0, dtype=np.int32))]
+    store = np.empty(_most_waiting(first, children))  # what fronts left, one on another
+    waiting, top = [0][:0], 0
     for s in range(len(start) - 1):
-        low, high = start[s], start[s + 1]
-        own, ahead = high - low, border[first[s] : first[s + 1]]
-        size = own + len(ahead)
-        U = rows[offset[s] : offset[s + 1]].reshape(own, size)
-        S = np.zeros((len(ahead), len(ahead)))
-        for p in range(low, high):
+        low, own, ahead = start[s], start[s + 1] - start[s], border[first[s] : first[s + 1]]
+        left = len(ahead)
+        U = rows[offset[s] : offset[s + 1]].reshape(own, own + left)
+        S = store[top : top + left * left].reshape(left, left)
+        S[:] = 0
+        for p in range(low, low + own):
             place[p] = p - low
-        for t, p in enumerate(ahead):
-            place[p] = own + t
-        for p in range(low, high):
+        for t in range(left):
+            place[ahead[t]] = own + t
+        for p in range(low, low + own):
             for t in range(indptr[order[p]], indptr[order[p] + 1]):
                 q = position[indices[t]]
                 if q >= p:
                     U[p - low, place[q]] = data[t]
         for _ in range(children[s]):
-            below, at = waiting.pop()
-            to = place[at]
-            for i in range(len(at)):
-                target = U[to[i]] if to[i] < own else S[to[i] - own]
-                shift = 0 if to[i] < own else own
-                for j in range(i, len(at)):
-                    target[to[j] - shift] += below[i, j]
+            child = waiting.pop()
+            at = border[first[child] : first[child + 1]]
+            top -= len(at) ** 2
+            below = store[top : top + len(at) ** 2].reshape(len(at), len(at))
+            _add(below, place[at], own, U, S)
         if not _factorise_rows(U):
             return False
-        if size > own:
-            _subtract_product(S, U[:, own:].T.copy())
-        waiting.append((S, ahead))
+        _subtract_product(S, U[:, own:].T.copy())
+        store[top : top + left * left] = S.ravel()  # on the place of its children
+        waiting.append(s)
+        top += left * left
     return True
+
+
+@njit(cache=True)
+def _most_waiting(first: Ints, children: Ints) -> int:
+    """Count the numbers that `eliminate` has to keep at a time."""
+    waiting, top, most = [0][:0], 0, 0
+    for s in range(len(children)):
+        size = (first[s + 1] - first[s]) ** 2
+        most = max(most, top + size)
+        for _ in range(children[s]):
+            top -= waiting.pop()
+        waiting.append(size)
+        top += size
+    return most
+
+
+@njit(cache=True)
+def _add(below: Floats, to: Ints, own: int, U: Floats, S: Floats) -> None:
+    """Add the upper triangle of what a child left at the places `to` of its front."""
+    for i in range(len(to)):
+        if to[i] < own:
+            for j in range(i, len(to)):
+                U[to[i], to[j]] += below[i, j]
+        else:
+            for j in range(i, len(to)):
+                S[to[i] - own, to[j] - own] += below[i, j]
 
 
 @njit(cache=True, fastmath={"contract"})
@@ -166,6 +192,8 @@ def _factorise_rows(U: Floats) -> bool:
 @njit(cache=True)
 def _subtract_product(S: Floats, columns: Floats) -> None:
     """Subtract the upper triangle of the product of `columns` and its transpose."""
+    if not columns.size:
+        return
     for a in range(0, len(S), BLOCK):
         b = min(a + BLOCK, len(S))
         S[a:b, a:] -= np.dot(columns[a:b], columns[a:].T)
@@ -202,3 +230,18 @@ def substitute(
                         total += U[j, i] * v[i]
                     v[j] = (v[j] - total) / U[j, j]
             x[k, low : low + own] = v[:own]
+
+
+@njit(cache=True)
+def spread_symmetric(upper: Floats, at: Ints, to: Floats) -> None:
+    """Write a symmetric matrix, of which the upper triangle is given, at rows `at`.
+
+    Rows and columns whose place is negative are left out.
+    """
+    for i in range(len(at)):
+        if at[i] < 0:
+            continue
+        for j in range(i, len(at)):
+            if at[j] >= 0:
+                to[at[i], at[j]] = upper[i, j]
+                to[at[j], at[i]] = upper[i, j]
