@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from harness import Matrix
 from problems.fem.mesh import Nodes
 
-LEAF = 12  #: nodes that are cut no more
+LEAF = 8  #: nodes that are cut no more
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -218,7 +218,7 @@ def _along(points: Floats, part: Ints) -> Floats:
     x, y = points[part, 0], points[part, 1]
     x, y = x - x.mean(), y - y.mean()
     angle = np.arctan2(2 * (x * y).sum(), (x * x).sum() - (y * y).sum()) / 2
-    return x * np.cos(angle) + y * np.sin(angle)
+    return np.asarray(x * np.cos(angle) + y * np.sin(angle))
 
 
 @njit(cache=True)
@@ -229,25 +229,27 @@ def borders(
     position = np.empty(len(order), dtype=np.int32)
     position[order] = np.arange(len(order), dtype=np.int32)
     seen = np.full(len(order), -1, dtype=np.int32)
-    waiting = [np.empty(0, dtype=np.int32)]
-    parts, first = [np.empty(0, dtype=np.int32)], np.zeros(len(start), dtype=np.int32)
+    found = np.empty(len(order), dtype=np.int32)
+    parts, waiting = [found[:0]], [0][:0]
+    first = np.zeros(len(start), dtype=np.int32)
     for s in range(len(start) - 1):
-        end, found = start[s + 1], [0][:0]
+        end, count = start[s + 1], 0
         for _ in range(children[s]):
-            for p in waiting.pop():
+            for p in parts[waiting.pop() + 1]:
                 if p >= end and seen[p] != s:
                     seen[p] = s
-                    found.append(p)
+                    found[count] = p
+                    count += 1
         for a in order[start[s] : end]:
             for t in range(ptr[a], ptr[a + 1]):
                 p = position[idx[t]]
                 if p >= end and seen[p] != s:
                     seen[p] = s
-                    found.append(p)
-        border = np.sort(np.array(found, dtype=np.int32))
-        waiting.append(border)
-        parts.append(border)
-        first[s + 1] = first[s] + len(border)
+                    found[count] = p
+                    count += 1
+        parts.append(np.sort(found[:count]))
+        waiting.append(s)
+        first[s + 1] = first[s] + count
     border = np.empty(first[-1], dtype=np.int32)
     for s in range(len(start) - 1):
         border[first[s] : first[s + 1]] = parts[s + 1]

@@ -22,19 +22,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.linalg import lapack, null_space, qr
-from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
+from scipy.linalg import block_diag, lapack, null_space, qr
+from scipy.sparse import block_diag as sparse_block_diag
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
 from harness import Matrix, Vector
-from problems.fem.kernels import congruence
 from problems.fem.mesh import Nodes, dofs_of
-from problems.fem.multifrontal import Multifrontal, multifrontal, spread_symmetric
+
+if TYPE_CHECKING:
+    from problems.fem.multifrontal import Multifrontal
 
 
 NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
@@ -111,12 +112,15 @@ class Condensed:
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ; ValueError where B touches other components."""
+        # late: importing numba takes a while
+        from problems.fem.kernels import congruence
+
         B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
         number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
         F, within = congruence(B.indptr, B.indices, B.data, number, self.compliance)
         if not within:
             raise ValueError("rows touch components outside the condensed interface")
-        return F
+        return np.asarray(F)
 
     def at_constraints(self, b: Vector) -> Vector:
         """Multiply with (K⁺)_cc; zero elsewhere."""
@@ -164,15 +168,18 @@ def floating_inverse(
         starred.append(csr_array(Q))
         fixed.append(start + rows)
         start += len(R)
-    R_star = csc_array(block_diag(starred))
+    R_star = csc_array(sparse_block_diag(starred))
     rho = K.diagonal().max()
     K_rho = csc_array(K + rho * (R_star @ R_star.T))
-    free, kernel = np.arange(K.shape[0]), linalg.block_diag(*kernels)
+    free, kernel = np.arange(K.shape[0]), block_diag(*kernels)
     return _inverse(K_rho, free, kernel, interface, np.concatenate(fixed))
 
 
 def supported_inverse(
-    K: Matrix, free: Nodes, rigid: NDArray[np.float64], interface: Interface | None = None
+    K: Matrix,
+    free: Nodes,
+    rigid: NDArray[np.float64],
+    interface: Interface | None = None,
 ) -> GeneralisedInverse:
     """Factorise K_ff where the supports may leave rigid motions of some body.
 
@@ -209,6 +216,8 @@ def _inverse(
         K_ff = csc_matrix(K[free][:, free])
         factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
         return Factorised(factor, free, kernel, perf_counter() - start)
+    from problems.fem.multifrontal import multifrontal, spread_symmetric
+
     touched = interface.components
     last = np.concatenate([touched, fixed])
     factor = multifrontal(K, free, interface.points, last)

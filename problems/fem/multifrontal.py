@@ -102,7 +102,11 @@ def eliminate(
     store = np.empty(_most_waiting(first, children))  # what fronts left, one on another
     waiting, top = [0][:0], 0
     for s in range(len(start) - 1):
-        low, own, ahead = start[s], start[s + 1] - start[s], border[first[s] : first[s + 1]]
+        low, own, ahead = (
+            start[s],
+            start[s + 1] - start[s],
+            border[first[s] : first[s + 1]],
+        )
         left = len(ahead)
         U = rows[offset[s] : offset[s + 1]].reshape(own, own + left)
         S = store[top : top + left * left].reshape(left, left)
@@ -157,36 +161,42 @@ def _add(below: Floats, to: Ints, own: int, U: Floats, S: Floats) -> None:
                 S[to[i] - own, to[j] - own] += below[i, j]
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True)
 def _factorise_rows(U: Floats) -> bool:
-    """Turn own rows of a front into those of its factor, panel by panel."""
-    own, size = U.shape
+    """Turn own rows of a front into those of its factor; False at a pivot ≤ 0."""
+    own = len(U)
     for low in range(0, own, PANEL):
         high = min(low + PANEL, own)
         for j in range(low, high):
-            row, p = U[j], low
-            while p + 4 <= j:  # four at once: the row is read and written less often
-                u0, u1, u2, u3 = U[p], U[p + 1], U[p + 2], U[p + 3]
-                c0, c1, c2, c3 = u0[j], u1[j], u2[j], u3[j]
-                for i in range(j, size):
-                    row[i] -= c0 * u0[i] + c1 * u1[i] + c2 * u2[i] + c3 * u3[i]
-                p += 4
-            while p < j:
-                u0, c0 = U[p], U[p, j]
-                for i in range(j, size):
-                    row[i] -= c0 * u0[i]
-                p += 1
-            if not row[j] > 0:
+            _subtract_rows(U, low, j)
+            if not U[j, j] > 0:
                 return False
-            scale = 1 / np.sqrt(row[j])
-            for i in range(j, size):
-                row[i] *= scale
+            U[j, j:] *= 1 / np.sqrt(U[j, j])
         if high < own:
             columns = U[low:high, high:].T.copy()
             for a in range(0, own - high, BLOCK):
                 b = min(a + BLOCK, own - high)
-                U[high + a : high + b, high + a :] -= np.dot(columns[a:b], columns[a:].T)
+                U[high + a : high + b, high + a :] -= np.dot(
+                    columns[a:b], columns[a:].T
+                )
     return True
+
+
+@njit(cache=True, fastmath={"contract"})
+def _subtract_rows(U: Floats, low: int, j: int) -> None:
+    """Subtract from row j the multiples of rows low … j − 1 that eliminate them."""
+    row, p, size = U[j], low, U.shape[1]
+    while p + 4 <= j:  # four at once: the row is read and written less often
+        u0, u1, u2, u3 = U[p], U[p + 1], U[p + 2], U[p + 3]
+        c0, c1, c2, c3 = u0[j], u1[j], u2[j], u3[j]
+        for i in range(j, size):
+            row[i] -= c0 * u0[i] + c1 * u1[i] + c2 * u2[i] + c3 * u3[i]
+        p += 4
+    while p < j:
+        u0, c0 = U[p], U[p, j]
+        for i in range(j, size):
+            row[i] -= c0 * u0[i]
+        p += 1
 
 
 @njit(cache=True)
@@ -208,7 +218,11 @@ def substitute(
     v = np.empty(np.max(np.diff(start) + np.diff(first)))
     for t in range(2 * fronts):
         s = min(t, 2 * fronts - 1 - t)  # up the tree and down again
-        low, own, ahead = start[s], start[s + 1] - start[s], border[first[s] : first[s + 1]]
+        low, own, ahead = (
+            start[s],
+            start[s + 1] - start[s],
+            border[first[s] : first[s + 1]],
+        )
         size = own + len(ahead)
         U = rows[offset[s] : offset[s + 1]].reshape(own, size)
         for k in range(len(x)):
@@ -216,9 +230,10 @@ def substitute(
             if t < fronts:
                 v[own:size] = 0
                 for j in range(own):
-                    v[j] /= U[j, j]
+                    c = v[j] / U[j, j]
+                    v[j] = c
                     for i in range(j + 1, size):
-                        v[i] -= v[j] * U[j, i]
+                        v[i] -= c * U[j, i]
                 for i in range(own, size):
                     x[k, ahead[i - own]] += v[i]
             else:
