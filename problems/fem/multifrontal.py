@@ -110,7 +110,8 @@ def eliminate(
         left = len(ahead)
         U = rows[offset[s] : offset[s + 1]].reshape(own, own + left)
         S = store[top : top + left * left].reshape(left, left)
-        S[:] = 0
+        for i in range(left):
+            S[i, i:] = 0
         for p in range(low, low + own):
             place[p] = p - low
         for t in range(left):
@@ -129,7 +130,8 @@ def eliminate(
         if not _factorise_rows(U):
             return False
         _subtract_product(S, U[:, own:].T.copy())
-        store[top : top + left * left] = S.ravel()  # on the place of its children
+        # to the place of its children, which are done with
+        _move(S, store[top : top + left * left].reshape(left, left))
         waiting.append(s)
         top += left * left
     return True
@@ -147,6 +149,13 @@ def _most_waiting(first: Ints, children: Ints) -> int:
         waiting.append(size)
         top += size
     return most
+
+
+@njit(cache=True)
+def _move(S: Floats, to: Floats) -> None:
+    """Copy the upper triangle to a place before it, which may overlap it."""
+    for i in range(len(S)):
+        to[i, i:] = S[i, i:]
 
 
 @njit(cache=True)
@@ -206,7 +215,10 @@ def _subtract_product(S: Floats, columns: Floats) -> None:
         return
     for a in range(0, len(S), BLOCK):
         b = min(a + BLOCK, len(S))
-        S[a:b, a:] -= np.dot(columns[a:b], columns[a:].T)
+        product = np.dot(columns[a:b], columns[a:].T)
+        for i in range(a, b):
+            for j in range(i, len(S)):
+                S[i, j] -= product[i - a, j - a]
 
 
 @njit(cache=True, fastmath={"contract", "reassoc"})
