@@ -16,7 +16,7 @@ help:  ## show this help
 
 setup: .venv/.ready  ## make .venv: system packages, Python packages
 
-.venv/.ready: pyproject.toml constraints.txt
+.venv/.ready: pyproject.toml constraints.txt tools/extensions.py $(shell find problems solvers -name "*.pyx")
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 

@@ -10,6 +10,9 @@ PROBLEMS: Registry[Family] = Registry(
         "hertz-plane": entry("problems.families.hertz", "HertzPlane"),
         "hertz-cylinder": entry("problems.families.hertz", "HertzCylinder"),
         "obstacle": entry("problems.families.obstacle", "Obstacle"),
+        "string": entry("problems.families.variational", "String"),
+        "journal-bearing": entry("problems.families.variational", "JournalBearing"),
+        "torsion": entry("problems.families.variational", "Torsion"),
         "bodies": entry("problems.families.gmsh_bodies", "GmshBodies"),
         "file": entry("problems.families.from_file", "FromFile"),
     }

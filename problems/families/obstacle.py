@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family
+from harness import Family, InputError
 from problems.ranges import at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
@@ -16,17 +16,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Obstacle(Family):
-    """A string or membrane over a flat obstacle, with known exact solution."""
+    """A string or membrane over an obstacle, with known exact solution."""
 
     name: str = "obstacle"
     defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"dim": 2, "n": 20}), hash=False
+        default_factory=lambda: MappingProxyType({"dim": 2, "n": 20, "shape": "flat"}),
+        hash=False,
     )
     forms: tuple[str, ...] = ("primal", "dual-bounds")
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
-        one_of(self.name, params, {"dim": (1, 2)})
+        one_of(self.name, params, {"dim": (1, 2), "shape": ("flat", "hemisphere")})
+        if params["shape"] == "hemisphere" and params["dim"] != 2:
+            raise InputError(f"{self.name}: shape=hemisphere needs dim=2")
         at_least(2, self.name, params, ("n",))
         fits(self.name, int(params["n"]) ** int(params["dim"]))
 
@@ -41,5 +44,6 @@ class Obstacle(Family):
         from problems.models.obstacle import over_obstacle
 
         del reference
+        params = self.complete(params)
         self.check(params)
         return over_obstacle(form, params)

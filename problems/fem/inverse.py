@@ -117,7 +117,10 @@ class Condensed:
 
         B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
         number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
-        F, within = congruence(B.indptr, B.indices, B.data, number, self.compliance)
+        F, within = congruence(
+            B.indptr.astype(np.int32), B.indices.astype(np.int32), B.data, number,
+            self.compliance,
+        )  # fmt: skip
         if not within:
             raise ValueError("rows touch components outside the condensed interface")
         return np.asarray(F)

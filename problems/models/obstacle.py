@@ -1,16 +1,26 @@
-"""A string or membrane pressed onto a flat obstacle: exact solutions in closed form.
+"""A string or membrane over an obstacle: exact solutions in closed form.
 
-Under unit tension, pulled down by the load q = 2 over Ω = (−3/2, 3/2)^dim and held at
-the boundary at the height of the solution, it minimises ∫ ½|∇u|² + q u over u ≥ 0. With
-r the distance from the origin, contact is where r ≤ 1, and beyond
+*Flat.* Under unit tension, pulled down by the load q = 2 over Ω = (−3/2, 3/2)^dim and
+held at the boundary at the height of the solution, it minimises ∫ ½|∇u|² + q u over
+u ≥ 0. With r the distance from the origin, contact is where r ≤ 1, and beyond
 
     string (dim = 1):    u = (r − 1)²               u″ = 2
     membrane (dim = 2):  u = r²/2 − ln r − ½        Δu = u″ + u′/r = 2
 
 both with u = u′ = 0 at r = 1; the obstacle pushes back with the pressure q inside, in
 all 2q and πq. (The membrane is a standard test of the obstacle problem, for instance in
-Bartels and Carstensen 2004.) Linear or bilinear elements on a uniform grid: the nodal
-error and that of the energy are of second order.
+Bartels and Carstensen 2004.)
+
+*Hemisphere.* Over Ω = (−2, 2)², without load, a membrane lies on the unit ball,
+ψ = √(1 − r²) for r ≤ 0.9 and its tangent beyond (tutorial 9 of PETSc's SNES; Bueler,
+"PETSc for partial differential equations", 2021, Chapter 12). Contact is where r ≤ a,
+
+    a²(ln 2 − ln a) = 1 − a²,    u = A ln(2/r) for r ≥ a,   A = a²/√(1 − a²)
+
+so that u and u′ are those of ψ at r = a, and u = 0 at r = 2. The ball pushes with 2πA.
+
+Linear or bilinear elements on a uniform grid: the nodal error and that of the energy
+are of second order.
 
 Lengths are in m, forces per tension.
 """
@@ -41,14 +51,17 @@ from problems.contact.results import ACTIVE
 from problems.duality.dualisation import Transformed, dual_bounds
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 
-HALF = 1.5  #: half the width of Ω, m
-LOAD = 2.0  #: q, 1/m
+HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
+LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
+TANGENT = 0.9  #: r at which the hemisphere gives way to its tangent, m
+LIFT_OFF = 0.697965148223374  #: a, m
+SLOPE = LIFT_OFF**2 / np.sqrt(1 - LIFT_OFF**2)  #: A, m
 
 
 def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     p: Any = params
-    problem = obstacle_problem(p["dim"], p["n"])
+    problem = obstacle_problem(p["dim"], p["n"], p["shape"])
     rows, start = problem.qp, perf_counter()
     if form == "primal":
         new = with_bounds(rows)
@@ -65,7 +78,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=rows, back=new.recover, factorise=problem.factorise,
-            mesh_size=2 * HALF / p["n"], rigid=np.zeros((rows.q.size, 0)),
+            mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,
@@ -80,8 +93,10 @@ class Problem:
 
     ::
 
-        min ½vᵀKv + (q + Kw)ᵀv,   v = 0 at the boundary,   −v ≤ 0 at the other nodes
+        min ½vᵀKv + (q + Kw)ᵀv,   v = 0 at the boundary,   −v ≤ −ψ at the other nodes
     """
+
+    shape: str  #: flat, ψ = 0, or hemisphere
 
     x: Vector  #: (N, dim) nodes, m
     cells: int
@@ -99,9 +114,9 @@ class Problem:
         return qp.objective(v) + float(constant)
 
 
-def obstacle_problem(dim: int, n: int) -> Problem:
+def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     """Assemble the problem on a uniform grid of n cells per side."""
-    h = 2 * HALF / n
+    h = 2 * HALF[shape] / n
     ends = np.array([1.0] + [2.0] * (n - 1) + [1.0])
     side = np.ones(n)
     K = csc_array(diags_array([-side, ends, -side], offsets=[-1, 0, 1]) / h)
@@ -110,28 +125,28 @@ def obstacle_problem(dim: int, n: int) -> Problem:
         M = diags_array([side, 2 * ends, side], offsets=[-1, 0, 1]) * (h / 6)
         K = csc_array(kron(K, M) + kron(M, K))
         share = np.outer(share, share).ravel()
-    x = nodes(dim, n)
-    at_boundary = np.abs(x).max(axis=1) > HALF - h / 2
-    w = np.where(at_boundary, exact_height(x), 0.0)
+    x = nodes(dim, n, shape)
+    at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
+    w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
     qp = QP(
-        P=K, q=LOAD * share + K @ w,
+        P=K, q=LOAD[shape] * share + K @ w,
         A=one[at_boundary], b=np.zeros(at_boundary.sum()),
-        G=-one[~at_boundary], h=np.zeros((~at_boundary).sum()),
+        G=-one[~at_boundary], h=-obstacle_height(x[~at_boundary], shape),
         lb=np.full(N, -np.inf), ub=np.full(N, np.inf),
     )  # fmt: skip
-    return Problem(x, n**dim, w, qp)
+    return Problem(shape, x, n**dim, w, qp)
 
 
 def with_bounds(rows: QP) -> Transformed:
-    """Take out the prescribed components, and write −v ≤ 0 as bounds v ≥ 0."""
+    """Take out the prescribed components, and write −v ≤ −ψ as bounds v ≥ ψ."""
     free = rows.G.indices
     n, m = rows.q.size, free.size
     K = csc_array(rows.P)
     qp = QP(
         P=K[free][:, free], q=rows.q[free],
         A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=np.zeros(m), ub=np.full(m, np.inf),
+        lb=-rows.h, ub=np.full(m, np.inf),
     )  # fmt: skip
 
     def recover(s: Solution) -> Solution:
@@ -144,9 +159,9 @@ def with_bounds(rows: QP) -> Transformed:
     return Transformed(qp, recover, 1.0, 0.0, lambda s: recover(s).x)
 
 
-def nodes(dim: int, n: int) -> Vector:
+def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
     """Return the positions (N, dim) of the grid with n cells per side, m."""
-    x = np.linspace(-HALF, HALF, n + 1)
+    x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     grid = np.meshgrid(*[x] * dim, indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=-1)
 
@@ -160,26 +175,44 @@ def cells(dim: int, n: int) -> NDArray[np.int64]:
     return np.asarray(first[:, None] + np.array([0, n + 1, n + 2, 1]))
 
 
-def exact_height(x: Vector) -> Vector:
+def obstacle_height(x: Vector, shape: str) -> Vector:
+    """Return ψ at positions (N, dim), m."""
+    if shape == "flat":
+        return np.zeros(len(x))
+    r = np.linalg.norm(x, axis=1)
+    ball = np.sqrt(1 - np.minimum(r, TANGENT) ** 2)
+    return np.asarray(ball - TANGENT / ball * np.maximum(r - TANGENT, 0))
+
+
+def exact_height(x: Vector, shape: str = "flat") -> Vector:
     """Return the exact u at positions (N, dim), m."""
+    if shape == "hemisphere":
+        r = np.linalg.norm(x, axis=1)
+        beyond = SLOPE * np.log(2 / np.maximum(r, LIFT_OFF))
+        return np.where(r <= LIFT_OFF, obstacle_height(x, shape), beyond)
     r = np.maximum(np.linalg.norm(x, axis=1), 1.0)
     if x.shape[1] == 1:
         return np.asarray((r - 1) ** 2)
     return np.asarray(r**2 / 2 - np.log(r) - 0.5)
 
 
-def exact_energy(dim: int) -> float:
-    """Return ∫ ½u′² + q u of the exact solution: ⅓ for the string.
+def exact_energy(dim: int, shape: str = "flat") -> float:
+    """Return ∫ ½|∇u|² + q u of the exact solution: ⅓ for the string.
 
     For the membrane the integral over r is elementary; with ρ the distance of the
     boundary in the direction φ,
 
         8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
+
+    and with the hemisphere π∫_0^a r³/(1 − r²) dr + 8 ∫_0^{π/4} ½A² ln(ρ/a) dφ.
     """
     if dim == 1:
         return 1 / 3
     at, weights = leggauss(20)  # enough for all digits of what is so smooth
-    rho = HALF / np.cos(np.pi / 8 * (1 + at))
+    rho = HALF[shape] / np.cos(np.pi / 8 * (1 + at))
+    if shape == "hemisphere":
+        ball = -np.pi / 2 * (LIFT_OFF**2 + np.log(1 - LIFT_OFF**2))
+        return float(ball + np.pi * weights @ (SLOPE**2 / 2 * np.log(rho / LIFT_OFF)))
     along_ray = 3 / 8 * (rho**4 - 1) - (rho**2 - 1) / 2 + (0.5 - rho**2) * np.log(rho)
     return float(np.pi * weights @ along_ray)
 
@@ -191,8 +224,11 @@ def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
     max_error: largest error of u at a node, m.
     """
     N, dim = problem.x.shape
+    shape = problem.shape
     energy, force = problem.energy(s.x), float(s.z.sum())
-    error = problem.lift + s.x - exact_height(problem.x)
+    error = problem.lift + s.x - exact_height(problem.x, shape)
+    flat = LOAD["flat"] * (2.0 if dim == 1 else np.pi)
+    exact_force = flat if shape == "flat" else 2 * np.pi * SLOPE
     return {
         "nodes": N,
         "elements": problem.cells,
@@ -201,8 +237,8 @@ def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
         "contact_rows": problem.qp.h.size,
         "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
         "energy": energy,
-        "energy_error": energy / exact_energy(dim) - 1,
+        "energy_error": energy / exact_energy(dim, shape) - 1,
         "obstacle_force": force,
-        "force_error": force / (LOAD * (2.0 if dim == 1 else np.pi)) - 1,
+        "force_error": force / exact_force - 1,
         "max_error": float(np.abs(error).max()),
     }

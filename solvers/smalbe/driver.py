@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
+from solvers.smalbe import compiled
 from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
-from solvers.smalbe.face_run import face_run
-from solvers.smalbe.mprgp import Face, FaceRun, Point, Rules, Watch
+from solvers.smalbe.mprgp import Face, Point, Rules, Watch
 from solvers.smalbe.options import Options
 from solvers.smalbe.outer_loop import (
     Constants,
     InnerSolver,
     Iterate,
-    Until,
+    OuterIteration,
     first_iterate,
+    infeasible,
     smalbe,
 )
 from solvers.smalbe.preconditioner import face_preconditioner
@@ -32,7 +33,7 @@ from solvers.smalbe.projected import (
     Spectrum,
     by_lanczos,
     by_power,
-    dense_rows,
+    prepared_problem,
     projected_problem,
 )
 from solvers.smalbe.spectrum import random_start
@@ -40,6 +41,7 @@ from solvers.smalbe.spectrum import random_start
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
+FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -53,7 +55,7 @@ class Carry(NamedTuple):
     block: FreeBlock | None
 
 
-Solve = Callable[[], tuple[Solution, Carry | None]]
+Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -63,7 +65,8 @@ class _Task:
     eliminated: Eliminated | None
     problem: Projected
     options: Options
-    means: InnerSolver
+    solve: Callable[[float, Iterate], Iterate]  #: the outer loop, to a tolerance
+    solver: compiled.Solver | None  #: None where nothing is compiled
     history: History | None
     start: Iterate
 
@@ -79,20 +82,28 @@ def prepared(
     inner = qp if eliminated is None else eliminated.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
-    problem = projected_problem(inner, partial(_find, options, carry))
+    problem = _projected(inner, options, carry)
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
-        return lambda: (nowhere, None)
+        return lambda: (nowhere, _nothing)
     if eliminated is not None and eliminated.columns:
-        problem.counts["P_products"] += eliminated.columns
+        problem.F.count += eliminated.columns
         problem.counts["factorised_columns"] += eliminated.columns
+    solve, solver = _outer_loop(problem, inner, options, history)
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
-        means=_means(problem, inner, options, history), history=history,
+        solve=solve, solver=solver, history=history,
         start=_start(problem, options, carry, tol),
     )  # fmt: skip
     return lambda: _certified(task, tol)
+
+
+def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
+    """Homogenise, project, normalise, and look at the spectrum."""
+    if carry is None and options.norm == "lanczos" and not options.history:
+        return prepared_problem(qp, options.lanczos_steps)
+    return projected_problem(qp, partial(_find, options, carry))
 
 
 def _find(
@@ -134,54 +145,62 @@ def _penalty(options: Options, tol: float) -> float:
     return min(options.rho, max(1.0, tol / (10 * EPS)))
 
 
-def _means(
+def _outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None
-) -> InnerSolver:
-    """Choose what the inner problems are solved with."""
+) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
+    """Choose what runs the outer loop: compiled, or as it is written."""
     rules = Rules(
-        options.Gamma, options.expansion, options.proportioning, options.reduced
-    )
-    plain = partial(problem.plain_model, alpha=options.alpha)
-    return InnerSolver(
-        rules=rules,
-        model=problem.model if options.expansion == "model" else plain,
-        precondition=face_preconditioner(problem, qp, options.preconditioner),
-        watch=None if history is None else partial(history.watch, problem),
-        run=None if history is not None else _compiled(problem, qp, options, rules),
-    )
-
-
-def _compiled(
-    problem: Projected, qp: QP, options: Options, rules: Rules
-) -> Callable[[float, Until], FaceRun] | None:
-    """Take CG steps compiled where F is dense and the preconditioner allows it."""
-    F = dense_rows(qp.P)
-    if F is None or options.preconditioner not in WITHOUT_P:
-        return None
-    with_model = options.preconditioner == "model"
-    return face_run(F, problem, rules, problem.model if with_model else None)
-
-
-def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
-    """Tighten the tolerance until the original problem's KKT residuals agree."""
-    options, problem, at = task.options, task.problem, task.start
+        options.Gamma, options.expansion, options.proportioning, options.reduced,
+        options.alpha,
+    )  # fmt: skip
     constants = Constants(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
     )  # fmt: skip
+    if history is None and options.preconditioner in WITHOUT_P:
+        with_model = options.preconditioner == "model"
+        solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
+        return partial(_compiled_loop, solver, problem, constants), solver
+    plain = partial(problem.plain_model, alpha=options.alpha)
+    inner = InnerSolver(
+        rules=rules,
+        model=problem.model if options.expansion == "model" else plain,
+        precondition=face_preconditioner(problem, qp, options.preconditioner),
+        watch=None if history is None else partial(history.watch, problem),
+    )
+    return partial(smalbe, problem, constants, inner), None
+
+
+def _compiled_loop(
+    solver: compiled.Solver,
+    problem: Projected,
+    constants: Constants,
+    tol: float,
+    at: Iterate,
+) -> Iterate:
+    nu, g, mu, M, rho, outer, status = solver.smalbe(
+        constants, tol, at, partial(infeasible, problem)
+    )
+    outer = (*at.outer, *map(OuterIteration._make, outer))
+    return Iterate(nu, g, mu, M, rho, outer, Status(status))
+
+
+def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | None]]:
+    """Tighten the tolerance until the original problem's KKT residuals agree."""
+    options, problem, at = task.options, task.problem, task.start
     tighter, best, waited = 1.0, np.inf, 0
     while True:
-        at = smalbe(problem, constants, task.means, tighter * tol, at)
+        at = task.solve(tighter * tol, at)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
-            return Solution.without_point(task.qp, at.status, message), None
+            return Solution.without_point(task.qp, at.status, message), _nothing
         if not np.isfinite(at.nu).all():
             message = "the iterates diverged"
-            return Solution.without_point(task.qp, Status.FAILED, message), None
-        point = _point(task, at)
-        worst = kkt_residuals(task.qp, point).worst
+            return Solution.without_point(task.qp, Status.FAILED, message), _nothing
+        point, Fx = _point(task, at)
+        worst = _worst_residual(task, point, Fx, CLAIM * tol)
         if worst <= CLAIM * tol:
-            return point, _carry(task, at)
+            return _counted(task, point), partial(_carry, task, at)
         waited = 0 if worst < best / 2 else waited + 1
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == PATIENCE:
@@ -191,7 +210,8 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Carry | None]:
     message = "no further progress: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
-    return replace(point, status=Status.ITERATION_LIMIT, message=message), None
+    point = replace(point, status=Status.ITERATION_LIMIT, message=message)
+    return _counted(task, point), _nothing
 
 
 def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
@@ -199,6 +219,10 @@ def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
     x = problem.rows.x_tilde + at.nu
     fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
     return fresh._replace(outer=at.outer)
+
+
+def _nothing() -> None:
+    """Leave nothing for the next problem."""
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:
@@ -211,36 +235,68 @@ def _carry(task: _Task, at: Iterate) -> Carry:
     )
 
 
-def _point(task: _Task, at: Iterate) -> Solution:
-    """Return to the original problem, with multipliers of its rows and bounds.
+def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
+    """Return to the problem as given; the product of what was solved with its x."""
+    qp, problem = task.inner, task.problem
+    if task.solver is None:
+        x, a, z_box, Fx = recovered(problem, qp, at)
+    else:
+        x, a, z_box, Fx = task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+        if a is None:
+            x, a, z_box, Fx = recovered(problem, qp, at)
+    steps = Counter(STEPS[letter] for letter in at.steps)
+    point = Solution(
+        status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
+        z_box=z_box, iterations=len(at.steps),
+        counts={**problem.counts, "outer": len(at.outer), **steps},
+        message="converged", history=task.history.columns if task.history else {},
+    )  # fmt: skip
+    return point if task.eliminated is None else task.eliminated.recover(point), Fx
+
+
+def recovered(
+    problem: Projected, qp: QP, at: Iterate
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product.
 
     Fx − d + Cᵀa is the gradient of the projected problem for a = ‖𝒫F𝒫‖μ − C(Fx − d), up
     to rounding and ‖Cν‖; a least-squares correction on the free components, where it
     must vanish, removes what is left.
     """
-    qp, problem = task.inner, task.problem
-    C, y_of = problem.rows.C, problem.rows.multipliers
+    C = problem.rows.C
     at_lower, at_upper = at.nu <= problem.bounds[0], at.nu >= problem.bounds[1]
     x = np.where(
         at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
     )
     x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
-    r = problem.F(x) + qp.q
+    Fx = problem.F(x)
+    r = Fx + qp.q
     free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
-    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free])[0]
+    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free], rcond=FREE_RANK)[0]
     r = r + C.T @ a
     z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)
-    problem.counts["P_products"] += 1  # of the residuals that follow
-    steps = Counter(STEPS[letter] for letter in at.steps)
-    point = Solution(
-        status=Status.SOLVED, x=x, y=y_of(a), z=np.zeros(0), z_box=z_box,
-        iterations=len(at.steps),
-        counts={**problem.counts, "outer": len(at.outer), **steps},
-        message="converged", history=task.history.columns if task.history else {},
-    )  # fmt: skip
-    return point if task.eliminated is None else task.eliminated.recover(point)
+    return x, a, z_box, Fx
+
+
+def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
+    """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
+    qp = task.qp
+    if task.solver is not None and task.eliminated is None:
+        bound: float = task.solver.residual_bound(
+            point.x, point.y, point.z_box, Fx, qp.lb, qp.ub, task.problem.rows.G, qp.b
+        )
+        if bound <= enough:
+            return bound
+    task.problem.F.count += 1
+    return kkt_residuals(qp, point).worst
+
+
+def _counted(task: _Task, point: Solution) -> Solution:
+    """Note all products, those of the residuals too."""
+    counts = {"P_products": task.problem.F.count, **point.counts}
+    return replace(point, counts=counts)
 
 
 COLUMNS = (
@@ -271,7 +327,7 @@ class History:
         def note(letter: str, at: Point, face: Face) -> None:
             error = np.linalg.norm(C @ at.x) if len(C) else 0.0
             self.rows.append((
-                letter, outer, problem.counts["P_products"],
+                letter, outer, problem.F.count,
                 np.linalg.norm(face.phi), np.linalg.norm(face.beta),
                 error / (size or np.linalg.norm(at.x) or 1.0),
                 face.free.size - np.count_nonzero(face.free),

@@ -12,6 +12,10 @@ inside) and the projected gradient g^P = φ + β, each step is one of
 
 Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
 length ᾱ takes beyond a bound.
+
+Every step but projcg's lessens the cost. Expansion never frees a component that the
+half step left at a bound, but for the first expansion by the model: from one
+proportioning to the next the active set only grows. docs/smalbe.md says what follows.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -34,12 +38,14 @@ Precondition = Callable[[Mask], Operator]  #: free components → their precondi
 #: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
 #: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
 #: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
-#: model: the CG step as far as it is feasible, then a `Model.step`, its length by
-#: an exact line search (ours; 2 products, 1 where the first step was all)
+#: model: the CG step, projected in the metric of the model (ours; 2 products, 1 where
+#: the CG step as far as it is feasible was all)
 Expansion = Literal["std", "projcg", "mixed", "model"]
 #: cg: minimise along −β, as far as feasible (the book's; 1 product)
-#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product)
+#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); cg for the
+#: rest of a run in which `MOST_IDLE` of them followed each other without a CG step
 Proportioning = Literal["cg", "model"]
+MOST_IDLE = 5
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
 
@@ -51,6 +57,7 @@ class Rules:
     expansion: Expansion = "model"
     proportioning: Proportioning = "model"
     reduced: bool = True  #: compare β with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
+    relaxation: float = 1.9  #: of expansions by the model, ᾱ‖H‖ of gradient projection
 
 
 class Point(NamedTuple):
@@ -90,21 +97,13 @@ Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, whe
 Step = tuple[str, Point, Model] | None
 
 
-class FaceRun(Protocol):
-    """Takes CG steps in a face, as many as `mprgp` would take one after the other.
+class _Line(NamedTuple):
+    """Along a direction of conjugate gradients."""
 
-    alpha : ᾱ of the reduced free gradient
-    most : steps to take
-    """
-
-    def __call__(
-        self, at: Point, p: Vector, face: Face, alpha: float, most: int
-    ) -> tuple[Point, Vector, Vector | None, int]:
-        """Return where it ended, the next direction, and the number of steps.
-
-        Third is Hp if the next CG step would leave the box, None if it is to be asked
-        again whether to stop or to proportion. Then at least one step was taken.
-        """
+    p: Vector
+    Hp: Vector
+    cg: float  #: α_cg, minimises the cost at x − αp; inf without curvature
+    feasible: float  #: the largest α that is
 
 
 class _Task(NamedTuple):
@@ -125,7 +124,6 @@ def mprgp(
     rules: Rules,
     precondition: Precondition | None = None,
     watch: Watch | None = None,
-    run: FaceRun | None = None,
     max_steps: int = 10_000,
 ) -> Minimum:
     """Minimise ½xᵀHx − bᵀx over l ≤ x ≤ u.
@@ -139,7 +137,6 @@ def mprgp(
     stop : says from the point and its face whether to stop; asked before every step
     precondition : makes the preconditioner of the CG steps in a face
     watch : told the letter of each step, the new point and its face
-    run : takes the CG steps, faster than one by one; `watch` is not told of them
 
     """
     task = _Task(H, b, bounds, rules)
@@ -148,25 +145,20 @@ def mprgp(
     face = split(at, bounds)
     z_of = precondition(face.free)
     p = z_of(face.phi)
-    Hp: Vector | None
+    idle, by_model = 0, rules.proportioning == "model"
     while not (done := stop(at, face)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
-            step = _proportion(task, at, face, B)
+            by_model, idle = by_model and idle < MOST_IDLE, idle + 1
+            step = _proportion(task, at, face, B, by_model=by_model)
         else:
-            if run is None:
-                Hp = H(p)
-            else:
-                at, p, Hp, steps = run(at, p, face, 1 / B.tau, max_steps - len(trace))
-                face, trace = split(at, bounds), trace + "c" * steps
-                if Hp is None:
-                    continue
-            step = _minimise_or_expand(task, at, p, Hp, B)
+            Hp = H(p)
+            step = _minimise_or_expand(task, at, p, Hp, B, first="e" not in trace)
         if step is None:
             break
         letter, at, B = step
         face = split(at, bounds)
         if letter == "c":
-            p = kernels.conjugate(z_of(face.phi), p, Hp)
+            p, idle = kernels.conjugate(z_of(face.phi), p, Hp), 0
         else:
             z_of = precondition(face.free)
             p = z_of(face.phi)
@@ -192,10 +184,12 @@ def _disproportional(task: _Task, at: Point, face: Face, B: Model) -> bool:
     return face.beta_square > task.rules.Gamma**2 * free_square
 
 
-def _proportion(task: _Task, at: Point, face: Face, B: Model) -> Step:
+def _proportion(
+    task: _Task, at: Point, face: Face, B: Model, *, by_model: bool
+) -> Step:
     """Take a step that frees components; never beyond an opposite bound."""
-    if task.rules.proportioning == "model":
-        return _model_step(task, at, B, "p")
+    if by_model:
+        return _model_step(task, at, B)
     p = face.beta
     Hp = task.H(p)
     length = min(kernels.lengths(*at, p, Hp, *task.bounds))
@@ -203,7 +197,7 @@ def _proportion(task: _Task, at: Point, face: Face, B: Model) -> Step:
 
 
 def _minimise_or_expand(
-    task: _Task, at: Point, p: Vector, Hp: Vector, B: Model
+    task: _Task, at: Point, p: Vector, Hp: Vector, B: Model, *, first: bool
 ) -> Step:
     """Take the CG step where it is feasible, else expand the active set."""
     H, b, bounds, rules = task
@@ -219,14 +213,13 @@ def _minimise_or_expand(
             return "e", new, B
     half = _moved(task, at, feasible, p, Hp)
     if rules.expansion == "model":
-        stay = ("e", half, B) if feasible > 0 else None
-        return _model_step(task, half, B, "e") or stay
+        return _model_expansion(task, at, half, _Line(p, Hp, cg, feasible), B, first)
     x = np.clip(half.x - split(half, bounds).phi / B.tau, *bounds)  # cuts φ to φ̃
     letter = "f" if rules.expansion == "mixed" else "e"
     return letter, Point(x, H(x) - b), B
 
 
-def _model_step(task: _Task, at: Point, B: Model, letter: str) -> Step:
+def _model_step(task: _Task, at: Point, B: Model) -> Step:
     """Minimise the model over the box, then the cost along that step.
 
     Above H, the model makes the minimising length at least 1. Where the product shows
@@ -241,7 +234,49 @@ def _model_step(task: _Task, at: Point, B: Model, letter: str) -> Step:
     if math.isinf(length):
         return None
     B = B if cost >= 1 else B.raised(s, float(s @ Hs))
-    return letter, _moved(task, at, -length, s, Hs), B
+    return "p", _moved(task, at, -length, s, Hs), B
+
+
+def _model_expansion(
+    task: _Task, at: Point, half: Point, line: _Line, B: Model, first: bool
+) -> Step:
+    """Project z = x − α_cg p on the box in the metric of the model.
+
+    The cost is known at z and beyond it bounded by the model where that is above H,
+
+        f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr,
+
+    and z + r is where the right side is least, with the tail of B divided by the
+    relaxation, as gradient projection steps are longer than 1/‖H‖. What the half step
+    left at a bound stays there, unless this is the `first` expansion, before which the
+    active set is a guess. From the half step it goes all the way to z + r if the cost
+    ends below that at x, else as far as it lessens the cost.
+    """
+    (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
+    held = ((half.x <= lower) | (half.x >= upper)) & (not first)
+    box = np.where(held, half.x, lower), np.where(held, half.x, upper)
+    beyond = cg - feasible if math.isfinite(cg) else 0.0
+    z = Point(half.x - beyond * p, half.g - beyond * Hp)
+    relaxed = Model(B.tau / task.rules.relaxation, B.U, B.w)
+    s = np.where(held, 0.0, z.x + relaxed.step(*z, box) - half.x)
+    if half.g @ s >= 0:
+        beyond, s = 0.0, B.step(*half, box)
+    if not s.any():
+        return "e", half, B
+    Hs = task.H(s)
+    cost, most = kernels.lengths(*half, -s, -Hs, *task.bounds)
+    length = min(cost, max(1.0, most))
+    if math.isinf(length):
+        return None
+    if _change(half.g, s, Hs, 1.0) + _change(at.g, -p, -Hp, feasible) < 0:
+        length = max(length, 1.0)
+    r, Hr = s + beyond * p, Hs + beyond * Hp
+    return "e", _moved(task, half, -length, s, Hs), B.raised(r, float(r @ Hr))
+
+
+def _change(g: Vector, s: Vector, Hs: Vector, t: float) -> float:
+    """Return f(x + ts) − f(x)."""
+    return t * float(g @ s) + 0.5 * t**2 * float(s @ Hs)
 
 
 def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:

@@ -29,14 +29,14 @@ class Options:
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
-    alpha: float = 1.9  #: ᾱ‖H‖ of plain gradient projection steps
+    alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖
     lanczos_steps: int = 12  #: products spent on it
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
     energy: float = 50.0  #: estimated energy error/tol to reach, too; 0: whatever
     history: bool = False  #: keep a row per step
-    max_steps: int = 20_000  #: of MPRGP and outer iterations, in total
+    max_steps: int = 200_000  #: of MPRGP and outer iterations, in total
 
     def __post_init__(self) -> None:
         positive(

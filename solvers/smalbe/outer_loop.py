@@ -12,10 +12,12 @@ Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …
 until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
 is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
 What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
-‖b‖ may be the gap of supports, beside which contact is small.
+‖b‖ may be the gap of supports, beside which contact is small. It may cost half as many
+products again, no more: where stiffnesses differ much, rounding can keep it away.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
-MOST_RHO; and CᵀCν is tried as proof that there is no feasible point.
+MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10 down to
+LEAST_M; and CᵀCν is tried as proof that there is no feasible point.
 """
 
 from __future__ import annotations
@@ -31,7 +33,6 @@ from harness import Status, Vector
 from solvers.smalbe.model import Model
 from solvers.smalbe.mprgp import (
     Face,
-    FaceRun,
     Minimum,
     Point,
     Precondition,
@@ -43,6 +44,8 @@ from solvers.smalbe.projected import Projected
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products
+FOR_ENERGY = 1.5  #: factor of the products spent that its error may still cost
+LEAST_M = 1e-10  #: beyond which M‖Cν‖ is rounding
 MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
 
 
@@ -58,14 +61,6 @@ class Constants:
     energy: float = 0.0  #: estimated energy error/tol to reach; 0: none
 
 
-class Until(NamedTuple):
-    """When an inner run may end."""
-
-    small: float  #: ‖g^P‖ ≤ small
-    coarse: float  #: … or ‖g^P‖ < coarse and ‖g^P‖ < M‖Cν‖
-    M: float
-
-
 @dataclass(frozen=True, eq=False)
 class InnerSolver:
     """How the inner problems are solved, for each ρ."""
@@ -75,7 +70,6 @@ class InnerSolver:
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
     """Makes the observer of outer iteration k with that right-hand side."""
-    run: Callable[[float, Until], FaceRun] | None = None  #: compiled CG steps
 
 
 class OuterIteration(NamedTuple):
@@ -132,22 +126,11 @@ def smalbe(
     b_size = _norm(b) or _norm(at.g)
     left = constants.max_steps - len(at.steps) - len(at.outer)
     lagrangian = -np.inf
-    until = Until(tol * b_size, constants.eta * b_size, at.M)
-
-    def accurate(here: Point, face: Face) -> bool:
-        error = problem.energy_error(here.x, face.phi + face.beta)
-        return error <= constants.energy * tol
-
-    def small(here: Point, face: Face) -> bool:
-        return (
-            face.projected_norm <= until.small
-            and problem.rows.met(here.x, tol, b_size)
-            and (not constants.energy or accurate(here, face))
-        )
+    small = _accuracy(problem, tol, b_size, constants.energy)
 
     def precise(here: Point, face: Face) -> bool:
-        size = face.projected_norm
-        if len(C) and size < until.coarse and size < at.M * _norm(C @ here.x):
+        size, coarse = face.projected_norm, constants.eta * b_size
+        if len(C) and size < coarse and size < at.M * _norm(C @ here.x):
             return True
         return small(here, face)
 
@@ -158,7 +141,6 @@ def smalbe(
             B=inner.model(at.rho), stop=precise, rules=inner.rules,
             precondition=inner.precondition(at.rho),
             watch=inner.watch and inner.watch(len(at.outer), rhs),
-            run=inner.run and inner.run(at.rho, until._replace(M=at.M)),
             max_steps=max(left, 0),
         )  # fmt: skip
         left -= len(run.trace) + 1
@@ -166,12 +148,48 @@ def smalbe(
         lagrangian = at.outer[-1].lagrangian
         if small(Point(run.x, run.g), run.face):
             return at._replace(status=Status.SOLVED)
-        if (not run.stopped or at.stalled) and _infeasible(problem, at.nu):
+        if (not run.stopped or at.stalled) and infeasible(problem, at.nu):
             return at._replace(status=Status.INFEASIBLE)
-        if not run.stopped or left < 0 or (at.stalled and at.rho >= MOST_RHO):
+        if not run.stopped or left < 0:
             return at
         if at.stalled:
-            at = _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
+            stricter = _after_stall(
+                problem, at, met=problem.rows.met(at.nu, tol, b_size)
+            )
+            if stricter is None:
+                return at
+            at = stricter
+
+
+def _accuracy(
+    problem: Projected, tol: float, b_size: float, energy: float
+) -> Callable[[Point, Face], bool]:
+    """Make the test that ends the outer loop."""
+    most = 0  # products, once all but the energy is as accurate as asked for
+
+    def reached(here: Point, face: Face) -> bool:
+        nonlocal most
+        if face.projected_norm > tol * b_size:
+            return False
+        if not problem.rows.met(here.x, tol, b_size):
+            return False
+        spent = problem.F.count
+        most = most or int(FOR_ENERGY * spent)
+        if energy == 0 or spent >= most:
+            return True
+        error = problem.energy_error(here.x, face.phi + face.beta)
+        return error <= energy * tol
+
+    return reached
+
+
+def _after_stall(problem: Projected, at: Iterate, *, met: bool) -> Iterate | None:
+    """Be stricter with the rows, or, where they are `met`, with the gradient."""
+    if met:
+        return at._replace(M=at.M / 10) if at.M >= LEAST_M else None
+    if at.rho >= MOST_RHO:
+        return None
+    return _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))
 
 
 def _updated(
@@ -195,7 +213,7 @@ def _updated(
     return _with_penalty(problem, new, constants.rho_growth * rho)
 
 
-def _infeasible(problem: Projected, nu: Vector) -> bool:
+def infeasible(problem: Projected, nu: Vector) -> bool:
     """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
 
     By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum

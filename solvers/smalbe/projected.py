@@ -4,27 +4,31 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
-from scipy.linalg.blas import dsymv
 from scipy.sparse import issparse
 
 from harness import QP, Matrix, Vector
+from solvers.smalbe import compiled
+from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import Model
 from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
+FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
 TAIL = 1e-4  #: least τ of a model, relative to the norm
 
 
 class Rows(NamedTuple):
     """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
 
+    G: NDArray[np.float64]  #: (m, n) as given
     C: NDArray[np.float64]  #: (r, n)
     GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
     e_size: float  #: ‖e‖
@@ -72,14 +76,14 @@ class Spectrum(NamedTuple):
 class Projected:
     """Steps 1 to 3 of SMALBE: H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and b."""
 
-    F: Callable[[Vector], Vector]  #: counts its calls
-    counts: Counter[str]
+    F: Product  #: counts its calls
     rows: Rows
     spectrum: Spectrum
     b: Vector
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
     q: Vector  #: as given
     diagonal: Vector  #: of F; empty for an operator
+    counts: Counter[str] = field(default_factory=Counter)  #: besides products with F
 
     def energy_error(self, nu: Vector, gradient: Vector) -> float:
         """Estimate the relative energy error from what is left of the gradient.
@@ -111,18 +115,28 @@ class Projected:
 
         The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
         what the Ritz vectors before it leave (the last, where the process came to its
-        end); ρQ is taken as it is. Where that is too
-        little, as in flat spectra, MPRGP raises τ by what its products show.
+        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
+        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
+        a short process finds not even the first eigenvector, and Ritz vectors that are
+        none would slow CG down: then only the norm is used.
         """
-        C, ritz = self.rows.C, self.spectrum.ritz
+        C, (above, U, tail) = self.rows.C, self.upper_end()
+        w = np.append(above, np.full(len(C), rho))
+        return Model(0.0, np.vstack([U, C]), w).with_tail(tail)
+
+    def upper_end(self) -> tuple[Vector, NDArray[np.float64], float]:
+        """Return the Ritz pairs (k,), (k, n) that a model holds, and its τ."""
+        ritz = self.spectrum.ritz
         if ritz is None:
             raise ValueError("the power method found no Ritz pairs")
         above = (ritz.values + ritz.residuals) / self.spectrum.norm
         ended = ritz.residuals[-1] <= 1e-10 * ritz.values[0]
         kept = max(len(above) - (1 if ended else 2), 0)
-        U = np.vstack([ritz.vectors[:kept], C])
-        w = np.append(above[:kept], np.full(len(C), rho))
-        return Model(0.0, U, w).with_tail(max(float(above[kept]), TAIL))
+        unknown = np.flatnonzero(ritz.residuals > ritz.values)
+        kept = min([kept, *unknown[:1]])
+        if ritz.residuals[0] > FOUND * ritz.values[0]:
+            kept = 0
+        return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
     def plain_model(self, rho: float, *, alpha: float) -> Model:
         """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
@@ -132,7 +146,7 @@ class Projected:
 
 def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
-    dense = np.asarray(G.toarray() if hasattr(G, "toarray") else G, dtype=float)
+    dense = _dense(G)
     size = np.linalg.norm(dense, axis=1)
     size[size == 0] = 1.0
     Q, R, pivot = qr((dense / size[:, None]).T, mode="economic", pivoting=True)
@@ -142,36 +156,44 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     mismatch = np.abs(dense @ x_tilde - e) / size
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
 
-    def multipliers(a: Vector) -> Vector:
-        y = np.zeros(e.size)
-        y[kept] = solve_triangular(R, a) / size[kept]
-        return y
-
+    multipliers = partial(compiled.multipliers, e.size, R, kept, size)
     consistent = bool((mismatch <= 1e-8 * scale).all())
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
     pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
-    return Rows(C, dense @ C.T, e_size, pivot_size, x_tilde, consistent, multipliers)
+    GC = dense @ C.T
+    return Rows(dense, C, GC, e_size, pivot_size, x_tilde, consistent, multipliers)
+
+
+def _dense(G: Matrix) -> NDArray[np.float64]:
+    dense = G.toarray() if hasattr(G, "toarray") else G
+    return np.ascontiguousarray(dense, dtype=float)
 
 
 def projected_problem(
-    qp: QP,
-    find: Callable[[Callable[[Vector], Vector], Rows], Spectrum],
-    counts: Counter[str] | None = None,
+    qp: QP, find: Callable[[Callable[[Vector], Vector], Rows], Spectrum]
 ) -> Projected:
     """Homogenise, project and normalise; one product with F and those of `find`.
 
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
-    counts : to go on with
     """
-    counts = Counter() if counts is None else counts
-    P = product(qp.P)
-
-    def F(v: Vector) -> Vector:
-        counts["P_products"] += 1
-        return P(v)
-
+    F = Product(qp.P, qp.q.size)
     rows = orthonormal_rows(qp.A, qp.b)
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
+    return _normalised(qp, F, rows, spectrum)
+
+
+def prepared_problem(qp: QP, steps: int) -> Projected:
+    """Do what `projected_problem` does with `by_lanczos`, compiled."""
+    start = random_start(qp.q.size)
+    F, rows, triangle, ritz = compiled.prepare(
+        qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
+    )
+    found = Ritz(*ritz)
+    rows = Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
+    return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
+
+
+def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:
     if spectrum.norm <= NOTHING * (size := _mean_eigenvalue(qp.P)):
         spectrum = spectrum._replace(norm=size or 1.0)  # 𝒫F𝒫 is zero, or rounding
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
@@ -180,7 +202,7 @@ def projected_problem(
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
     diagonal = np.asarray(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
-    return Projected(F, counts, rows, spectrum, b, bounds, qp.q, diagonal)
+    return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
 def _mean_eigenvalue(P: Matrix) -> float:
@@ -198,22 +220,3 @@ def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Sp
 def by_power(PFP: Callable[[Vector], Vector], rows: Rows) -> Spectrum:
     """Find the norm as PERMON does; up to 50 products."""
     return Spectrum(power_method(PFP, rows.x_tilde.size) or 1.0, None)
-
-
-def product(P: Matrix) -> Callable[[Vector], Vector]:
-    """Return v → Pv for a symmetric P; of a dense one only a triangle is read.
-
-    Memory bounds a product with a dense matrix: half of it takes about half the time.
-    """
-    rows = dense_rows(P)
-    if rows is None:
-        return lambda v: np.asarray(P @ v)
-    columns = rows.T
-    return lambda v: np.asarray(dsymv(1.0, columns, v, lower=1))
-
-
-def dense_rows(P: Matrix) -> NDArray[np.float64] | None:
-    """Return a dense symmetric P with contiguous rows, None if it is no such array."""
-    if not isinstance(P, np.ndarray) or P.dtype != np.float64 or not P.size:
-        return None
-    return next((M for M in (P, P.T) if M.flags.c_contiguous), None)

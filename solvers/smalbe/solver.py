@@ -68,7 +68,8 @@ class SMALBE(Options):
 
             def run() -> Solution:
                 nonlocal carry
-                solution, carry = solve()
+                solution, left = solve()
+                carry = left()
                 return solution
 
             return run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +27,12 @@ class Ritz(NamedTuple):
         return float(self.values[0] + self.residuals[0])
 
 
+@lru_cache(maxsize=8)
 def random_start(n: int) -> Vector:
     """Draw the same vector (n,) every time: no answer may depend on luck."""
-    return np.random.default_rng(19640229).standard_normal(n)
+    start = np.random.default_rng(19640229).standard_normal(n)
+    start.flags.writeable = False
+    return start
 
 
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:

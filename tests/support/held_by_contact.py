@@ -31,6 +31,7 @@ def disc_between_plates(
     *,
     form: str = "primal",
     contact: str = "nts",
+    basis: str = "dual",
     disc_is_slave: bool = True,
     rollers: bool = False,
     turn: float = 0.3,
@@ -70,7 +71,7 @@ def disc_between_plates(
         load=(load @ T.T).ravel(),
         pairs=tuple(ContactPair(*(f if disc_is_slave else f[::-1])) for f in faces),
     )  # fmt: skip
-    rows = linearisation(bodies, contact, "dual")(np.zeros(mesh.dofs))
+    rows = linearisation(bodies, contact, basis)(np.zeros(mesh.dofs))
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, form,

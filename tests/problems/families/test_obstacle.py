@@ -5,7 +5,13 @@ import pytest
 
 from harness import InputError, kkt_residuals
 from problems.families.obstacle import Obstacle
-from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
+from problems.models.obstacle import (
+    LIFT_OFF,
+    exact_energy,
+    exact_height,
+    obstacle_height,
+    obstacle_problem,
+)
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
@@ -133,11 +139,61 @@ def test_the_boundary_is_held_at_the_exact_height():
     )
 
 
+def test_over_the_hemisphere_the_exact_height_is_harmonic_and_leaves_it_smoothly():
+    rng = np.random.default_rng(20090)
+    x, h = rng.uniform(-2, 2, (400, 2)), 1e-4
+    laplacian = sum(
+        exact_height(x + e, "hemisphere") - 2 * exact_height(x, "hemisphere")
+        + exact_height(x - e, "hemisphere") for e in h * np.eye(2)
+    ) / h**2  # fmt: skip
+    r = np.linalg.norm(x, axis=1)
+    lift = exact_height(x, "hemisphere") - obstacle_height(x, "hemisphere")
+    near = abs(r - LIFT_OFF) < 0.02
+
+    assert laplacian[r > LIFT_OFF + h] == pytest.approx(0, abs=1e-5)
+    assert (laplacian[r < LIFT_OFF - h] < -1).all()
+    assert (lift >= 0).all()
+    assert lift[near].max() <= 3 * 0.02**2
+    assert exact_height(np.array([[2.0, 0.0]]), "hemisphere") == pytest.approx(0)
+
+
+def test_the_exact_energy_over_the_hemisphere_is_that_of_the_exact_height():
+    n, h = 800, 1e-5
+    x = -2 + 4 * (np.arange(n) + 0.5) / n
+    points = np.stack([a.ravel() for a in np.meshgrid(x, x)], axis=1)
+    slopes = [
+        (
+            exact_height(points + e, "hemisphere")
+            - exact_height(points - e, "hemisphere")
+        )
+        / (2 * h)
+        for e in h * np.eye(2)
+    ]
+    energy = sum(slope @ slope for slope in slopes) / 2 * (4 / n) ** 2
+
+    assert energy == pytest.approx(exact_energy(2, "hemisphere"), rel=1e-4)
+
+
+@pytest.mark.parametrize("form", ["primal", "dual-bounds"])
+def test_over_the_hemisphere_it_converges_with_second_order(form):
+    got = []
+    for n in (16, 32, 64):
+        params = {"dim": 2, "n": n, "shape": "hemisphere"}
+        case = FAMILY.build(form, params, reference_solution)
+        s = SMALBE().prepare(case.qp, 1e-9)()
+        got.append(case.quantities(s))
+
+    assert rates([g["energy_error"] for g in got]) == pytest.approx(2, abs=0.15)
+    assert got[-1]["max_error"] <= 2e-3
+    assert abs(got[-1]["force_error"]) <= 2e-3
+
+
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
         ({"dim": 3}, "dim=3 is unknown, expected 1 or 2"),
         ({"n": 1}, "n=1 must be at least 2"),
+        ({"shape": "hemisphere", "dim": 1}, "shape=hemisphere needs dim=2"),
     ],
 )
 def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):

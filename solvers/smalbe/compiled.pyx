@@ -1,0 +1,1223 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+# cython: initializedcheck=False
+"""SMALBE compiled: preparation, MPRGP, outer loop and the way back, without Python.
+
+The readable modules define what happens here, and are what tests compare with: the same
+counts, and the same points up to rounding.
+
+* `prepare`: `solvers.smalbe.projected`, `solvers.smalbe.spectrum`
+* `_Run.step_of_model`, `_Run.core`: `solvers.smalbe.model`
+* `_Run.minimise`: `solvers.smalbe.mprgp`
+* `smalbe`: `solvers.smalbe.outer_loop`
+* `recover`: `solvers.smalbe.driver`
+
+P is dense (then one triangle is read), sparse, or an operator, which is asked by Python.
+Between two products a step makes three passes over its vectors. The loops over vectors
+are compiled twice, for processors with AVX2 and for all others.
+"""
+
+from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
+from libc.string cimport memcpy, memset
+from scipy.linalg.cython_blas cimport dgemv, dsymv
+from scipy.linalg.cython_lapack cimport (
+    dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev, dtrtrs,
+)
+
+import numpy as np
+from scipy.sparse import csr_array, issparse
+
+cdef extern from *:
+    """
+    #define ROUNDING (4 * 2.220446049250313e-16) /* relative error of a few operations */
+    #if defined(__x86_64__) && defined(__gnu_linux__)
+    #define TWICE __attribute__((target_clones("arch=haswell", "default")))
+    #else
+    #define TWICE
+    #endif
+    TWICE static void sparse(const int *, const int *, const double *, const double *,
+                             double *, Py_ssize_t);
+    TWICE static double dot(const double *, const double *, Py_ssize_t);
+    TWICE static void add(double, const double *, double *, Py_ssize_t);
+    TWICE static void scale(double, double *, Py_ssize_t);
+    TWICE static void lengths(const double *, const double *, const double *,
+        const double *, const double *, const double *, Py_ssize_t, double *);
+    TWICE static void move(double, const double *, const double *, const double *,
+        const double *, const double *, const double *, double *, double *, Py_ssize_t);
+    TWICE static void split(const double *, const double *, const double *,
+        const double *, double, double *, double *, Py_ssize_t, double *);
+    TWICE static double conjugate(const double *, double *, const double *, Py_ssize_t,
+        double);
+    TWICE static void add_gram(double, const double *, double *, Py_ssize_t);
+    TWICE static void tilted(const double *, const double *, double, const double *,
+        const double *, double *, double *, Py_ssize_t);
+    """
+    const double ROUNDING
+
+
+# --- loops over vectors -------------------------------------------------------------
+
+
+cdef void sparse "sparse"(
+    const int *indptr, const int *indices, const double *data, const double *v,
+    double *y, Py_ssize_t n,
+) noexcept nogil:
+    """y ← Fv by the rows of F (n, n)."""
+    cdef Py_ssize_t i, k
+    cdef double total
+    for i in range(n):
+        total = 0.0
+        for k in range(indptr[i], indptr[i + 1]):
+            total += data[k] * v[indices[k]]
+        y[i] = total
+
+
+cdef double dot "dot"(const double *a, const double *b, Py_ssize_t n) noexcept nogil:
+    cdef double total = 0.0
+    cdef Py_ssize_t i
+    for i in range(n):
+        total += a[i] * b[i]
+    return total
+
+
+cdef void add "add"(double s, const double *a, double *b, Py_ssize_t n) noexcept nogil:
+    """b ← b + s a."""
+    cdef Py_ssize_t i
+    for i in range(n):
+        b[i] += s * a[i]
+
+
+cdef void scale "scale"(double s, double *a, Py_ssize_t n) noexcept nogil:
+    cdef Py_ssize_t i
+    for i in range(n):
+        a[i] *= s
+
+
+cdef void lengths "lengths"(
+    const double *x, const double *g, const double *p, const double *Hp,
+    const double *lower, const double *upper, Py_ssize_t n, double *told,
+) noexcept nogil:
+    """Find α of x − αp: told ← the minimising, the largest feasible, gᵀp, pᵀHp."""
+    cdef double curvature = 0.0, slope = 0.0, feasible = INFINITY, room
+    cdef Py_ssize_t i
+    for i in range(n):
+        curvature += p[i] * Hp[i]
+        slope += g[i] * p[i]
+        room = (x[i] - (lower[i] if p[i] > 0 else upper[i])) / p[i]
+        room = room if p[i] != 0 else INFINITY
+        feasible = room if room < feasible else feasible
+    told[0] = slope / curvature if curvature > 0 else INFINITY
+    told[1], told[2], told[3] = feasible, slope, curvature
+
+
+cdef void move "move"(
+    double alpha, const double *x, const double *g, const double *p, const double *Hp,
+    const double *lower, const double *upper, double *new_x, double *new_g,
+    Py_ssize_t n,
+) noexcept nogil:
+    """x − αp and its gradient; what is nearer to a bound than rounding is on it."""
+    cdef double step, new, noise
+    cdef int down, up
+    cdef Py_ssize_t i
+    for i in range(n):
+        step = alpha * p[i]
+        new, noise = x[i] - step, ROUNDING * (fabs(x[i]) + fabs(step))
+        down = (new - lower[i] <= noise) & (step >= 0)
+        up = (upper[i] - new <= noise) & (step <= 0) & (1 - down)
+        new = lower[i] if down else new
+        new_x[i] = upper[i] if up else new
+        new_g[i] = g[i] - alpha * Hp[i]
+
+
+cdef void split "split"(
+    const double *x, const double *g, const double *lower, const double *upper,
+    double tau, double *phi, double *free, Py_ssize_t n, double *told,
+) noexcept nogil:
+    """Find φ and the free components (1, others 0); told ← ‖φ‖², ‖β‖², φ̃ᵀφ."""
+    cdef double f, b, cut, phi_square = 0.0, beta_square = 0.0, reduced = 0.0, inside
+    cdef int at_lower, at_upper
+    cdef Py_ssize_t i
+    for i in range(n):
+        at_lower, at_upper = x[i] <= lower[i], x[i] >= upper[i]
+        inside = 0.0 if at_lower | at_upper else 1.0
+        f = 0.0 if at_lower | at_upper else g[i]
+        b = g[i] if ((g[i] < 0) & (1 - at_upper)) | ((g[i] > 0) & (1 - at_lower)) else 0.0
+        b = b if at_lower | at_upper else 0.0
+        free[i], phi[i] = inside, f
+        phi_square += f * f
+        beta_square += b * b
+        cut = tau * (x[i] - upper[i])
+        cut = f if f > cut else cut
+        inside = tau * (x[i] - lower[i])
+        cut = cut if cut < inside else inside
+        reduced += cut * f if f != 0 else 0.0
+    told[0], told[1], told[2] = phi_square, beta_square, reduced
+
+
+cdef double conjugate "conjugate"(
+    const double *z, double *p, const double *Hp, Py_ssize_t n, double curvature
+) noexcept nogil:
+    """p ← z − (zᵀHp/pᵀHp) p."""
+    cdef double gamma = dot(z, Hp, n) / curvature
+    cdef Py_ssize_t i
+    for i in range(n):
+        p[i] = z[i] - gamma * p[i]
+    return gamma
+
+
+cdef void add_gram "add_gram"(
+    double s, const double *v, double *S, Py_ssize_t k
+) noexcept nogil:
+    """S ← S + s vvᵀ (k, k)."""
+    cdef Py_ssize_t i, j
+    cdef double t
+    for i in range(k):
+        t = s * v[i]
+        for j in range(k):
+            S[i * k + j] += t * v[j]
+
+
+cdef void tilted "tilted"(
+    const double *x, const double *g, double tau, const double *lower,
+    const double *upper, double *s, double *piece, Py_ssize_t n,
+) noexcept nogil:
+    """Minimise gᵀs + τ/2‖s‖² over the box; piece: −1 at the lower bound, 1 at the upper."""
+    cdef double target
+    cdef int down, up
+    cdef Py_ssize_t i
+    for i in range(n):
+        target = x[i] - g[i] / tau
+        down = target <= lower[i]
+        up = (target >= upper[i]) & (1 - down)
+        target = lower[i] if down else target
+        target = upper[i] if up else target
+        piece[i] = up - down
+        s[i] = target - x[i]
+
+
+# --- the matrix ---------------------------------------------------------------------
+
+
+cdef class Product:
+    """v → Pv, counted."""
+
+    cdef Py_ssize_t n
+    cdef public long count
+    cdef object matrix
+    cdef const double *dense
+    cdef const double *data
+    cdef const int *indptr
+    cdef const int *indices
+    cdef object held
+
+    def __cinit__(self, P, Py_ssize_t n):
+        cdef const double[:, ::1] rows
+        cdef const double[::1] data
+        cdef const int[::1] indptr, indices
+        self.n, self.matrix = n, P
+        if isinstance(P, np.ndarray) and n:
+            whole = P if P.flags.c_contiguous else P.T
+            rows = np.ascontiguousarray(whole, dtype=float)
+            self.held, self.dense = rows, &rows[0, 0]
+        elif issparse(P) and P.nnz and P.nnz < 2**31:
+            M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
+            data = np.ascontiguousarray(M.data, dtype=float)
+            indptr = np.ascontiguousarray(M.indptr, dtype=np.int32)
+            indices = np.ascontiguousarray(M.indices, dtype=np.int32)
+            self.held = (data, indptr, indices)
+            self.data, self.indptr, self.indices = &data[0], &indptr[0], &indices[0]
+
+    def __call__(self, v):
+        """Return Pv for v (n,)."""
+        cdef double[::1] vector = np.ascontiguousarray(v, dtype=float)
+        cdef double[::1] result = np.empty(self.n)
+        if self.n:
+            self.apply(&vector[0], &result[0])
+        return np.asarray(result)
+
+    cdef int apply(self, const double *v, double *y) except -1:
+        self.count += 1
+        cdef double[::1] vector, result
+        cdef int n = self.n, one = 1
+        cdef double unit = 1.0, zero = 0.0
+        if self.dense:
+            dsymv(b"U", &n, &unit, <double *> self.dense, &n, <double *> v, &one, &zero,
+                  y, &one)
+        elif self.data:
+            sparse(self.indptr, self.indices, self.data, v, y, self.n)
+        elif self.n:
+            told = np.empty(self.n)
+            vector = told
+            memcpy(&vector[0], v, self.n * sizeof(double))
+            result = np.ascontiguousarray(self.matrix @ told, dtype=float)
+            memcpy(y, &result[0], self.n * sizeof(double))
+        return 0
+
+
+cdef double *pointer(double[::1] v) noexcept:
+    return &v[0] if v.shape[0] else NULL
+
+
+cdef double *first(double[:, ::1] M) noexcept:
+    return &M[0, 0] if M.shape[0] and M.shape[1] else NULL
+
+
+cdef void rows_times(
+    const double *U, const double *v, double *out, Py_ssize_t k, Py_ssize_t n
+) noexcept nogil:
+    """out ← Uv for U (k, n) by rows."""
+    cdef int columns = k, order = n, one = 1
+    cdef double unit = 1.0, zero = 0.0
+    if k and n:
+        dgemv(b"T", &order, &columns, &unit, <double *> U, &order, <double *> v, &one,
+              &zero, out, &one)
+
+
+cdef void add_combination(
+    double s, const double *U, const double *c, double *out, Py_ssize_t k, Py_ssize_t n
+) noexcept nogil:
+    """out ← out + s Uᵀc for U (k, n) by rows."""
+    cdef int columns = k, order = n, one = 1
+    cdef double unit = 1.0
+    if k and n:
+        dgemv(b"N", &order, &columns, &s, <double *> U, &order, <double *> c, &one,
+              &unit, out, &one)
+
+
+cdef void without(
+    const double *C, Py_ssize_t r, double *v, double *Cv, Py_ssize_t n
+) noexcept nogil:
+    """v ← v − CᵀCv with Cv (r,), which is kept."""
+    rows_times(C, v, Cv, r, n)
+    add_combination(-1.0, C, Cv, v, r, n)
+
+
+# --- preparation --------------------------------------------------------------------
+
+
+def prepare(P, Py_ssize_t n, const double[:, ::1] G, const double[::1] e,
+            const double[::1] start, int steps):
+    """Find orthonormal rows, x̃ and Ritz pairs, as `projected_problem` does.
+
+    G (m, n), e (m,); start (n,) of the Lanczos process, `steps` long. Returns the
+    product, the fields of `Rows` but the last, the QR factorisation that
+    multipliers need, and the fields of `Ritz`.
+    """
+    cdef Py_ssize_t i, m = G.shape[0], r = 0
+    cdef Product F = Product(P, n)
+    cdef double mismatch = 0.0, most_x = 0.0, most_e = 0.0, square = 0.0
+    cdef bint consistent = True
+    dense, least_pivot = np.asarray(G), 1.0
+    kept, R, rows = np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros((0, n))
+    sizes, x_tildes, GC = np.ones(m), np.zeros(n), np.zeros((m, 0))
+    cdef double[::1] size = sizes, x_tilde = x_tildes
+    cdef double[:, ::1] C = rows
+    for i in range(m):
+        size[i] = sqrt(dot(&G[i, 0], &G[i, 0], n)) if n else 0.0
+        size[i] = size[i] or 1.0
+        most_e = fmax(most_e, fabs(e[i]) / size[i])
+        square += e[i] * e[i]
+    if m and n:
+        R, kept, rows = _orthonormal(dense / sizes[:, None], min(m, n))
+        C, r = rows, rows.shape[0]
+        GC = dense @ rows.T
+        if r:
+            least_pivot = min(1.0, np.abs(np.diag(R)).min())
+            coefficients = _triangular(R, (np.asarray(e) / sizes)[kept], b"T")
+            x_tilde = coefficients @ rows
+        for i in range(n):
+            most_x = fmax(most_x, fabs(x_tilde[i]))
+    for i in range(m):
+        e_i = dot(&G[i, 0], &x_tilde[0], n) if n else 0.0
+        mismatch = fmax(mismatch, fabs(e_i - e[i]) / size[i])
+    consistent = mismatch <= 1e-8 * (most_x + most_e)
+    rows = (dense, rows, GC, sqrt(square), least_pivot, np.asarray(x_tilde), consistent)
+    return F, rows, (R, kept, sizes), _lanczos(F, C, start, steps)
+
+
+def _orthonormal(unit, Py_ssize_t w):
+    """Factorise unitᵀ = QR with pivots: R (r, r), the rows kept (r,), C = Qᵀ (r, n)."""
+    cdef double[:, ::1] A = np.array(unit)  # (m, n) by rows is (n, m) by columns
+    cdef int m = A.shape[0], n = A.shape[1], info = 0, most, r = 0, width = w
+    pivots, tau, work = np.zeros(m, dtype=np.int32), np.empty(w), np.empty(64 * (m + n))
+    cdef int[::1] pivot = pivots
+    cdef double[::1] t = tau, space = work
+    most = space.shape[0]
+    dgeqp3(&n, &m, &A[0, 0], &n, &pivot[0], &t[0], &space[0], &most, &info)
+    R = np.triu(np.asarray(A)[:w, :w].T)
+    diagonal = np.abs(np.diag(R))
+    r = int((diagonal > RANK).sum())
+    if r:
+        dorgqr(&n, &r, &r, &A[0, 0], &n, &t[0], &space[0], &most, &info)
+    return R[:r, :r].copy(), pivots[:r].astype(np.int64) - 1, np.asarray(A)[:r].copy()
+
+
+RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+
+
+def multipliers(Py_ssize_t m, R, kept, size, a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
+    y = np.zeros(m)
+    if len(kept):
+        y[kept] = _triangular(R, a, b"N") / size[kept]
+    return y
+
+
+def _triangular(R, b, char *transposed):
+    """Solve Rx = b, or Rᵀx = b, with an upper triangle R (r, r)."""
+    cdef double[::1, :] A = np.asfortranarray(R)
+    cdef double[::1] x = np.array(b)
+    cdef int r = x.shape[0], one = 1, info = 0
+    if r:
+        dtrtrs(b"U", transposed, b"N", &r, &one, &A[0, 0], &r, &x[0], &r, &info)
+    return np.asarray(x)
+
+
+cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
+    """Find upper Ritz pairs of PFP: values, residuals, vectors (k, n), and at the start."""
+    cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
+    cdef int kept, info = 0, again
+    steps = min(steps, n)
+    bases, told, offs = np.zeros((steps, n)), np.zeros(steps), np.zeros(steps)
+    cdef double[:, ::1] basis = bases
+    cdef double[::1] diagonal = told, off = offs, v = np.array(start), Cv = np.empty(r)
+    cdef double[::1] Fv = np.empty(n)
+    cdef double beta, largest = 0.0, s
+    kept = 0
+    if n:
+        without(first(C), r, &v[0], pointer(Cv), n)
+        beta = sqrt(dot(&v[0], &v[0], n))
+    else:
+        beta = 0.0
+    for k in range(steps if beta else 0):
+        memcpy(&basis[k, 0], &v[0], n * sizeof(double))
+        scale(1 / beta, &basis[k, 0], n)
+        memcpy(&Fv[0], &basis[k, 0], n * sizeof(double))
+        without(first(C), r, &Fv[0], pointer(Cv), n)
+        F.apply(&Fv[0], &v[0])
+        without(first(C), r, &v[0], pointer(Cv), n)
+        diagonal[k] = dot(&basis[k, 0], &v[0], n)
+        largest = fmax(largest, fabs(diagonal[k]))
+        for again in range(2):
+            for i in range(k + 1):
+                s = dot(&basis[i, 0], &v[0], n)
+                add(-s, &basis[i, 0], &v[0], n)
+        beta = sqrt(dot(&v[0], &v[0], n))
+        off[k] = beta
+        kept = k + 1
+        if beta <= 1e-12 * largest:
+            break
+    if not kept:
+        return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
+    at_start = told[0]
+    cdef double[::1] theta = told[:kept].copy(), between = offs[:kept].copy()
+    cdef double[::1, :] S = np.zeros((kept, kept), order="F")
+    cdef double[::1] space = np.empty(max(1, 2 * kept))
+    dstev(b"V", &kept, &theta[0], &between[0], &S[0, 0], &kept, &space[0], &info)
+    whole = np.asarray(S)
+    vectors = whole[:, ::-1].T @ bases[:kept]
+    residuals = offs[kept - 1] * np.abs(whole[-1, ::-1])
+    return np.asarray(theta)[::-1].copy(), residuals, vectors, at_start
+
+
+# --- MPRGP and the outer loop -------------------------------------------------------
+
+cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
+cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
+
+cdef enum:
+    NEWTON_STEPS = 100
+    SEARCH_STEPS = 60
+    MOST_IDLE = 5
+    STD = 0
+    PROJCG = 1
+    MIXED = 2
+    MODEL = 3
+
+
+cdef struct Until:
+    double small
+    double coarse
+    double M
+
+
+cdef class Model:
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n).
+
+    It keeps U_F U_Fᵀ for the face F for which it was asked last.
+    """
+
+    cdef Py_ssize_t n, k, flips
+    cdef bint entered
+    cdef double tau
+    cdef double[:, ::1] U, gram
+    cdef double[::1] w, root, held, column
+
+    @staticmethod
+    cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
+        """Leave out the rows whose w is not positive."""
+        cdef Model B = Model.__new__(Model)
+        cdef Py_ssize_t i, k = 0
+        for i in range(w.shape[0]):
+            k += w[i] > 0
+        if k < w.shape[0]:
+            kept = np.asarray(w) > 0
+            U, w = np.asarray(U)[kept], np.asarray(w)[kept]
+        B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
+        return B
+
+    cdef double *rows(self) noexcept:
+        return &self.U[0, 0] if self.k else NULL
+
+    @staticmethod
+    cdef Model of_norm(double norm, Py_ssize_t n):
+        cdef Model B = Model.__new__(Model)
+        B.tau, B.n = norm, n
+        return B
+
+    cdef Model with_tail(self, double tau):
+        """Change τ and leave w + τ as it is, where that is above τ."""
+        cdef double[::1] w = np.array(self.w) if self.k else np.zeros(0)
+        cdef Py_ssize_t i
+        if not self.k:
+            return Model.of_norm(tau, self.n)
+        for i in range(self.k):
+            w[i] += self.tau - tau
+        return Model.above_tail(self.U, w, tau)
+
+    cdef int enter(self, const double *piece) except -1:
+        """Have the Gram matrix be that of the face where `piece` is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew.
+        """
+        cdef Py_ssize_t i, j
+        cdef double was, held
+        cdef double *gram
+        if not self.entered:
+            self.entered = True
+            self.root, self.column = np.sqrt(self.w), np.empty(self.k)
+            self.gram, self.held = np.eye(self.k), np.zeros(self.n)
+        gram = &self.gram[0, 0]
+        if self.flips > self.n:
+            self.flips = 0
+            memset(gram, 0, self.k * self.k * sizeof(double))
+            for i in range(self.k):
+                gram[i * self.k + i] = 1.0
+            memset(&self.held[0], 0, self.n * sizeof(double))
+        for i in range(self.n):
+            was, held = self.held[i], piece[i] != 0
+            if was != held:
+                for j in range(self.k):
+                    self.column[j] = self.U[j, i]
+                add_gram(was - held, &self.column[0], gram, self.k)
+                self.held[i] = held
+                self.flips += 1
+        return 0
+
+
+def _whole(a):
+    return np.ascontiguousarray(a, dtype=float)
+
+
+cdef class Solver:
+    """One projected problem, the rules of its solution, and room for the vectors.
+
+    problem : a `Projected` with the `Product` P; rules : a `Rules`
+    """
+
+    cdef Product F
+    cdef object problem
+    cdef Py_ssize_t n, r, m
+    cdef double inverse_norm, norm, e_size, x_tilde_size, alpha, Gamma_square, rho
+    cdef bint reduced, plain, preconditioned, newton_proportions
+    cdef int expansion
+    cdef double[:, ::1] C, GC, vectors, room
+    cdef const double[::1] q, diagonal
+    cdef double[::1] x_tilde, b, lower, upper, above, rhs
+    cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
+    cdef double[::1] piece, piece2, Cv, Cw, Ge, told
+    cdef double tail, phi_square, beta_square, reduced_square
+    cdef Model preconditioner, B, known
+    cdef double known_rho
+    cdef long most_products  # where the energy error may still cost something
+    cdef double[::1] y, dy, y2, slope, slope2, c, c2
+    cdef double[:, ::1] core, inverse
+
+    def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
+        rows, spectrum = problem.rows, problem.spectrum
+        self.problem, self.F = problem, F
+        self.C, self.GC, self.x_tilde = map(_whole, (rows.C, rows.GC, rows.x_tilde))
+        self.n, self.r, self.m = F.n, self.C.shape[0], self.GC.shape[0]
+        self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
+        self.e_size, self.x_tilde_size = rows.e_size, np.linalg.norm(rows.x_tilde)
+        self.b, self.q = _whole(problem.b), _whole(problem.q)
+        self.lower, self.upper = map(_whole, problem.bounds)
+        self.diagonal = _whole(problem.diagonal)
+        self.alpha, self.Gamma_square, self.reduced = alpha, rules.Gamma**2, rules.reduced
+        self.expansion = ("std", "projcg", "mixed", "model").index(rules.expansion)
+        self.newton_proportions = rules.proportioning == "model"
+        self.plain = rules.expansion != "model"
+        self.preconditioned = preconditioned
+        k = 0
+        if spectrum.ritz is not None:
+            above, vectors, self.tail = problem.upper_end()
+            self.above = np.append(above, np.zeros(self.r)) - self.tail
+            self.vectors = np.vstack([vectors, rows.C])
+            k = self.above.shape[0]
+        n = self.n
+        self.room = np.empty((14, n))
+        (self.x, self.g, self.p, self.Hp, self.phi, self.free, self.z, self.s, self.Hs,
+         self.t, self.x2, self.g2, self.box_lower, self.box_upper) = self.room
+        self.rhs, self.piece, self.piece2 = np.empty((3, n))
+        self.Cv, self.Cw = np.empty((2, self.r))
+        self.Ge, self.told = np.empty(self.m), np.empty(4)
+        (self.y, self.dy, self.y2, self.slope, self.slope2, self.c,
+         self.c2) = np.empty((7, k))
+        self.core, self.inverse = np.empty((2, k, k))
+
+    # the operator
+
+    cdef int H(self, const double *v, double *out) except -1:
+        """out ← Hv = PFPv/‖PFP‖ + ρQv; one product."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double *Pv = pointer(self.t)
+        if not self.r:
+            self.F.apply(v, out)
+            scale(self.inverse_norm, out, n)
+            return 0
+        memcpy(Pv, v, n * sizeof(double))
+        without(first(self.C), self.r, Pv, &self.Cv[0], n)
+        self.F.apply(Pv, out)
+        scale(self.inverse_norm, out, n)
+        rows_times(first(self.C), out, &self.Cw[0], self.r, n)
+        for i in range(self.r):
+            self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
+        add_combination(1.0, first(self.C), &self.Cw[0], out, self.r, n)
+        return 0
+
+    cdef double infeasibility(self, const double *x):
+        """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
+        cdef Py_ssize_t i
+        cdef double square = 0.0
+        rows_times(first(self.C), x, pointer(self.Cv), self.r, self.n)
+        for i in range(self.r):
+            square += self.Cv[i] * self.Cv[i]
+        return sqrt(square)
+
+    # the model
+
+    cdef Model model(self, double rho):
+        """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
+        cdef Py_ssize_t i, k = self.above.shape[0]
+        cdef double[::1] w
+        if self.known is None or self.known_rho != rho:
+            w = np.array(self.above)
+            for i in range(k - self.r, k):
+                w[i] += rho
+            self.known, self.known_rho = Model.above_tail(self.vectors, w, self.tail), rho
+        return self.known
+
+    cdef int factor(self, Model B, const double *piece) except -1:
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
+        cdef Py_ssize_t i, j, k = B.k
+        cdef double *S = first(self.core)
+        cdef int order = k, info = 0
+        B.enter(piece)
+        for i in range(k):
+            for j in range(k):
+                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i, j]
+            S[i * k + i] += B.tau
+        dpotrf(b"U", &order, S, &order, &info)
+        if info:
+            raise ArithmeticError("the core of a model is not positive definite")
+        return 0
+
+    cdef void tilt(self, Model B, const double *x, const double *g, const double *lower,
+                   const double *upper, const double *y, double *s, double *piece,
+                   double *slope) noexcept:
+        """Find s(y), its piece and the slope Us − W⁻¹y."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double *t = pointer(self.t)
+        if not B.k:
+            tilted(x, g, B.tau, lower, upper, s, piece, n)
+            return
+        memcpy(t, g, n * sizeof(double))
+        add_combination(1.0, B.rows(), y, t, B.k, n)
+        tilted(x, t, B.tau, lower, upper, s, piece, n)
+        rows_times(B.rows(), s, slope, B.k, n)
+        for i in range(B.k):
+            slope[i] -= y[i] / B.w[i]
+
+    cdef int step_of_model(self, Model B, const double *x, const double *g,
+                           const double *lower, const double *upper,
+                           double *s) except -1:
+        """s ← argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u, as `Model.step` does."""
+        cdef Py_ssize_t i, newton, search, n = self.n, k = B.k
+        cdef double *y = pointer(self.y)
+        cdef double *dy = pointer(self.dy)
+        cdef double *there = pointer(self.y2)
+        cdef double *slope = pointer(self.slope)
+        cdef double *slope_there = pointer(self.slope2)
+        cdef double *piece = &self.piece[0]
+        cdef double *piece_there = &self.piece2[0]
+        cdef double begun, now, low, high, at_low, at_high, t, share
+        cdef int order = k, one = 1, info = 0
+        if not k:
+            self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+            return 0
+        memset(y, 0, k * sizeof(double))
+        self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+        for newton in range(NEWTON_STEPS):
+            self.factor(B, piece)
+            for i in range(k):
+                dy[i] = B.root[i] * slope[i]
+            dpotrs(b"U", &order, &one, first(self.core), &order, dy, &order, &info)
+            for i in range(k):
+                dy[i] *= B.root[i] * B.tau
+                there[i] = y[i] + dy[i]
+            begun = dot(slope, dy, k)
+            self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
+            for i in range(n):
+                if piece[i] != piece_there[i]:
+                    break
+            else:
+                return 0  # where Newton's method is exact
+            now = dot(slope_there, dy, k)
+            low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
+            for search in range(SEARCH_STEPS):
+                if fabs(now) <= 0.1 * begun or (now > 0 and t == 1) or at_low <= at_high:
+                    break
+                share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+                t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
+                for i in range(k):
+                    there[i] = y[i] + t * dy[i]
+                self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
+                now = dot(slope_there, dy, k)
+                if now > 0:
+                    low, at_low = t, now
+                else:
+                    high, at_high = t, now
+            memcpy(y, there, k * sizeof(double))
+            memcpy(slope, slope_there, k * sizeof(double))
+            memcpy(piece, piece_there, n * sizeof(double))
+        largest = B.tau + np.max(B.w)  # seldom
+        return self.step_of_model(
+            Model.of_norm(largest, n), x, g, lower, upper, s
+        )
+
+    cdef Model raised(self, Model B, const double *s, double sHs):
+        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
+        cdef Py_ssize_t i
+        cdef double square = dot(s, s, self.n), rest = square, missing, tau
+        missing = sHs - B.tau * square
+        rows_times(B.rows(), s, pointer(self.c), B.k, self.n)
+        for i in range(B.k):
+            rest -= self.c[i] * self.c[i]
+            missing -= B.w[i] * self.c[i] * self.c[i]
+        if missing <= 0:
+            return B
+        tau = B.tau + missing / rest if rest > 0 else INFINITY
+        return B.with_tail(fmin(fmax(tau, B.tau), 10 * B.tau))
+
+    # the face
+
+    cdef void split(self):
+        """Split the gradient at x by the face on which x lies."""
+        split(&self.x[0], &self.g[0], &self.lower[0], &self.upper[0], self.B.tau,
+              &self.phi[0], &self.free[0], self.n, &self.told[0])
+        self.phi_square, self.beta_square = self.told[0], self.told[1]
+        self.reduced_square = self.told[2]
+
+    cdef int enter_face(self) except -1:
+        """Have the preconditioner know the face."""
+        cdef Py_ssize_t i, j, k
+        cdef double *N = first(self.inverse)
+        cdef int order, info = 0
+        if not self.preconditioned or not self.preconditioner.k:
+            return 0
+        cdef Model M = self.preconditioner
+        k = order = M.k
+        for i in range(self.n):
+            self.piece[i] = 1 - self.free[i]
+        self.factor(M, &self.piece[0])
+        memcpy(N, first(self.core), k * k * sizeof(double))
+        dpotri(b"U", &order, N, &order, &info)
+        for i in range(k):
+            for j in range(i + 1):
+                N[i * k + j] *= M.root[i] * M.root[j]
+                N[j * k + i] = N[i * k + j]
+        return 0
+
+    cdef const double *preconditioned_gradient(self) noexcept:
+        """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
+        cdef Py_ssize_t i, n = self.n, k
+        cdef double tau
+        cdef const double *U
+        cdef double *z = &self.z[0]
+        if not self.preconditioned:
+            return &self.phi[0]
+        k, tau = self.preconditioner.k, self.preconditioner.tau
+        U = self.preconditioner.rows()
+        memcpy(z, &self.phi[0], n * sizeof(double))
+        if k:
+            rows_times(U, z, &self.c[0], k, n)
+            rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
+            add_combination(-1.0, U, &self.c2[0], z, k, n)
+        for i in range(n):
+            z[i] *= self.free[i] / tau
+        return z
+
+    # MPRGP
+
+    cdef double cost(self, const double *x, const double *g):
+        """Return xᵀHx − 2bᵀx, twice the cost, from the gradient."""
+        cdef double total = 0.0
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            total += x[i] * (g[i] - self.rhs[i])
+        return total
+
+    cdef void to(self, double alpha, const double *p, const double *Hp):
+        """x ← x − αp; the gradient follows without a product."""
+        move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
+             &self.x[0], &self.g[0], self.n)
+
+    cdef int step_by_model(self) except -1:
+        """Minimise the model over the box, then the cost along that step.
+
+        0 where there is nothing to gain, or the cost falls without end.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef double *s = &self.s[0]
+        cdef double *Hs = &self.Hs[0]
+        cdef double length
+        cdef bint moves = False
+        self.step_of_model(self.B, &self.x[0], &self.g[0], &self.lower[0],
+                           &self.upper[0], s)
+        for i in range(n):
+            moves = moves or s[i] != 0
+        if not moves:
+            return 0
+        self.H(s, Hs)
+        scale(-1.0, s, n)
+        scale(-1.0, Hs, n)
+        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
+                &self.told[0])
+        length = fmin(self.told[0], fmax(1.0, self.told[1]))
+        if isinf(length):
+            return 0
+        if self.told[0] < 1:
+            self.B = self.raised(self.B, s, dot(s, Hs, n))
+        self.to(length, s, Hs)
+        return 1
+
+    cdef int proportion(self, bint by_model) except -1:
+        """Take a step that frees components; 0 where none leads on."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double *beta = &self.s[0]
+        if by_model:
+            return self.step_by_model()
+        for i in range(n):
+            beta[i] = 0.0
+            if not self.free[i] and (
+                (self.g[i] < 0 and self.x[i] < self.upper[i])
+                or (self.g[i] > 0 and self.x[i] > self.lower[i])
+            ):
+                beta[i] = self.g[i]
+        self.H(beta, &self.Hs[0])
+        lengths(&self.x[0], &self.g[0], beta, &self.Hs[0], &self.lower[0],
+                &self.upper[0], n, &self.told[0])
+        if isinf(fmin(self.told[0], self.told[1])):
+            return 0
+        self.to(fmin(self.told[0], self.told[1]), beta, &self.Hs[0])
+        return 1
+
+    cdef int expand(self, double cg, double feasible, bint is_first) except -1:
+        """Expand the active set; returns the letter of the step, 0 where none leads on."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double step
+        if self.expansion in (PROJCG, MIXED) and isfinite(cg):
+            for i in range(n):
+                step = self.x[i] - cg * self.p[i]
+                self.x2[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
+            self.gradient(&self.x2[0], &self.g2[0])
+            if self.expansion == PROJCG or (
+                self.cost(&self.x2[0], &self.g2[0]) <= self.cost(&self.x[0], &self.g[0])
+            ):
+                memcpy(&self.x[0], &self.x2[0], n * sizeof(double))
+                memcpy(&self.g[0], &self.g2[0], n * sizeof(double))
+                return b"e"
+        if self.expansion == MODEL:
+            return self.expand_by_model(cg, feasible, is_first)
+        self.to(feasible, &self.p[0], &self.Hp[0])
+        self.split()
+        for i in range(n):
+            step = self.x[i] - self.phi[i] / self.B.tau  # cuts φ to φ̃
+            self.x[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
+        self.gradient(&self.x[0], &self.g[0])
+        return b"f" if self.expansion == MIXED else b"e"
+
+    cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
+        """Project x − α_cg p on the box in the metric of the model."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double *p = &self.p[0]
+        cdef double *Hp = &self.Hp[0]
+        cdef double *s = &self.s[0]
+        cdef double *Hs = &self.Hs[0]
+        cdef double *lower = &self.box_lower[0]
+        cdef double *upper = &self.box_upper[0]
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
+        cdef bint held, moves = False
+        change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
+        self.to(feasible, p, Hp)
+        for i in range(n):
+            held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
+            held = held and not is_first
+            lower[i] = self.x[i] if held else self.lower[i]
+            upper[i] = self.x[i] if held else self.upper[i]
+            self.x2[i] = self.x[i] - beyond * p[i]
+            self.g2[i] = self.g[i] - beyond * Hp[i]
+        tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
+        self.step_of_model(self.B, &self.x2[0], &self.g2[0], lower, upper, s)
+        self.B.tau = tau
+        for i in range(n):
+            held = lower[i] == upper[i] and not is_first
+            s[i] = 0.0 if held else self.x2[i] + s[i] - self.x[i]
+        if dot(&self.g[0], s, n) >= 0:
+            beyond = 0.0
+            self.step_of_model(self.B, &self.x[0], &self.g[0], lower, upper, s)
+        for i in range(n):
+            moves = moves or s[i] != 0
+        if not moves:
+            return b"e"
+        self.H(s, Hs)
+        scale(-1.0, s, n)
+        scale(-1.0, Hs, n)
+        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
+                &self.told[0])
+        length = fmin(self.told[0], fmax(1.0, self.told[1]))
+        if isinf(length):
+            return 0
+        if -self.told[2] + 0.5 * self.told[3] + change < 0:
+            length = fmax(length, 1.0)
+        self.to(length, s, Hs)
+        add(-beyond, p, s, n)
+        add(-beyond, Hp, Hs, n)
+        self.B = self.raised(self.B, s, dot(s, Hs, n))
+        return b"e"
+
+    cdef int gradient(self, const double *x, double *g) except -1:
+        """g ← Hx − b; one product."""
+        self.H(x, g)
+        add(-1.0, &self.rhs[0], g, self.n)
+        return 0
+
+    cdef int minimise(self, Until until, double tol, double energy, double b_size,
+                      long most, bytearray trace) except -1:
+        """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
+        cdef long steps = 0, idle = 0
+        cdef int letter
+        cdef bint by_model = self.newton_proportions, has_expanded = False
+        cdef double curvature, weight
+        self.split()
+        self.enter_face()
+        memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
+        while True:
+            if self.precise(until, tol, energy, b_size):
+                return 1
+            if steps >= most:
+                return 0
+            weight = self.reduced_square if self.reduced else self.phi_square
+            if self.beta_square > self.Gamma_square * weight:
+                by_model = by_model and idle < MOST_IDLE
+                idle += 1
+                letter = b"p" if self.proportion(by_model) else 0
+            else:
+                self.H(&self.p[0], &self.Hp[0])
+                lengths(&self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
+                        &self.lower[0], &self.upper[0], self.n, &self.told[0])
+                curvature = self.told[3]
+                if isinf(fmin(self.told[0], self.told[1])):
+                    return 0
+                if self.told[0] <= self.told[1]:
+                    letter = b"c"
+                    self.to(self.told[0], &self.p[0], &self.Hp[0])
+                else:
+                    letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                    has_expanded = True
+            if not letter:
+                return 0
+            self.split()
+            if letter == b"c":
+                idle = 0
+                conjugate(self.preconditioned_gradient(), &self.p[0], &self.Hp[0],
+                          self.n, curvature)
+            else:
+                self.enter_face()
+                memcpy(&self.p[0], self.preconditioned_gradient(),
+                       self.n * sizeof(double))
+            trace.append(letter)
+            steps += 1
+
+    # when to stop
+
+    cdef bint precise(self, Until until, double tol, double energy, double b_size):
+        """Whether an inner run may end."""
+        cdef double size = sqrt(self.phi_square + self.beta_square)
+        if self.r and size < until.coarse:
+            if size < until.M * self.infeasibility(&self.x[0]):
+                return True
+        return size <= until.small and self.small(tol, energy, b_size)
+
+    cdef bint small(self, double tol, double energy, double b_size):
+        """Whether rows are met and the energy error is small or has cost its share."""
+        if not self.met(tol, b_size):
+            return False
+        if not self.most_products:
+            self.most_products = <long> (1.5 * self.F.count)
+        if not energy or self.F.count >= self.most_products:
+            return True
+        return self.energy_error() <= energy * tol
+
+    cdef bint met(self, double tol, double b_size):
+        """Whether the equality rows are met, as `Rows.met` says."""
+        cdef double error = self.infeasibility(&self.x[0]), square = 0.0, part
+        cdef Py_ssize_t i
+        if self.e_size == 0:
+            part = sqrt(dot(&self.x[0], &self.x[0], self.n))
+            return error <= tol * fmax(part, b_size)
+        for i in range(self.m):
+            part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0
+            square += part * part
+        return error <= tol * self.x_tilde_size and sqrt(square) <= tol * self.e_size
+
+    cdef double energy_error(self):
+        """Estimate the relative energy error, as `Projected.energy_error` does."""
+        cdef double energy = 0.0, most = 0.0, total = 0.0, part, noise
+        cdef Py_ssize_t i
+        if not self.diagonal.shape[0]:
+            return 0.0
+        for i in range(self.n):
+            energy += self.q[i] * (self.x_tilde[i] + self.x[i])
+            most = fmax(most, fabs(self.q[i]))
+        noise = 1e3 * 2.0 ** -52 * most
+        for i in range(self.n):
+            if not self.free[i] and not (
+                (self.g[i] < 0 and self.x[i] < self.upper[i])
+                or (self.g[i] > 0 and self.x[i] > self.lower[i])
+            ):
+                continue
+            part = self.norm * self.g[i]
+            if self.diagonal[i] > 0 and fabs(part) > noise:
+                total += part * part / self.diagonal[i]
+        return sqrt(total / fabs(energy)) if energy else 0.0
+
+    # the outer loop
+
+    def smalbe(self, constants, double tol, at, infeasible):
+        """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
+
+        Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
+        `OuterIteration`, and the status. infeasible : asked whether ν proves that.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef double before = -INFINITY, lagrangian, error, M = at.M
+        cdef long left = constants.max_steps - len(at.steps) - len(at.outer)
+        cdef double energy = constants.energy
+        cdef bint stopped, enough, solved, stalled
+        cdef Until until
+        np.asarray(self.x)[:], np.asarray(self.g)[:] = at.nu, at.g
+        self.rho, self.most_products = at.rho, 0
+        cdef double[::1] mu = np.array(at.mu)
+        cdef double b_size = sqrt(dot(pointer(self.b), pointer(self.b), n))
+        b_size = b_size or sqrt(dot(&self.g[0], &self.g[0], n))
+        until.small, until.coarse = tol * b_size, constants.eta * b_size
+        done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
+        status = "iteration_limit"
+        while True:
+            trace, until.M = bytearray(), M
+            self.rhs[:] = self.b
+            for i in range(self.r):
+                add(-mu[i], &self.C[i, 0], &self.rhs[0], n)
+            if self.plain:
+                self.B = self.plain_model()
+            if self.preconditioned or not self.plain:
+                self.preconditioner = self.model(self.rho)
+                if not self.plain:
+                    self.B = self.preconditioner
+            stopped = self.minimise(
+                until, tol, energy, b_size, max(left, 0), trace
+            )
+            left -= len(trace) + 1
+            solved = sqrt(self.phi_square + self.beta_square) <= until.small
+            solved = solved and self.small(tol, energy, b_size)
+            error = self.infeasibility(&self.x[0])
+            lagrangian = 0.0
+            for i in range(n):
+                lagrangian += 0.5 * self.x[i] * (self.g[i] - self.b[i])
+            for i in range(self.r):
+                lagrangian += 0.5 * mu[i] * self.Cv[i]
+            enough = lagrangian >= before + self.rho / 2 * error * error
+            before = lagrangian
+            done.append((trace.decode(), M, self.rho, error, lagrangian))
+            for i in range(self.r):
+                add(self.rho * self.Cv[i], &self.C[i, 0], &self.g[0], n)
+                mu[i] += self.rho * self.Cv[i]
+            if not enough:
+                M *= constants.beta
+                if constants.rho_growth != 1:
+                    self.change_penalty(constants.rho_growth * self.rho)
+            if solved:
+                status = "solved"
+                break
+            errors = [*errors, error][len(errors) > 2:]
+            stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
+            if (not stopped or stalled) and infeasible(np.asarray(self.x)):
+                status = "infeasible"
+                break
+            if not stopped or left < 0:
+                break
+            if stalled and self.met(tol, b_size):
+                if M < LEAST_M:
+                    break
+                M /= 10
+            elif stalled:
+                if self.rho >= MOST_RHO:
+                    break
+                self.change_penalty(fmin(10 * self.rho, MOST_RHO))
+        return (np.array(self.x), np.array(self.g), np.asarray(mu), M, self.rho, done,
+                status)
+
+    cdef Model plain_model(self):
+        """Model H by ‖H‖ alone, as `Projected.plain_model` does."""
+        cdef double norm = fmax(1.0, self.rho if self.r else 0.0)
+        return Model.of_norm(norm / self.alpha, self.n)
+
+    cdef void change_penalty(self, double rho):
+        """Change ρ; the gradient follows without a product."""
+        cdef Py_ssize_t i
+        self.infeasibility(&self.x[0])
+        for i in range(self.r):
+            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], &self.g[0], self.n)
+        self.rho = rho
+
+    # back to the problem as given
+
+    def point(self, nu, mu, const double[::1] lb, const double[::1] ub):
+        """Return x, a, z_box and Fx of the problem with the rows Cx = Cx̃; one product.
+
+        As `solvers.smalbe.driver` has it; a (r,) belongs to those rows. a is None where
+        the rows are too nearly dependent on the free components for normal equations.
+        """
+        cdef Py_ssize_t i, j, k, n = self.n, r = self.r
+        cdef int order = r, one = 1, info = 0
+        result = np.zeros((4, n))
+        cdef double[::1] x, z_box, Fx, rest, v = nu, at = np.empty(n)
+        cdef double[::1] a = self.norm * mu, da = np.zeros(r)
+        cdef double[:, ::1] S = np.zeros((r, r))
+        cdef double s
+        x, z_box, Fx, rest = result
+        for i in range(n):
+            at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
+            s = self.x_tilde[i] + v[i]
+            s = lb[i] if at[i] < 0 else (ub[i] if at[i] > 0 else s)
+            x[i] = fmin(fmax(s, lb[i]), ub[i])  # l − x̃ + x̃ may differ in the last bit
+        self.F.apply(&x[0], &Fx[0])
+        for i in range(n):
+            rest[i] = Fx[i] + self.q[i]
+        for i in range(r):
+            a[i] -= dot(&self.C[i, 0], &rest[0], n)
+        for i in range(r):
+            add(a[i], &self.C[i, 0], &rest[0], n)
+        for k in range(n):
+            if at[k] == 0:
+                for i in range(r):
+                    da[i] += self.C[i, k] * rest[k]
+                    for j in range(i + 1):
+                        S[i, j] += self.C[i, k] * self.C[j, k]
+        if r:
+            dpotrf(b"U", &order, &S[0, 0], &order, &info)
+            for i in range(r):
+                if info or S[i, i] < 1e-4:
+                    return np.asarray(x), None, None, np.asarray(Fx)
+            dpotrs(b"U", &order, &one, &S[0, 0], &order, &da[0], &order, &info)
+        for i in range(r):
+            a[i] -= da[i]
+            add(-da[i], &self.C[i, 0], &rest[0], n)
+        for i in range(n):
+            if at[i] < 0:
+                z_box[i] = -fmax(rest[i], 0.0)
+            if at[i] == 1 or at[i] == -1:  # −1 is both
+                z_box[i] -= fmin(rest[i], 0.0)
+        return np.asarray(x), np.asarray(a), np.asarray(z_box), np.asarray(Fx)
+
+    def residual_bound(self, const double[::1] x, const double[::1] y,
+                       const double[::1] z_box, const double[::1] Fx,
+                       const double[::1] lb, const double[::1] ub,
+                       const double[:, ::1] G, const double[::1] e):
+        """Bound the worst of `harness.kkt_residuals` from above, without products.
+
+        With the least scale of energy that it may use, and nothing excused as rounding:
+        where this is small, so are the residuals. inf where nothing can be said.
+        """
+        cdef Py_ssize_t i, j, n = self.n, m = e.shape[0]
+        cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
+        cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
+        cdef double[::1] forces = np.array(z_box), size = self.s
+        if not self.diagonal.shape[0]:
+            return INFINITY
+        for i in range(m):
+            add(y[i], &G[i, 0], pointer(forces), n)
+            held += e[i] * y[i]
+        for i in range(n):
+            if not lb[i] <= x[i] <= ub[i]:
+                return INFINITY
+            xFx += x[i] * Fx[i]
+            qx += self.q[i] * x[i]
+            if z_box[i]:
+                step = ub[i] if z_box[i] > 0 else lb[i]
+                held += step * z_box[i]
+                worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
+            if self.diagonal[i] > 0:
+                least = fmin(least, self.diagonal[i])
+            S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(self.q[i]), fabs(forces[i])))
+        most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held))
+        energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
+        if not energy > 0:
+            return INFINITY
+        worst = fmax(worst, fabs(xFx + qx + held)) / energy
+        if isfinite(least):
+            S = fmax(S, sqrt(energy * least))
+        for i in range(n):
+            step = fabs(Fx[i] + self.q[i] + forces[i])
+            total += step
+            if step == 0:
+                continue
+            worst = fmax(worst, step / S)
+            own = step / fmax(fmax(fabs(Fx[i]), fabs(self.q[i])), fabs(forces[i]))
+            if self.diagonal[i] > 0:
+                known = fmax(fabs(x[i]), step / self.diagonal[i])
+                terms = x[i] - lb[i] if Fx[i] + self.q[i] + forces[i] > 0 else ub[i] - x[i]
+                own = fmin(own, step * fmin(known, terms) / energy)
+            worst = fmax(worst, own)
+        for j in range(n if m else 0):
+            step = INFINITY
+            if self.diagonal[j] > 0:
+                step = sqrt(energy / self.diagonal[j])
+            if self.q[j]:
+                step = fmin(step, energy / fabs(self.q[j]))
+            size[j] = 0.0
+            if isfinite(step):
+                size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
+        for i in range(m):
+            violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
+            for j in range(n):
+                violated += G[i, j] * x[j]
+                terms += fabs(G[i, j] * x[j])
+                known += fabs(G[i, j]) * size[j]
+            total += violated
+            if violated:
+                worst = fmax(worst, fabs(violated) / known)
+                if fabs(e[i]) > 1e-9 * known:
+                    worst = fmax(worst, 1e-4 * fabs(violated) / terms)
+        return worst if isfinite(total) and isfinite(worst) else INFINITY

@@ -1,0 +1,66 @@
+"""Compile the .pyx modules beside their sources, and put them into the wheel.
+
+Hatchling runs it when the package is built or installed, for `pip install -e` too;
+`make setup` does that again when a .pyx file has changed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+ROOT = Path(__file__).parents[1]
+FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
+MODULES = {
+    # the digits of a QP are the same on every machine
+    "problems.fem.kernels": ["-ffp-contract=off"],
+    # sums may be vectorised, which needs another order; inf and NaN are kept
+    "solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
+}
+
+
+def compiled() -> list[Path]:
+    """Compile what has changed; list the shared libraries."""
+    from Cython.Build import cythonize
+    from setuptools import Distribution, Extension
+    from setuptools.command.build_ext import build_ext
+
+    with tempfile.TemporaryDirectory() as folder:
+        extensions = cythonize(
+            [
+                Extension(name, [_path(name, ".pyx")], extra_compile_args=FLAGS + flags)
+                for name, flags in MODULES.items()
+            ],
+            build_dir=folder,
+            quiet=True,
+        )
+        command = build_ext(Distribution({"ext_modules": extensions}))
+        command.build_temp, command.build_lib = folder, folder
+        command.ensure_finalized()
+        command.run()
+        made = []
+        for name in MODULES:
+            library = Path(command.get_ext_fullpath(name))
+            suffix = library.name.removeprefix(name.rpartition(".")[2])
+            made.append(Path(shutil.move(library, _path(name, suffix))))
+    return made
+
+
+def _path(module: str, suffix: str) -> str:
+    return str(ROOT.joinpath(*module.split("."))) + suffix
+
+
+class Extensions(BuildHookInterface):  # type: ignore[type-arg]
+    """What hatchling calls."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile before the files are collected."""
+        build_data["pure_python"], build_data["infer_tag"] = False, True
+        build_data["artifacts"] += [
+            str(library.relative_to(ROOT)) for library in compiled()
+        ]
+
