@@ -18,6 +18,8 @@ FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
     # the digits of a QP are the same on every machine
     "problems.fem.kernels": ["-ffp-contract=off"],
+    "problems.fem.ordering": ["-ffp-contract=off"],
+    "problems.fem.elimination": ["-ffp-contract=off"],
     # sums may be vectorised, which needs another order; inf and NaN are kept
     "solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
 }
@@ -63,4 +65,3 @@ class Extensions(BuildHookInterface):  # type: ignore[type-arg]
         build_data["artifacts"] += [
             str(library.relative_to(ROOT)) for library in compiled()
         ]
-

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +32,11 @@ from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
 from harness import Matrix, Vector
+from problems.fem.dissection import index_arrays
+from problems.fem.elimination import spread_symmetric
+from problems.fem.kernels import congruence
 from problems.fem.mesh import Nodes, dofs_of
-
-if TYPE_CHECKING:
-    from problems.fem.multifrontal import Multifrontal
-
+from problems.fem.multifrontal import Multifrontal, multifrontal
 
 NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
@@ -112,18 +112,13 @@ class Condensed:
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ; ValueError where B touches other components."""
-        # late: importing numba takes a while
-        from problems.fem.kernels import congruence
-
         B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
         number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
-        F, within = congruence(
-            B.indptr.astype(np.int32), B.indices.astype(np.int32), B.data, number,
-            self.compliance,
-        )  # fmt: skip
+        ptr, idx = index_arrays(B)
+        F, within = congruence(ptr, idx, B.data, number, self.compliance)
         if not within:
             raise ValueError("rows touch components outside the condensed interface")
-        return np.asarray(F)
+        return F
 
     def at_constraints(self, b: Vector) -> Vector:
         """Multiply with (K⁺)_cc; zero elsewhere."""
@@ -219,8 +214,6 @@ def _inverse(
         K_ff = csc_matrix(K[free][:, free])
         factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
         return Factorised(factor, free, kernel, perf_counter() - start)
-    from problems.fem.multifrontal import multifrontal, spread_symmetric
-
     touched = interface.components
     last = np.concatenate([touched, fixed])
     factor = multifrontal(K, free, interface.points, last)
