@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
@@ -28,13 +29,12 @@ MODULES = {
 def compiled() -> list[Path]:
     """Compile what has changed; list the shared libraries."""
     from Cython.Build import cythonize
-    from setuptools import Distribution, Extension
     from setuptools.command.build_ext import build_ext
 
     with tempfile.TemporaryDirectory() as folder:
         extensions = cythonize(
             [
-                Extension(name, [_path(name, ".pyx")], extra_compile_args=FLAGS + flags)
+                _extension(name, flags)
                 for name, flags in MODULES.items()
             ],
             build_dir=folder,
@@ -50,6 +50,17 @@ def compiled() -> list[Path]:
             suffix = library.name.removeprefix(name.rpartition(".")[2])
             made.append(Path(shutil.move(library, _path(name, suffix))))
     return made
+
+
+def _extension(name: str, flags: list[str]) -> Extension:
+    source = Path(_path(name, ".pyx"))
+    return Extension(
+        name,
+        [str(source)],
+        depends=[str(header) for header in source.parent.glob("*.h")],
+        include_dirs=[str(source.parent)],
+        extra_compile_args=FLAGS + flags,
+    )
 
 
 def _path(module: str, suffix: str) -> str:

@@ -47,7 +47,7 @@ PLAN = ROOT / "tests" / "mutants.toml"
 SLOWER, GRACE = 5.0, 20.0  #: a mutant hangs after that many times the usual, plus s
 SHOWN = 100  #: characters of code in a description
 #: imported once, not for each mutant
-LIBRARIES = ("hypothesis", "numba", "pandas", "scipy.sparse.linalg", "scipy.stats")
+LIBRARIES = ("hypothesis", "pandas", "scipy.sparse.linalg", "scipy.stats")
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub,

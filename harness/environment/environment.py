@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 from harness.digest import hex_digest
 
 #: that measurements rest on, whichever solvers there are
-PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas", "numba")
+PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
 
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS", "OMP_THREAD_LIMIT", "OMP_DYNAMIC", "OMP_PROC_BIND", "OMP_PLACES",

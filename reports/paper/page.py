@@ -91,8 +91,7 @@ def _summary(experiment: Experiment) -> Section:
             "Times are medians of interleaved repeats in one process, with the "
             "distribution-free 95 % interval of the median in brackets and as bars "
             "(below six repeats: smallest and largest, which cover less). Garbage "
-            "collection is off, and compilation by numba, done once and kept on disk, "
-            "is not counted. Methods are ours throughout, also those marked “the "
+            "collection is off. Methods are ours throughout, also those marked “the "
             "paper's way”: its own code is not public.",
         ),
     )

@@ -12,8 +12,8 @@ counts, and the same points up to rounding.
 * `recover`: `solvers.smalbe.driver`
 
 P is dense (then one triangle is read), sparse, or an operator, which is asked by Python.
-Between two products a step makes three passes over its vectors. The loops over vectors
-are compiled twice, for processors with AVX2 and for all others.
+Between two products a step makes three passes over its vectors. Its loops
+over vectors are in `vectors.h`.
 """
 
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
@@ -26,172 +26,24 @@ from scipy.linalg.cython_lapack cimport (
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-cdef extern from *:
-    """
-    #define ROUNDING (4 * 2.220446049250313e-16) /* relative error of a few operations */
-    #if defined(__x86_64__) && defined(__gnu_linux__)
-    #define TWICE __attribute__((target_clones("arch=haswell", "default")))
-    #else
-    #define TWICE
-    #endif
-    TWICE static void sparse(const int *, const int *, const double *, const double *,
-                             double *, Py_ssize_t);
-    TWICE static double dot(const double *, const double *, Py_ssize_t);
-    TWICE static void add(double, const double *, double *, Py_ssize_t);
-    TWICE static void scale(double, double *, Py_ssize_t);
-    TWICE static void lengths(const double *, const double *, const double *,
-        const double *, const double *, const double *, Py_ssize_t, double *);
-    TWICE static void move(double, const double *, const double *, const double *,
-        const double *, const double *, const double *, double *, double *, Py_ssize_t);
-    TWICE static void split(const double *, const double *, const double *,
-        const double *, double, double *, double *, Py_ssize_t, double *);
-    TWICE static double conjugate(const double *, double *, const double *, Py_ssize_t,
-        double);
-    TWICE static void add_gram(double, const double *, double *, Py_ssize_t);
-    TWICE static void tilted(const double *, const double *, double, const double *,
-        const double *, double *, double *, Py_ssize_t);
-    """
-    const double ROUNDING
-
-
-# --- loops over vectors -------------------------------------------------------------
-
-
-cdef void sparse "sparse"(
-    const int *indptr, const int *indices, const double *data, const double *v,
-    double *y, Py_ssize_t n,
-) noexcept nogil:
-    """y ← Fv by the rows of F (n, n)."""
-    cdef Py_ssize_t i, k
-    cdef double total
-    for i in range(n):
-        total = 0.0
-        for k in range(indptr[i], indptr[i + 1]):
-            total += data[k] * v[indices[k]]
-        y[i] = total
-
-
-cdef double dot "dot"(const double *a, const double *b, Py_ssize_t n) noexcept nogil:
-    cdef double total = 0.0
-    cdef Py_ssize_t i
-    for i in range(n):
-        total += a[i] * b[i]
-    return total
-
-
-cdef void add "add"(double s, const double *a, double *b, Py_ssize_t n) noexcept nogil:
-    """b ← b + s a."""
-    cdef Py_ssize_t i
-    for i in range(n):
-        b[i] += s * a[i]
-
-
-cdef void scale "scale"(double s, double *a, Py_ssize_t n) noexcept nogil:
-    cdef Py_ssize_t i
-    for i in range(n):
-        a[i] *= s
-
-
-cdef void lengths "lengths"(
-    const double *x, const double *g, const double *p, const double *Hp,
-    const double *lower, const double *upper, Py_ssize_t n, double *told,
-) noexcept nogil:
-    """Find α of x − αp: told ← the minimising, the largest feasible, gᵀp, pᵀHp."""
-    cdef double curvature = 0.0, slope = 0.0, feasible = INFINITY, room
-    cdef Py_ssize_t i
-    for i in range(n):
-        curvature += p[i] * Hp[i]
-        slope += g[i] * p[i]
-        room = (x[i] - (lower[i] if p[i] > 0 else upper[i])) / p[i]
-        room = room if p[i] != 0 else INFINITY
-        feasible = room if room < feasible else feasible
-    told[0] = slope / curvature if curvature > 0 else INFINITY
-    told[1], told[2], told[3] = feasible, slope, curvature
-
-
-cdef void move "move"(
-    double alpha, const double *x, const double *g, const double *p, const double *Hp,
-    const double *lower, const double *upper, double *new_x, double *new_g,
-    Py_ssize_t n,
-) noexcept nogil:
-    """x − αp and its gradient; what is nearer to a bound than rounding is on it."""
-    cdef double step, new, noise
-    cdef int down, up
-    cdef Py_ssize_t i
-    for i in range(n):
-        step = alpha * p[i]
-        new, noise = x[i] - step, ROUNDING * (fabs(x[i]) + fabs(step))
-        down = (new - lower[i] <= noise) & (step >= 0)
-        up = (upper[i] - new <= noise) & (step <= 0) & (1 - down)
-        new = lower[i] if down else new
-        new_x[i] = upper[i] if up else new
-        new_g[i] = g[i] - alpha * Hp[i]
-
-
-cdef void split "split"(
-    const double *x, const double *g, const double *lower, const double *upper,
-    double tau, double *phi, double *free, Py_ssize_t n, double *told,
-) noexcept nogil:
-    """Find φ and the free components (1, others 0); told ← ‖φ‖², ‖β‖², φ̃ᵀφ."""
-    cdef double f, b, cut, phi_square = 0.0, beta_square = 0.0, reduced = 0.0, inside
-    cdef int at_lower, at_upper
-    cdef Py_ssize_t i
-    for i in range(n):
-        at_lower, at_upper = x[i] <= lower[i], x[i] >= upper[i]
-        inside = 0.0 if at_lower | at_upper else 1.0
-        f = 0.0 if at_lower | at_upper else g[i]
-        b = g[i] if ((g[i] < 0) & (1 - at_upper)) | ((g[i] > 0) & (1 - at_lower)) else 0.0
-        b = b if at_lower | at_upper else 0.0
-        free[i], phi[i] = inside, f
-        phi_square += f * f
-        beta_square += b * b
-        cut = tau * (x[i] - upper[i])
-        cut = f if f > cut else cut
-        inside = tau * (x[i] - lower[i])
-        cut = cut if cut < inside else inside
-        reduced += cut * f if f != 0 else 0.0
-    told[0], told[1], told[2] = phi_square, beta_square, reduced
-
-
-cdef double conjugate "conjugate"(
-    const double *z, double *p, const double *Hp, Py_ssize_t n, double curvature
-) noexcept nogil:
-    """p ← z − (zᵀHp/pᵀHp) p."""
-    cdef double gamma = dot(z, Hp, n) / curvature
-    cdef Py_ssize_t i
-    for i in range(n):
-        p[i] = z[i] - gamma * p[i]
-    return gamma
-
-
-cdef void add_gram "add_gram"(
-    double s, const double *v, double *S, Py_ssize_t k
-) noexcept nogil:
-    """S ← S + s vvᵀ (k, k)."""
-    cdef Py_ssize_t i, j
-    cdef double t
-    for i in range(k):
-        t = s * v[i]
-        for j in range(k):
-            S[i * k + j] += t * v[j]
-
-
-cdef void tilted "tilted"(
-    const double *x, const double *g, double tau, const double *lower,
-    const double *upper, double *s, double *piece, Py_ssize_t n,
-) noexcept nogil:
-    """Minimise gᵀs + τ/2‖s‖² over the box; piece: −1 at the lower bound, 1 at the upper."""
-    cdef double target
-    cdef int down, up
-    cdef Py_ssize_t i
-    for i in range(n):
-        target = x[i] - g[i] / tau
-        down = target <= lower[i]
-        up = (target >= upper[i]) & (1 - down)
-        target = lower[i] if down else target
-        target = upper[i] if up else target
-        piece[i] = up - down
-        s[i] = target - x[i]
+cdef extern from "vectors.h" nogil:
+    void sparse_product(const int *indptr, const int *indices, const double *data,
+                        double s, const double *v, double *y, Py_ssize_t n)
+    double dot(const double *a, const double *b, Py_ssize_t n)
+    void add(double s, const double *a, double *b, Py_ssize_t n)
+    void scale(double s, double *a, Py_ssize_t n)
+    void lengths(const double *x, const double *g, const double *p, const double *Hp,
+                 const double *lower, const double *upper, Py_ssize_t n, double *told)
+    void move(double alpha, double *x, double *g, const double *p, const double *Hp,
+              const double *lower, const double *upper, Py_ssize_t n)
+    void split(const double *x, const double *g, const double *lower,
+               const double *upper, double tau, double *phi, double *free,
+               Py_ssize_t n, double *told)
+    void conjugate(const double *z, double *p, const double *Hp, double curvature,
+                   Py_ssize_t n)
+    void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    void tilted(const double *x, const double *g, double tau, const double *lower,
+                const double *upper, double *s, double *piece, Py_ssize_t n)
 
 
 # --- the matrix ---------------------------------------------------------------------
@@ -234,22 +86,25 @@ cdef class Product:
             self.apply(&vector[0], &result[0])
         return np.asarray(result)
 
-    cdef int apply(self, const double *v, double *y) except -1:
+    cdef int apply(self, const double *v, double *y, double s=1.0) except -1:
+        """y ← s Pv."""
         self.count += 1
         cdef double[::1] vector, result
         cdef int n = self.n, one = 1
-        cdef double unit = 1.0, zero = 0.0
+        cdef double zero = 0.0
         if self.dense:
-            dsymv(b"U", &n, &unit, <double *> self.dense, &n, <double *> v, &one, &zero,
+            dsymv(b"U", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
                   y, &one)
         elif self.data:
-            sparse(self.indptr, self.indices, self.data, v, y, self.n)
+            sparse_product(self.indptr, self.indices, self.data, s, v, y, self.n)
         elif self.n:
             told = np.empty(self.n)
             vector = told
             memcpy(&vector[0], v, self.n * sizeof(double))
             result = np.ascontiguousarray(self.matrix @ told, dtype=float)
             memcpy(y, &result[0], self.n * sizeof(double))
+            if s != 1:
+                scale(s, y, self.n)
         return 0
 
 
@@ -427,7 +282,7 @@ cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
 cdef enum:
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
-    MOST_IDLE = 5
+    MOST_IDLE = 2
     STD = 0
     PROJCG = 1
     MIXED = 2
@@ -582,13 +437,11 @@ cdef class Solver:
         cdef Py_ssize_t i, n = self.n
         cdef double *Pv = pointer(self.t)
         if not self.r:
-            self.F.apply(v, out)
-            scale(self.inverse_norm, out, n)
+            self.F.apply(v, out, self.inverse_norm)
             return 0
         memcpy(Pv, v, n * sizeof(double))
         without(first(self.C), self.r, Pv, &self.Cv[0], n)
-        self.F.apply(Pv, out)
-        scale(self.inverse_norm, out, n)
+        self.F.apply(Pv, out, self.inverse_norm)
         rows_times(first(self.C), out, &self.Cw[0], self.r, n)
         for i in range(self.r):
             self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
@@ -754,15 +607,14 @@ cdef class Solver:
         cdef double tau
         cdef const double *U
         cdef double *z = &self.z[0]
-        if not self.preconditioned:
-            return &self.phi[0]
+        if not self.preconditioned or not self.preconditioner.k:
+            return &self.phi[0]  # directions have no length
         k, tau = self.preconditioner.k, self.preconditioner.tau
         U = self.preconditioner.rows()
         memcpy(z, &self.phi[0], n * sizeof(double))
-        if k:
-            rows_times(U, z, &self.c[0], k, n)
-            rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
-            add_combination(-1.0, U, &self.c2[0], z, k, n)
+        rows_times(U, z, &self.c[0], k, n)
+        rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
+        add_combination(-1.0, U, &self.c2[0], z, k, n)
         for i in range(n):
             z[i] *= self.free[i] / tau
         return z
@@ -780,7 +632,7 @@ cdef class Solver:
     cdef void to(self, double alpha, const double *p, const double *Hp):
         """x ← x − αp; the gradient follows without a product."""
         move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
-             &self.x[0], &self.g[0], self.n)
+             self.n)
 
     cdef int step_by_model(self) except -1:
         """Minimise the model over the box, then the cost along that step.
@@ -917,7 +769,8 @@ cdef class Solver:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
         cdef long steps = 0, idle = 0
         cdef int letter
-        cdef bint by_model = self.newton_proportions, has_expanded = False
+        cdef bint by_model, has_expanded = False
+        cdef double chopped = INFINITY
         cdef double curvature, weight
         self.split()
         self.enter_face()
@@ -929,8 +782,9 @@ cdef class Solver:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
-                by_model = by_model and idle < MOST_IDLE
-                idle += 1
+                idle = idle + 1 if self.beta_square > chopped / 2 else 0
+                chopped = self.beta_square
+                by_model = self.newton_proportions and idle < MOST_IDLE
                 letter = b"p" if self.proportion(by_model) else 0
             else:
                 self.H(&self.p[0], &self.Hp[0])
@@ -949,9 +803,8 @@ cdef class Solver:
                 return 0
             self.split()
             if letter == b"c":
-                idle = 0
                 conjugate(self.preconditioned_gradient(), &self.p[0], &self.Hp[0],
-                          self.n, curvature)
+                          curvature, self.n)
             else:
                 self.enter_face()
                 memcpy(&self.p[0], self.preconditioned_gradient(),

@@ -90,7 +90,7 @@ def prepared(
     if eliminated is not None and eliminated.columns:
         problem.F.count += eliminated.columns
         problem.counts["factorised_columns"] += eliminated.columns
-    solve, solver = _outer_loop(problem, inner, options, history)
+    solve, solver = outer_loop(problem, inner, options, history)
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
         solve=solve, solver=solver, history=history,
@@ -145,10 +145,18 @@ def _penalty(options: Options, tol: float) -> float:
     return min(options.rho, max(1.0, tol / (10 * EPS)))
 
 
-def _outer_loop(
-    problem: Projected, qp: QP, options: Options, history: History | None
+def outer_loop(
+    problem: Projected,
+    qp: QP,
+    options: Options,
+    history: History | None = None,
+    *,
+    compile: bool = True,
 ) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
-    """Choose what runs the outer loop: compiled, or as it is written."""
+    """Choose what runs the outer loop: compiled where it can be, or as it is written.
+
+    With a history, and with preconditioners that need more than products, it is not.
+    """
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced,
         options.alpha,
@@ -157,7 +165,7 @@ def _outer_loop(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
     )  # fmt: skip
-    if history is None and options.preconditioner in WITHOUT_P:
+    if compile and history is None and options.preconditioner in WITHOUT_P:
         with_model = options.preconditioner == "model"
         solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
         return partial(_compiled_loop, solver, problem, constants), solver

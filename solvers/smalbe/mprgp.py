@@ -42,10 +42,10 @@ Precondition = Callable[[Mask], Operator]  #: free components → their precondi
 #: the CG step as far as it is feasible was all)
 Expansion = Literal["std", "projcg", "mixed", "model"]
 #: cg: minimise along −β, as far as feasible (the book's; 1 product)
-#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); cg for the
-#: rest of a run in which `MOST_IDLE` of them followed each other without a CG step
+#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); but cg where
+#: from one to the next `MOST_IDLE` times in a row ‖β‖² was not halved
 Proportioning = Literal["cg", "model"]
-MOST_IDLE = 5
+MOST_IDLE = 2
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
 
@@ -145,11 +145,12 @@ def mprgp(
     face = split(at, bounds)
     z_of = precondition(face.free)
     p = z_of(face.phi)
-    idle, by_model = 0, rules.proportioning == "model"
+    idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
     while not (done := stop(at, face)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
-            by_model, idle = by_model and idle < MOST_IDLE, idle + 1
-            step = _proportion(task, at, face, B, by_model=by_model)
+            idle = idle + 1 if face.beta_square > chopped / 2 else 0
+            chopped = face.beta_square
+            step = _proportion(task, at, face, B, by_model=idle < MOST_IDLE)
         else:
             Hp = H(p)
             step = _minimise_or_expand(task, at, p, Hp, B, first="e" not in trace)
@@ -158,7 +159,7 @@ def mprgp(
         letter, at, B = step
         face = split(at, bounds)
         if letter == "c":
-            p, idle = kernels.conjugate(z_of(face.phi), p, Hp), 0
+            p = kernels.conjugate(z_of(face.phi), p, Hp)
         else:
             z_of = precondition(face.free)
             p = z_of(face.phi)
@@ -188,7 +189,7 @@ def _proportion(
     task: _Task, at: Point, face: Face, B: Model, *, by_model: bool
 ) -> Step:
     """Take a step that frees components; never beyond an opposite bound."""
-    if by_model:
+    if by_model and task.rules.proportioning == "model":
         return _model_step(task, at, B)
     p = face.beta
     Hp = task.H(p)

@@ -186,8 +186,9 @@ def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
     start = random_start(qp.q.size)
     F, rows, triangle, ritz = compiled.prepare(
-        qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
-    )
+        qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start,
+        _length(qp.q.size, steps),
+    )  # fmt: skip
     found = Ritz(*ritz)
     rows = Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
     return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
@@ -213,8 +214,14 @@ def _mean_eigenvalue(P: Matrix) -> float:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    ritz = lanczos(PFP, rows.project(random_start(rows.x_tilde.size)), steps)
+    n = rows.x_tilde.size
+    ritz = lanczos(PFP, rows.project(random_start(n)), _length(n, steps))
     return Spectrum(ritz.norm or 1.0, ritz)
+
+
+def _length(n: int, steps: int) -> int:
+    """Take fewer Lanczos steps for few unknowns, whose products would not pay."""
+    return min(steps, max(5, n // 6))
 
 
 def by_power(PFP: Callable[[Vector], Vector], rows: Rows) -> Spectrum:

@@ -230,7 +230,7 @@ def test_products_are_explained_by_the_steps(dual):
 
     steps = c.get("cg", 0) + c.get("proportioning", 0)
     steps += 2 * c.get("expansion", 0) + 3 * c.get("fallback", 0)
-    assert c["P_products"] == 12 + 1 + 1 + steps + 2
+    assert c["P_products"] == 12 + 1 + 1 + steps + 1
 
 
 def test_with_equalities_only_it_agrees_with_the_saddle_point_system():

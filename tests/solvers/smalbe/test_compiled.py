@@ -1,0 +1,187 @@
+"""SMALBE compiled against SMALBE as it is written."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness import QP, Status, kkt_residuals, no_rows
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from solvers.smalbe import compiled
+from solvers.smalbe.driver import outer_loop, recovered
+from solvers.smalbe.outer_loop import first_iterate
+from solvers.smalbe.projected import by_lanczos, prepared_problem, projected_problem
+
+PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
+
+
+class Operator:
+    """A matrix that only multiplies."""
+
+    def __init__(self, P):
+        self._P, self.shape = P, P.shape
+
+    def __matmul__(self, v):
+        return self._P @ v
+
+
+def random_qp(seed, kind="dense"):
+    """Bounds below, above, on both sides or none; up to three rows, some repeated."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 40)), int(rng.integers(0, 4))
+    W = rng.standard_normal((n, n)) * np.logspace(0, -rng.uniform(0, 3), n)
+    P = W @ W.T + 1e-3 * np.eye(n)
+    inside = rng.standard_normal(n)
+    lb = np.where(rng.random(n) < 0.6, inside - rng.exponential(size=n), -np.inf)
+    ub = np.where(rng.random(n) < 0.3, inside + rng.exponential(size=n), np.inf)
+    A = rng.standard_normal((min(m, n), n)) * 10 ** rng.uniform(-2, 2)
+    if len(A) == 3:
+        A[2] = A[0] - A[1]
+    made = {"dense": P, "sparse": csr_array(P), "operator": Operator(P)}[kind]
+    return QP(
+        P=made, q=10 * rng.standard_normal(n), A=A if len(A) else no_rows(n),
+        b=A @ inside, G=no_rows(n), h=np.zeros(0), lb=lb, ub=ub,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=["dual", "dual-bounds"])
+def contact(request):
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=4, Nh=3))
+    return family.build(request.param, params, reference_solution).qp
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
+def test_a_product_is_the_product_and_is_counted(seed, kind):
+    qp = random_qp(seed, kind)
+    v = np.random.default_rng(seed).standard_normal(qp.q.size)
+    P = compiled.Product(qp.P, qp.q.size)
+
+    assert P(v) == pytest.approx(qp.P @ v, rel=1e-12, abs=1e-12)
+    P(v)
+    assert P.count == 2
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_product_with_any_layout(order):
+    W = np.random.default_rng(271828).standard_normal((17, 17))
+    P = np.array(W + W.T, order=order)
+    P.flags.writeable = False
+    v = np.arange(17.0)
+
+    assert compiled.Product(P, 17)(v) == pytest.approx(P @ v, rel=1e-13)
+    half = P[::2, ::2]
+    assert compiled.Product(half, 9)(v[:9]) == pytest.approx(half @ v[:9], rel=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_preparation_is_as_it_is_written(seed):
+    qp = random_qp(seed)
+    fast, slow = prepared_problem(qp, 12), projected_problem(
+        qp, partial(by_lanczos, steps=12)
+    )  # fmt: skip
+
+    assert fast.F.count == slow.F.count
+    assert fast.rows.consistent == slow.rows.consistent
+    assert fast.spectrum.norm == pytest.approx(slow.spectrum.norm, rel=1e-9)
+    assert fast.rows.x_tilde == pytest.approx(slow.rows.x_tilde, abs=1e-9)
+    assert len(fast.rows.C) == len(slow.rows.C)
+    span = fast.rows.C.T @ fast.rows.C
+    assert span == pytest.approx(slow.rows.C.T @ slow.rows.C, abs=1e-9)
+    assert fast.spectrum.ritz.values == pytest.approx(
+        slow.spectrum.ritz.values, rel=1e-6, abs=1e-9 * slow.spectrum.norm
+    )
+    a = np.arange(1.0, len(fast.rows.C) + 1)
+    assert qp.A.T @ fast.rows.multipliers(a) == pytest.approx(
+        fast.rows.C.T @ a, abs=1e-7
+    )
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("seed", range(12))
+def test_the_steps_are_those_that_are_written(seed, name, kind):
+    """Letter for letter for 25 steps; rounding lets long runs part later."""
+    options = replace(SOLVERS[name], max_steps=25)
+    qp, runs = random_qp(seed, kind), []
+    for written in (False, True):
+        problem = projected_problem(qp, partial(by_lanczos, steps=12))
+        solve, solver = outer_loop(problem, qp, options, compile=not written)
+        assert (solver is None) == written
+        start = first_iterate(
+            problem, problem.rows.x_tilde * 0, np.zeros(len(problem.rows.C)),
+            M=options.M, rho=options.rho,
+        )  # fmt: skip
+        end = solve(1e-6, start)
+        runs.append((end, problem.F.count))
+    (fast, products), (slow, also) = runs
+
+    assert fast.steps == slow.steps
+    assert products == also
+    assert fast.status is slow.status
+    size = 1 + np.abs(slow.nu).max()
+    assert fast.nu == pytest.approx(slow.nu, abs=1e-6 * size)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_on_contact_it_takes_as_many_products_as_with_a_history(contact, name):
+    """Which is not compiled. Rounding may cost a few without a preconditioner."""
+    fast = SOLVERS[name].prepare(contact, 1e-6)()
+    slow = replace(SOLVERS[name], history=True).prepare(contact, 1e-6)()
+    apart = 2 if name == "smalbe" else 25
+
+    assert fast.status is Status.SOLVED
+    assert abs(fast.counts["P_products"] - slow.counts["P_products"]) <= apart
+    assert contact.objective(fast.x) == pytest.approx(
+        contact.objective(slow.x), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_the_way_back_is_as_it_is_written(seed):
+    qp, options = random_qp(seed), SOLVERS["smalbe"]
+    problem = prepared_problem(qp, 12)
+    solve, solver = outer_loop(problem, qp, options)
+    start = first_iterate(
+        problem, 0 * qp.q, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4
+    )
+    at = solve(1e-8, start)
+    x, a, z_box, Px = solver.point(at.nu, at.mu, qp.lb, qp.ub)
+    also_x, also_a, also_z, _ = recovered(problem, qp, at)
+
+    assert x == pytest.approx(also_x)
+    assert Px == pytest.approx(qp.P @ x, rel=1e-9, abs=1e-9)
+    if a is not None:
+        assert z_box == pytest.approx(also_z, abs=1e-6 * (1 + np.abs(also_z).max()))
+        assert problem.rows.C.T @ a == pytest.approx(
+            problem.rows.C.T @ also_a, abs=1e-6 * (1 + np.abs(also_a).max(initial=0))
+        )
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_no_point_has_residuals_above_the_bound(seed):
+    """Near a solution and far from it, with multipliers of either sign."""
+    rng = np.random.default_rng(seed)
+    qp = random_qp(seed)
+    solution = SOLVERS["smalbe"].prepare(qp, 1e-8)()
+    if solution.status is not Status.SOLVED:
+        return
+    _, solver = outer_loop(prepared_problem(qp, 12), qp, SOLVERS["smalbe"])
+    G = np.ascontiguousarray(qp.A.toarray() if hasattr(qp.A, "toarray") else qp.A)
+    for size in (0.0, 1e-9, 1e-6, 1e-3, 1.0, 1e3):
+        def noise(v, size=size):
+            return v + size * (1 + np.abs(v)) * rng.standard_normal(v.size)
+
+        x = np.clip(noise(solution.x), qp.lb, qp.ub)
+        y, z = noise(solution.y), noise(solution.z_box)
+        z = np.where(np.isinf(qp.lb), np.maximum(z, 0), z)
+        z = np.where(np.isinf(qp.ub), np.minimum(z, 0), z)
+        point = replace(solution, x=x, y=y, z_box=z)
+        bound = solver.residual_bound(x, y, z, qp.P @ x, qp.lb, qp.ub, G, qp.b)
+
+        assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9)
