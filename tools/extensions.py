@@ -17,7 +17,7 @@ from setuptools import Distribution, Extension
 ROOT = Path(__file__).parents[1]
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
-    # the digits of a QP are the same on every machine
+    # the digits of a stiffness, and the order of its factor, are the same everywhere
     "problems.fem.kernels": ["-ffp-contract=off"],
     "problems.fem.ordering": ["-ffp-contract=off"],
     "problems.fem.elimination": ["-ffp-contract=off"],
@@ -33,10 +33,7 @@ def compiled() -> list[Path]:
 
     with tempfile.TemporaryDirectory() as folder:
         extensions = cythonize(
-            [
-                _extension(name, flags)
-                for name, flags in MODULES.items()
-            ],
+            [_extension(name, flags) for name, flags in MODULES.items()],
             build_dir=folder,
             quiet=True,
         )

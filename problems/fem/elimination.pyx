@@ -28,7 +28,7 @@ def eliminate(
     double[::1] rows,
 ):
     """Write the rows of U front by front; say whether all pivots were positive."""
-    cdef Py_ssize_t s, p, q, t, i, child, top = 0, waiting = 0
+    cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, waiting = 0
     cdef int low, own, left, size, info = 0
     cdef double one = 1.0, minus = -1.0
     cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
@@ -55,15 +55,14 @@ def eliminate(
         for i in range(children[s]):
             waiting -= 1
             child = stack[waiting]
-            size = first[child + 1] - first[child]
-            for t in range(size):
+            m = first[child + 1] - first[child]
+            for t in range(m):
                 to[t] = place[border[first[child] + t]]
-            top -= size * size
-            add(&store[top], &to[0], size, own, left, U, S)
-        size = own + left
+            top -= m * m
+            add(&store[top], &to[0], m, own, left, U, S)
         if own:
             dpotrf(b"L", &own, U, &size, &info)
-            if info or not U[(own - 1) * size + own - 1] > 0:  # NaN is not
+            if info or not U[(own - 1) * (<Py_ssize_t> size + 1)] > 0:  # NaN is not
                 return False
         if own and left:
             dtrsm(b"R", b"L", b"T", b"N", &left, &own, &one, U, &size, U + own, &size)
@@ -74,7 +73,7 @@ def eliminate(
                 memmove(&store[top + t], S + t, (left - i) * sizeof(double))
         stack[waiting] = s
         waiting += 1
-        top += left * left
+        top += <Py_ssize_t> left * left
     return True
 
 
@@ -97,22 +96,22 @@ def most_waiting(const int[::1] first, const int[::1] children):
 
 
 cdef void add(
-    const double *below, const int *to, Py_ssize_t size, Py_ssize_t own,
-    Py_ssize_t left, double *U, double *S,
+    const double *below, const int *to, Py_ssize_t m, Py_ssize_t own, Py_ssize_t left,
+    double *U, double *S,
 ) noexcept nogil:
     """Add the upper triangle of what a child left at the places `to` of its front.
 
-    below (size, size), U (own, own + left), S (left, left)
+    below (m, m), U (own, own + left), S (left, left)
     """
     cdef Py_ssize_t i, j
     cdef double *row
-    for i in range(size):
+    for i in range(m):
         if to[i] < own:
             row = U + to[i] * (own + left)
         else:
             row = S + (to[i] - own) * left - own
-        for j in range(i, size):
-            row[to[j]] += below[i * size + j]
+        for j in range(i, m):
+            row[to[j]] += below[i * m + j]
 
 
 def substitute(

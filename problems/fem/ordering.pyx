@@ -3,6 +3,7 @@
 """Compiled loops of nested dissection; `problems.fem.dissection` says what it is."""
 
 from libc.math cimport INFINITY, atan2, cos, fmax, fmin, sin
+from libc.stdint cimport int64_t
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def dissected(
     chosen = np.argsort(key, kind="stable").astype(np.int32)
     ends = np.append(0, np.bincount(key, minlength=key.max() // 2 * 2 + 2).cumsum())
     cdef int[::1] order = chosen
-    cdef const long long[::1] end = ends.astype(np.longlong)
+    cdef const int64_t[::1] end = ends
 
     # a part of n nodes is cut at most n − 1 times, into two that become fronts
     cdef Py_ssize_t nodes = points.shape[0], waiting, low, high, middle, separator

@@ -41,13 +41,16 @@ def dense(factor):
 
 
 def choices(mesh):
-    """Free components and those that come last: all, none, and a half at random."""
+    """Free components and those that come last: all, none, some; halves of both."""
     n, rng = mesh.dofs, np.random.default_rng(161803)
     every, half = np.arange(n), np.sort(rng.permutation(n)[: n // 2])
-    return [(every, half[::5]), (half, half[::7]), (every, every), (every, every[:0])]
+    return [
+        (every, half[::5]), (half, half[::7]), (every, every), (every, every[:0]),
+        (every[n // 2 :], every[n // 2 :: 9]),  # whole fronts have nothing to eliminate
+    ]  # fmt: skip
 
 
-@pytest.mark.parametrize("choice", range(4))
+@pytest.mark.parametrize("choice", range(5))
 @pytest.mark.parametrize("name", MESHES)
 def test_the_factor_multiplies_to_the_matrix(name, choice):
     mesh = MESHES[name]
@@ -61,7 +64,7 @@ def test_the_factor_multiplies_to_the_matrix(name, choice):
     assert abs(U.T @ U - K[o][:, o]).max() <= 1e-13 * abs(K).max()
 
 
-@pytest.mark.parametrize("choice", range(4))
+@pytest.mark.parametrize("choice", range(5))
 @pytest.mark.parametrize("name", MESHES)
 def test_right_hand_sides_give_planted_solutions_alone_and_together(name, choice):
     mesh = MESHES[name]
@@ -155,3 +158,38 @@ def test_a_matrix_that_is_not_positive_definite_is_refused(name):
 
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
         multifrontal(K, np.arange(mesh.dofs), mesh.points, np.arange(4))
+
+
+@pytest.mark.parametrize("name", ["cell", "three"])
+@pytest.mark.parametrize("entry", [0, -1])
+def test_a_matrix_with_a_nan_is_refused(name, entry):
+    mesh = MESHES[name]
+    K = definite(mesh)
+    K.data[entry] = np.nan
+
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        multifrontal(K, np.arange(mesh.dofs), mesh.points, np.arange(4))
+
+
+def test_long_indices_give_the_same_factor():
+    mesh = MESHES["three"]
+    K, long = definite(mesh), definite(mesh)
+    long.indptr, long.indices = K.indptr.astype(np.int64), K.indices.astype(np.int64)
+
+    factors = [
+        multifrontal(A, np.arange(mesh.dofs), mesh.points, np.arange(8))
+        for A in (K, long)
+    ]
+
+    assert np.array_equal(factors[0].rows, factors[1].rows)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_borders_ascend_and_come_later(name):
+    mesh = MESHES[name]
+    _, f = dissect(definite(mesh), mesh.points, np.arange(2))
+
+    for s in range(len(f.children)):
+        border = f.border[f.first[s] : f.first[s + 1]]
+        assert (np.diff(border) > 0).all()
+        assert (border >= f.start[s + 1]).all()
