@@ -17,8 +17,10 @@ from setuptools import Distribution, Extension
 ROOT = Path(__file__).parents[1]
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
-    # the digits of a QP are the same on every machine
+    # the digits of a stiffness, and the order of its factor, are the same everywhere
     "problems.fem.kernels": ["-ffp-contract=off"],
+    "problems.fem.ordering": ["-ffp-contract=off"],
+    "problems.fem.elimination": ["-ffp-contract=off"],
     # sums may be vectorised, which needs another order; inf and NaN are kept
     "solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
 }

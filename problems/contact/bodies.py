@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csc_array, csr_array, eye_array
+from scipy.linalg import block_diag
+from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import InputError, Vector
 from problems.fem.elasticity import (
@@ -20,6 +21,7 @@ from problems.fem.elasticity import (
 from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import (
     GeneralisedInverse,
+    Interface,
     floating_inverse,
     regular_inverse,
     supported_inverse,
@@ -83,7 +85,7 @@ class Bodies:
         """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
         owner, points = self.body_of_node, self.mesh.points
         modes = [rigid_modes(points[owner == b]) for b in range(len(self.names))]
-        return np.asarray(block_diag([csr_array(R) for R in modes]).toarray())
+        return np.asarray(block_diag(*modes))
 
     @property
     def mesh_size(self) -> float:
@@ -141,8 +143,9 @@ def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     parts = [points[owner == b] for b in range(len(bodies.names))]
     kernels = [rigid_modes(part) for part in parts]
     fixing = [fixing_nodes(part) for part in parts]
-    touched = np.union1d(bodies.interface, bodies.B_D.indices) if condense else None
-    return floating_inverse(bodies.K, kernels, fixing, touched)
+    touched = np.union1d(bodies.interface, bodies.B_D.indices)
+    interface = Interface(touched, bodies.mesh.points) if condense else None
+    return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
 def clamped(bodies: Bodies) -> GeneralisedInverse:
@@ -162,13 +165,15 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
             "exist; expected form primal or dual"
         )
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), held)
-    return regular_inverse(bodies.K, free, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
+    return regular_inverse(bodies.K, free, interface)
 
 
 def supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, and what else a body needs."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
-    return supported_inverse(bodies.K, free, bodies.rigid, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
+    return supported_inverse(bodies.K, free, bodies.rigid, interface)
 
 
 def _elasticity_matrices(

@@ -44,7 +44,7 @@ def contact_case(
     matrices: Mapping[str, Any] = {}
     seconds = None
     if form == "primal":
-        new = Transformed(primal, lambda s: s, 1.0, 0.0)
+        new = Transformed(primal, lambda s: s, 1.0, 0.0, lambda s: s.x)
     else:
         inverse = floating() if form == "dual" else clamped()
         start = perf_counter()

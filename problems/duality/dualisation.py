@@ -25,6 +25,8 @@ class Transformed(NamedTuple):
     recover: Callable[[Solution], Solution]
     sign: float  #: old objective = sign·new objective + constant, at the solutions
     constant: float
+    #: old point (n,), right where constraints can touch it; cheaper than `recover`
+    touched: Callable[[Solution], Vector]
 
 
 def dualise(
@@ -64,7 +66,11 @@ def dualise(
             u = u - R @ s.y
         return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free))
+    def touched(s: Solution) -> Vector:
+        u = free - inverse.at_constraints(B.T @ s.x)
+        return u - R @ s.y if R.shape[1] else u
+
+    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
 
 
 def dual_bounds(
@@ -97,7 +103,10 @@ def dual_bounds(
         reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
         return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free))
+    def touched(s: Solution) -> Vector:
+        return free - clamped.at_constraints(B.T @ s.x)
+
+    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
 
 
 def _dual(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from harness import Vector
+from problems.fem.kernels import add_stiffness, dof_pattern, node_pattern, slots
 from problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
@@ -95,9 +96,6 @@ def stiffness(
     pattern : of the mesh, where it is known
 
     """
-    # late: importing numba takes a while
-    from problems.fem.kernels import add_stiffness
-
     pattern = pattern or sparsity(mesh)
     if material is None:
         material = np.zeros(len(mesh.cells), dtype=np.int64)
@@ -122,8 +120,6 @@ class Pattern:
 
 def sparsity(mesh: Mesh) -> Pattern:
     """Find the pattern of K, once for all values."""
-    from problems.fem.kernels import dof_pattern, node_pattern, slots
-
     cells = mesh.cells.astype(np.int32)
     ptr, idx = node_pattern(cells, len(mesh.points))
     return Pattern(cells, ptr, slots(cells, ptr, idx), *dof_pattern(ptr, idx))

@@ -13,7 +13,8 @@ components and zero on the prescribed ones.
 
 Constraints touch only the components c of contact sides and supports. Ordered last,
 they leave a trailing block L_cc in the factor, and  (K⁺)_cc = (L_cc L_ccᵀ)⁻¹  gives
-F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  for every load step by one small product.
+F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  for every load step by one small product. Fixing nodes
+are ordered with them: what couples these far nodes then fills no other column.
 """
 
 from __future__ import annotations
@@ -21,16 +22,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack, null_space, qr
-from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
-from sksparse.cholmod import Factor, analyze
+from scipy.linalg import block_diag, lapack, null_space, qr
+from scipy.sparse import block_diag as sparse_block_diag
+from scipy.sparse import csc_array, csc_matrix, csr_array
+from sksparse.cholmod import Factor, cholesky
 
 from harness import Matrix, Vector
+from problems.fem.dissection import index_arrays
+from problems.fem.elimination import spread_symmetric
+from problems.fem.kernels import congruence
 from problems.fem.mesh import Nodes, dofs_of
+from problems.fem.multifrontal import Multifrontal, multifrontal
+
+NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
+
+
+class Interface(NamedTuple):
+    """What constraints can touch, and where the unknowns are."""
+
+    components: Nodes  #: (c,) ascending
+    points: NDArray[np.float64]  #: (N, 2) of the nodes that K's components belong to
 
 
 class GeneralisedInverse(Protocol):
@@ -50,20 +65,23 @@ class GeneralisedInverse(Protocol):
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n), exactly symmetric."""
 
+    def at_constraints(self, b: Vector) -> Vector:
+        """Return K⁺b (n,) where constraints can touch, for b (n,) that acts there."""
+
 
 @dataclass(frozen=True, eq=False)
 class Factorised:
-    """K⁺ through a Cholesky factor; BK⁺Bᵀ by one solve per row, the paper's way."""
+    """K⁺ through CHOLMOD's factor; BK⁺Bᵀ by one solve per row, the paper's way."""
 
     factor: Factor
-    order: Nodes  #: components in the order of the factor; K⁺ is zero on the others
+    free: Nodes  #: components it acts on; K⁺ is zero on the others
     kernel: NDArray[np.float64]
-    seconds: float  #: to factorise, and to condense where that was asked for
+    seconds: float  #: to factorise
 
     def __call__(self, b: Vector) -> Vector:
         """Solve."""
         x = np.zeros_like(b)
-        x[self.order] = self.factor.solve_A(b[self.order])
+        x[self.free] = self.factor.solve_A(b[self.free])
         return x
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
@@ -71,47 +89,53 @@ class Factorised:
         F = B @ self(B.T.toarray())
         return np.asarray((F + F.T) / 2)
 
+    def at_constraints(self, b: Vector) -> Vector:
+        """Solve: this is right everywhere."""
+        return self(b)
+
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
     """K⁺ with its block on the components that constraints can touch."""
 
-    whole: Factorised
-    interface: Nodes  #: (c,) components
+    factor: Multifrontal
+    interface: Nodes  #: (c,) components, ascending
     compliance: NDArray[np.float64]  #: (K⁺)_cc, zero where a component is prescribed
-
-    @property
-    def kernel(self) -> NDArray[np.float64]:
-        """Orthonormal basis R (n, r) of ker K."""
-        return self.whole.kernel
-
-    @property
-    def seconds(self) -> float:
-        """What factorising and condensing took."""
-        return self.whole.seconds
+    kernel: NDArray[np.float64]
+    seconds: float  #: to factorise and to condense
 
     def __call__(self, b: Vector) -> Vector:
         """Solve with the whole factor."""
-        return self.whole(b)
+        x = np.zeros_like(b)
+        x[self.factor.order] = self.factor.solve(b[self.factor.order])
+        return x
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ; ValueError where B touches other components."""
-        B_c = csr_array(B)[:, self.interface]
-        if B_c.count_nonzero() != B.count_nonzero():
+        B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
+        number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
+        ptr, idx = index_arrays(B)
+        F, within = congruence(ptr, idx, B.data, number, self.compliance)
+        if not within:
             raise ValueError("rows touch components outside the condensed interface")
-        F = B_c @ (B_c @ self.compliance).T
-        return np.asarray((F + F.T) / 2)
+        return F
+
+    def at_constraints(self, b: Vector) -> Vector:
+        """Multiply with (K⁺)_cc; zero elsewhere."""
+        u = np.zeros(b.size)
+        u[self.interface] = self.compliance @ b[self.interface]
+        return u
 
 
 def regular_inverse(
-    K: Matrix, free: Nodes, interface: Nodes | None = None
+    K: Matrix, free: Nodes, interface: Interface | None = None
 ) -> GeneralisedInverse:
     """Factorise K_ff, condensed onto the free part of `interface` where it is given.
 
     Raises
     ------
-    sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When K_ff is singular.
+    numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
+        When K_ff is singular; the latter without an interface.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)
@@ -121,7 +145,7 @@ def floating_inverse(
     K: Matrix,
     kernels: Sequence[NDArray[np.float64]],
     fixing: Sequence[Nodes],
-    interface: Nodes | None = None,
+    interface: Interface | None = None,
 ) -> GeneralisedInverse:
     """Factorise the stiffness of floating bodies numbered one after another.
 
@@ -131,24 +155,29 @@ def floating_inverse(
     kernels : per body, an orthonormal basis (2N_body, r_body) of its rigid modes
     fixing : per body, the numbers (within it) of nodes that no rigid motion leaves all
         at rest: at least two that are apart
-    interface : components to condense onto
+    interface : to condense onto
 
     """
-    starred = []
+    starred, fixed, start = [], [], 0
     for R, nodes in zip(kernels, fixing, strict=True):
         rows = dofs_of(nodes)
         Q = np.zeros_like(R)
         Q[rows] = np.linalg.qr(R[rows])[0]
         starred.append(csr_array(Q))
-    R_star = csc_array(block_diag(starred))
+        fixed.append(start + rows)
+        start += len(R)
+    R_star = csc_array(sparse_block_diag(starred))
     rho = K.diagonal().max()
     K_rho = csc_array(K + rho * (R_star @ R_star.T))
-    whole = np.asarray(block_diag([csr_array(R) for R in kernels]).toarray())
-    return _inverse(K_rho, np.arange(K.shape[0]), whole, interface)
+    free, kernel = np.arange(K.shape[0]), block_diag(*kernels)
+    return _inverse(K_rho, free, kernel, interface, np.concatenate(fixed))
 
 
 def supported_inverse(
-    K: Matrix, free: Nodes, rigid: NDArray[np.float64], interface: Nodes | None = None
+    K: Matrix,
+    free: Nodes,
+    rigid: NDArray[np.float64],
+    interface: Interface | None = None,
 ) -> GeneralisedInverse:
     """Factorise K_ff where the supports may leave rigid motions of some body.
 
@@ -159,7 +188,7 @@ def supported_inverse(
     Parameters
     ----------
     rigid : (n, r) rigid motions of all bodies, supports or not
-    interface : components to condense onto
+    interface : to condense onto
 
     """
     held = np.setdiff1d(np.arange(K.shape[0]), free)
@@ -173,24 +202,25 @@ def supported_inverse(
 
 
 def _inverse(
-    K: csc_array, free: Nodes, kernel: NDArray[np.float64], interface: Nodes | None
+    K: csc_array,
+    free: Nodes,
+    kernel: NDArray[np.float64],
+    interface: Interface | None,
+    fixed: Nodes = NO_NODES,
 ) -> GeneralisedInverse:
+    """Factorise K_ff, the components `fixed` and those of the interface last."""
     start = perf_counter()
-    touched = np.zeros(0, np.int64) if interface is None else np.unique(interface)
-    held = ~np.isin(touched, free)
-    last = touched[~held]
-    first = np.setdiff1d(free, last, assume_unique=True)
-    inner = csc_matrix(K[first][:, first])
-    fill_reducing = analyze(inner, mode="supernodal", ordering_method="nesdis").P()
-    order = np.concatenate([first[fill_reducing], last])
-    ordered = csc_matrix(K[order][:, order])
-    factor = analyze(ordered, mode="supernodal", ordering_method="natural")
-    factor.cholesky_inplace(ordered)
     if interface is None:
-        return Factorised(factor, order, kernel, perf_counter() - start)
-    L = factor.L()[len(first) :, len(first) :].toarray()
-    lower, _ = lapack.dpotri(L, lower=1, overwrite_c=1)
+        K_ff = csc_matrix(K[free][:, free])
+        factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
+        return Factorised(factor, free, kernel, perf_counter() - start)
+    touched = interface.components
+    last = np.concatenate([touched, fixed])
+    factor = multifrontal(K, free, interface.points, last)
+    number = np.full(K.shape[0], -1, dtype=np.int32)
+    number[touched] = np.arange(touched.size, dtype=np.int32)
     compliance = np.zeros((touched.size, touched.size))
-    compliance[np.ix_(~held, ~held)] = np.tril(lower) + np.tril(lower, -1).T
-    whole = Factorised(factor, order, kernel, perf_counter() - start)
-    return Condensed(whole, touched, compliance)
+    for components, U in factor.trailing():
+        lower, _ = lapack.dpotri(U.T, lower=1)
+        spread_symmetric(lower.T, number[components], compliance)
+    return Condensed(factor, touched, compliance, kernel, perf_counter() - start)

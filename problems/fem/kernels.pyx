@@ -1,5 +1,5 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Compiled loops of the stiffness assembly.
+"""Compiled loops of the stiffness assembly, and of the congruence with its inverse.
 
 Bilinear quadrilaterals couple each node to few others, so the sparsity pattern is
 found node by node, and each cell adds its 64 entries straight into the CSC arrays: no
@@ -175,3 +175,35 @@ def add_stiffness(
                 data[at + row] += Ke[32 + 4 * i + j]
                 data[at + row + 1] += Ke[48 + 4 * i + j]
     return values
+
+
+def congruence(
+    const int[::1] ptr,
+    const int[::1] idx,
+    const double[::1] data,
+    const int[::1] number,
+    const double[:, ::1] C,
+):
+    """Multiply BCBᵀ (m, m), exactly symmetric, for sparse rows B (m, n) in CSR.
+
+    Column j of B belongs to row number[j] of the symmetric C (c, c); also returned:
+    whether every entry of B has one (number[j] ≥ 0).
+    """
+    cdef Py_ssize_t i, j, k, t, m = ptr.shape[0] - 1, c = C.shape[0]
+    cdef double total
+    product = np.empty((m, m))
+    cdef double[:, ::1] F = product
+    cdef double[::1] row = np.empty(c)
+    for i in range(m):
+        row[:] = 0
+        for t in range(ptr[i], ptr[i + 1]):
+            if number[idx[t]] < 0:
+                return product, False
+            for k in range(c):
+                row[k] += data[t] * C[number[idx[t]], k]
+        for j in range(i + 1):
+            total = 0.0
+            for t in range(ptr[j], ptr[j + 1]):
+                total += row[number[idx[t]]] * data[t]
+            F[i, j] = F[j, i] = total
+    return product, True

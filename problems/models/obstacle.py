@@ -156,7 +156,7 @@ def with_bounds(rows: QP) -> Transformed:
         reactions = -rows.A @ (rows.P @ v + rows.q + rows.G.T @ z)
         return replace(s, x=v, y=reactions, z=z, z_box=np.zeros(n))
 
-    return Transformed(qp, recover, 1.0, 0.0)
+    return Transformed(qp, recover, 1.0, 0.0, lambda s: recover(s).x)
 
 
 def nodes(dim: int, n: int, shape: str = "flat") -> Vector:

@@ -247,7 +247,7 @@ def test_help_lists_and_refusals_wait_for_no_library(argv, tmp_path):
         "sys.argv[0] = 'mortarbench'\n"
         "try: m.main()\n"
         "except SystemExit: pass\n"
-        "slow = {'numpy', 'scipy', 'numba', 'pandas', 'matplotlib', 'rich'}\n"
+        "slow = {'numpy', 'scipy', 'pandas', 'matplotlib', 'rich'}\n"
         "print('loaded', *sorted(slow & set(sys.modules)))\n"
     )
     done = subprocess.run(

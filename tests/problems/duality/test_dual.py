@@ -8,12 +8,14 @@ from scipy.sparse import csc_array, csr_array
 
 from harness import QP, Solution, Status, kkt_residuals, no_rows
 from problems import PROBLEMS
+from problems.contact.linearise import linearisation
 from problems.duality.dualisation import dual_bounds, dualise
+from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
-from problems.fem.inverse import floating_inverse, regular_inverse
+from problems.fem.inverse import Interface, floating_inverse, regular_inverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from problems.models.beam_ring import _clamped, _floating
+from problems.models.beam_ring import _clamped, _floating, model
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 
@@ -22,9 +24,10 @@ BEAM = rectangle((0, 0.5), (2, 0.25), (24, 3))
 RING = half_ring((1, 0), (0.3, 0.49), (24, 4))
 MESH, _ = join((BEAM, RING))
 TOUCHED = dofs_of(np.concatenate([MESH.boundaries[b] for b in ("outer", "bottom")]))
+ONTO = Interface(TOUCHED, MESH.points)
 
 
-@pytest.fixture(scope="module", params=[None, TOUCHED], ids=["factor", "condensed"])
+@pytest.fixture(scope="module", params=[None, ONTO], ids=["factor", "condensed"])
 def floating(request):
     parts = [BEAM.points, RING.points]
     K = stiffness(MESH, D)
@@ -69,7 +72,7 @@ def test_the_congruence_is_that_of_a_dense_inverse(floating, seed):
     assert pytest.approx(B @ K_plus @ B.T, rel=1e-9) == F
 
 
-@pytest.mark.parametrize("interface", [None, TOUCHED], ids=["factor", "condensed"])
+@pytest.mark.parametrize("interface", [None, ONTO], ids=["factor", "condensed"])
 def test_a_supported_body_has_its_inverse_on_the_free_components(interface):
     K = stiffness(MESH, D)
     fixed = dofs_of(
@@ -97,12 +100,22 @@ def test_rows_outside_the_condensed_interface_are_refused():
     fixed = dofs_of(MESH.boundaries["left"])
     parts = [BEAM.points, RING.points]
     inverse = floating_inverse(
-        K, [rigid_modes(p) for p in parts], [fixing_nodes(p) for p in parts], TOUCHED
+        K, [rigid_modes(p) for p in parts], [fixing_nodes(p) for p in parts], ONTO
     )
     B = csr_array((np.ones(1), ([0], [fixed[0]])), shape=(1, MESH.dofs))
 
     with pytest.raises(ValueError, match="outside the condensed interface"):
         inverse.congruence(B)
+
+
+def test_displacements_at_constraints_are_those_of_the_whole_inverse(floating):
+    K, inverse = floating
+    b = np.zeros(K.shape[0])
+    b[TOUCHED] = np.random.default_rng(223606).standard_normal(TOUCHED.size)
+
+    u = inverse.at_constraints(b)
+
+    assert u[TOUCHED] == pytest.approx(inverse(b)[TOUCHED], rel=1e-9)
 
 
 def condition(mesh, nodes):
@@ -240,3 +253,53 @@ def test_a_dual_is_charged_for_a_factor_that_was_there_already(form):
         params = family.complete(dict(Nr=3, Nh=2, step=step))
         case = family.build(form, params, reference_solution)
         assert case.dualise_seconds > factor.seconds
+
+
+class Counted:
+    """K⁺ that counts its solves."""
+
+    def __init__(self, inverse):
+        self.inverse, self.solves = inverse, 0
+
+    def __getattr__(self, name):
+        return getattr(self.inverse, name)
+
+    def __call__(self, b):
+        self.solves += 1
+        return self.inverse(b)
+
+
+@pytest.mark.parametrize(
+    ("factorise", "transform"), [(_floating, dualise), (_clamped, dual_bounds)]
+)
+def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transform):
+    geometry = (3, 2, 4, "strain")
+    bodies, inverse = model(*geometry), Counted(factorise(*geometry))
+    path = LoadPath(
+        bodies, linearisation(bodies, "nts", "dual"), inverse, reference_solution, 6,
+        transform=transform,
+    )  # fmt: skip
+
+    last = path.answer(6)
+
+    assert inverse.solves == 2  # of the load, and of the last step
+    primal = path.primal(6)
+    assert kkt_residuals(primal, last).worst <= 1e-6
+    path.answer(3), path.answer(3)
+    assert inverse.solves == 3
+
+
+@pytest.mark.parametrize(
+    ("factorise", "transform"), [(_floating, dualise), (_clamped, dual_bounds)]
+)
+def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
+    factorise, transform
+):
+    family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
+    params = family.complete({"Nr": 3, "Nh": 2})
+    primal = family.build("primal", params, reference_solution).qp
+    dual = transform(primal, factorise(*geometry))
+    s = reference_solution(dual.qp)
+    sides, u = np.unique(primal.G.indices), dual.recover(s).x
+
+    assert dual.touched(s)[sides] == pytest.approx(u[sides], abs=1e-9 * abs(u).max())

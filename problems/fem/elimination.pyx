@@ -1,0 +1,170 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+# cython: initializedcheck=False
+"""Compiled loops of the multifrontal method, dense work done by BLAS and LAPACK.
+
+`problems.fem.multifrontal` says what it is. U = Lᵀ of a front by rows is L of LAPACK,
+by columns.
+"""
+
+from libc.stdint cimport int64_t
+from libc.string cimport memmove, memset
+from scipy.linalg.cython_blas cimport dgemv, dsyrk, dtrsm, dtrsv
+from scipy.linalg.cython_lapack cimport dpotrf
+
+import numpy as np
+
+
+def eliminate(
+    const int[::1] indptr,
+    const int[::1] indices,
+    const double[::1] data,
+    const int64_t[::1] order,
+    const int[::1] position,
+    const int[::1] start,
+    const int[::1] first,
+    const int[::1] border,
+    const int[::1] children,
+    const int64_t[::1] offset,
+    double[::1] rows,
+):
+    """Write the rows of U front by front; say whether all pivots were positive."""
+    cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, waiting = 0
+    cdef int low, own, left, size, info = 0
+    cdef double one = 1.0, minus = -1.0
+    cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
+    cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
+    cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
+    # what fronts left, one on another
+    cdef double[::1] store = np.empty(most_waiting(first, children))
+    cdef double *U
+    cdef double *S
+    for s in range(children.shape[0]):
+        low, own, left = start[s], start[s + 1] - start[s], first[s + 1] - first[s]
+        size = own + left
+        U, S = &rows[0] + offset[s], &store[0] + top
+        for i in range(own):
+            place[low + i] = i
+        for i in range(left):
+            place[border[first[s] + i]] = own + i
+            memset(S + i * left + i, 0, (left - i) * sizeof(double))
+        for p in range(low, low + own):
+            for t in range(indptr[order[p]], indptr[order[p] + 1]):
+                q = position[indices[t]]
+                if q >= p:
+                    U[(p - low) * size + place[q]] = data[t]
+        for i in range(children[s]):
+            waiting -= 1
+            child = stack[waiting]
+            m = first[child + 1] - first[child]
+            for t in range(m):
+                to[t] = place[border[first[child] + t]]
+            top -= m * m
+            add(&store[top], &to[0], m, own, left, U, S)
+        if own:
+            dpotrf(b"L", &own, U, &size, &info)
+            if info or not U[(own - 1) * (<Py_ssize_t> size + 1)] > 0:  # NaN is not
+                return False
+        if own and left:
+            dtrsm(b"R", b"L", b"T", b"N", &left, &own, &one, U, &size, U + own, &size)
+            dsyrk(b"L", b"N", &left, &own, &minus, U + own, &size, &one, S, &left)
+        if children[s]:  # to their place: they are done with
+            for i in range(left):
+                t = i * left + i
+                memmove(&store[top + t], S + t, (left - i) * sizeof(double))
+        stack[waiting] = s
+        waiting += 1
+        top += <Py_ssize_t> left * left
+    return True
+
+
+def most_waiting(const int[::1] first, const int[::1] children):
+    """Count the numbers that `eliminate` has to keep at a time."""
+    cdef Py_ssize_t s, i, waiting = 0
+    cdef int64_t size, top = 0, most = 0
+    cdef int64_t[::1] stack = np.empty(children.shape[0], dtype=np.int64)
+    for s in range(children.shape[0]):
+        size = first[s + 1] - first[s]
+        size *= size
+        most = max(most, top + size)
+        for i in range(children[s]):
+            waiting -= 1
+            top -= stack[waiting]
+        stack[waiting] = size
+        waiting += 1
+        top += size
+    return most
+
+
+cdef void add(
+    const double *below, const int *to, Py_ssize_t m, Py_ssize_t own, Py_ssize_t left,
+    double *U, double *S,
+) noexcept nogil:
+    """Add the upper triangle of what a child left at the places `to` of its front.
+
+    below (m, m), U (own, own + left), S (left, left)
+    """
+    cdef Py_ssize_t i, j
+    cdef double *row
+    for i in range(m):
+        if to[i] < own:
+            row = U + to[i] * (own + left)
+        else:
+            row = S + (to[i] - own) * left - own
+        for j in range(i, m):
+            row[to[j]] += below[i * m + j]
+
+
+def substitute(
+    const int[::1] start,
+    const int[::1] first,
+    const int[::1] border,
+    const int64_t[::1] offset,
+    const double[::1] rows,
+    double[:, ::1] x,
+):
+    """Solve UᵀU x = b in place of b, whose right-hand sides are the rows of x."""
+    cdef Py_ssize_t s, t, k, i, fronts = start.shape[0] - 1
+    cdef int own, left, size, unit = 1
+    cdef double one = 1.0, minus = -1.0, zero = 0.0
+    cdef double[::1] further = np.empty(np.diff(first).max())
+    cdef double *v = &further[0]
+    cdef double *U
+    cdef double *xs
+    for t in range(2 * fronts):
+        s = min(t, 2 * fronts - 1 - t)  # up the tree and down again
+        own, left = start[s + 1] - start[s], first[s + 1] - first[s]
+        size = own + left
+        if not own:
+            continue
+        U = <double *> &rows[0] + offset[s]
+        for k in range(x.shape[0]):
+            xs = &x[k, start[s]]
+            if t < fronts:
+                dtrsv(b"L", b"N", b"N", &own, U, &size, xs, &unit)
+                dgemv(b"N", &left, &own, &minus, U + own, &size, xs, &unit, &zero, v,
+                      &unit)
+                for i in range(left):
+                    x[k, border[first[s] + i]] += v[i]
+            else:
+                for i in range(left):
+                    v[i] = x[k, border[first[s] + i]]
+                dgemv(b"T", &left, &own, &minus, U + own, &size, v, &unit, &one, xs,
+                      &unit)
+                dtrsv(b"L", b"T", b"N", &own, U, &size, xs, &unit)
+
+
+def spread_symmetric(
+    const double[:, :] upper, const int[::1] at, double[:, ::1] to
+):
+    """Write a symmetric matrix, of which the upper triangle is given, at rows `at`.
+
+    Rows and columns whose place is negative are left out.
+    """
+    cdef Py_ssize_t i, j
+    for i in range(at.shape[0]):
+        if at[i] < 0:
+            continue
+        for j in range(i, at.shape[0]):
+            if at[j] >= 0:
+                to[at[i], at[j]] = upper[i, j]
+                to[at[j], at[i]] = upper[i, j]

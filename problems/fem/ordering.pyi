@@ -1,0 +1,17 @@
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int32]
+Floats = NDArray[np.float64]
+Marks = NDArray[np.bool_]
+
+def node_graph(
+    indptr: Ints, indices: Ints, d: int, nodes: int
+) -> tuple[Ints, Ints]: ...
+def components(ptr: Ints, idx: Ints) -> Ints: ...
+def dissected(
+    ptr: Ints, idx: Ints, points: Floats, ending: Marks, leaf: int
+) -> tuple[Ints, Ints, Ints, Marks]: ...
+def borders(
+    ptr: Ints, idx: Ints, order: Ints, start: Ints, children: Ints
+) -> tuple[Ints, Ints]: ...

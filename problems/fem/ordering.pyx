@@ -1,0 +1,256 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+# cython: initializedcheck=False
+"""Compiled loops of nested dissection; `problems.fem.dissection` says what it is."""
+
+from libc.math cimport INFINITY, atan2, cos, fmax, fmin, sin
+from libc.stdint cimport int64_t
+
+import numpy as np
+
+
+def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
+    """Contract the pattern of a matrix with d components per node, diagonal left out.
+
+    Returns the neighbours of each node in turn, as (ptr, idx).
+    """
+    cdef Py_ssize_t a, b, t, end = 0
+    pointers = np.zeros(nodes + 1, dtype=np.int32)
+    neighbours = np.empty(indices.shape[0], dtype=np.int32)
+    cdef int[::1] ptr = pointers, idx = neighbours
+    cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
+    for a in range(nodes):
+        seen[a] = a
+        for t in range(indptr[d * a], indptr[d * (a + 1)]):
+            b = indices[t] // d
+            if seen[b] != a:
+                seen[b] = a
+                idx[end] = b
+                end += 1
+        ptr[a + 1] = end
+    return pointers, neighbours[:end].copy()
+
+
+def components(const int[::1] ptr, const int[::1] idx):
+    """Number the connected components in the order of their first nodes: (N,)."""
+    cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
+    cdef int count = 0
+    numbers = np.full(nodes, -1, dtype=np.int32)
+    cdef int[::1] number = numbers, reached = np.empty(nodes, dtype=np.int32)
+    for seed in range(nodes):
+        if number[seed] >= 0:
+            continue
+        number[seed], reached[0], at, end = count, seed, 0, 1
+        while at < end:
+            for t in range(ptr[reached[at]], ptr[reached[at] + 1]):
+                if number[idx[t]] < 0:
+                    number[idx[t]], reached[end] = count, idx[t]
+                    end += 1
+            at += 1
+        count += 1
+    return numbers
+
+
+def dissected(
+    const int[::1] ptr, const int[::1] idx, const double[:, :] points, ending, int leaf
+):
+    """Dissect each connected component; see `dissect` and `Fronts`.
+
+    Returns order (N,), start (F + 1,), children (F,) and roots (F,).
+    """
+    # each component in turn, its nodes of `ending` after the others, all ascending
+    key = 2 * components(ptr, idx) + ending
+    chosen = np.argsort(key, kind="stable").astype(np.int32)
+    ends = np.append(0, np.bincount(key, minlength=key.max() // 2 * 2 + 2).cumsum())
+    cdef int[::1] order = chosen
+    cdef const int64_t[::1] end = ends
+
+    # a part of n nodes is cut at most n − 1 times, into two that become fronts
+    cdef Py_ssize_t nodes = points.shape[0], waiting, low, high, middle, separator
+    cdef Py_ssize_t c, begin, fronts = 0
+    lengths, branches = np.zeros((2, 3 * nodes), dtype=np.int32)
+    roots = np.zeros(3 * nodes, dtype=np.bool_)
+    cdef int[::1] length = lengths, children = branches
+    cdef int[:, ::1] todo = np.empty((2 * nodes, 2), dtype=np.int32)
+    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # of the last cut of a node
+    cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
+    cdef double[:, ::1] along = np.empty((2, nodes))
+    cdef int cut = 0
+    for c in range(end.shape[0] // 2):
+        # reversed postorder: a separator, all of its second half, all of its first
+        begin, waiting = fronts, 0
+        if end[2 * c] < end[2 * c + 1]:
+            todo[0, 0], todo[0, 1], waiting = end[2 * c], end[2 * c + 1], 1
+        while waiting:
+            waiting -= 1
+            low, high = todo[waiting, 0], todo[waiting, 1]
+            middle = separator = high
+            if high - low > leaf:
+                cut += 2
+                bisect(
+                    ptr, idx, points, order[low:high], side, cut, kind, copy, along,
+                    &middle, &separator,
+                )
+                middle += low
+                separator += low
+            if middle != low and middle != high:
+                length[fronts], children[fronts] = high - separator, 2
+                todo[waiting, 0], todo[waiting, 1] = low, middle
+                todo[waiting + 1, 0], todo[waiting + 1, 1] = middle, separator
+                waiting += 2
+            else:  # few nodes, or all in one place
+                length[fronts], children[fronts] = high - low, 0
+            fronts += 1
+        lengths[begin:fronts] = lengths[begin:fronts][::-1].copy()
+        branches[begin:fronts] = branches[begin:fronts][::-1].copy()
+        length[fronts] = end[2 * c + 2] - end[2 * c + 1]
+        children[fronts], roots[fronts] = fronts > begin, True
+        fronts += 1
+    start = np.append(0, np.cumsum(lengths[:fronts])).astype(np.int32)
+    return chosen, start, branches[:fronts].copy(), roots[:fronts].copy()
+
+
+cdef void bisect(
+    const int[::1] ptr, const int[::1] idx, const double[:, :] points, int[::1] part,
+    int[::1] side, int cut, int[::1] kind, int[::1] copy, double[:, ::1] along,
+    Py_ssize_t *middle, Py_ssize_t *separator,
+) noexcept:
+    """Reorder `part` to first half, second half, separator; tell where these begin.
+
+    side becomes `cut` on the first half and cut + 1 on the rest. kind, copy and along
+    (2, N) are overwritten.
+    """
+    cdef Py_ssize_t a, t, s, n = part.shape[0]
+    cdef double value, least = INFINITY, most = -INFINITY
+    cdef Py_ssize_t[3] count = [0, 0, 0]
+    coordinates(points, part, along[0])
+    for t in range(n):
+        along[1, t] = along[0, t]
+        least, most = fmin(least, along[0, t]), fmax(most, along[0, t])
+    # nodes level with the median but for rounding stay together
+    value = find(&along[1, 0], n, n // 2) - 1e-9 * (most - least)
+    for t in range(n):
+        side[part[t]] = cut + (along[0, t] >= value)
+    for t in range(n):
+        a = part[t]
+        copy[t], kind[t] = a, 0
+        if side[a] == cut + 1:
+            kind[t] = 1
+            for s in range(ptr[a], ptr[a + 1]):
+                if side[idx[s]] == cut:
+                    kind[t] = 2
+                    break
+        count[kind[t]] += 1
+    middle[0], separator[0] = count[0], count[0] + count[1]
+    count[0], count[1], count[2] = 0, middle[0], separator[0]
+    for t in range(n):
+        part[count[kind[t]]] = copy[t]
+        count[kind[t]] += 1
+
+
+cdef void coordinates(
+    const double[:, :] points, const int[::1] part, double[::1] along
+) noexcept:
+    """Write the coordinates of nodes along their longest principal axis."""
+    cdef Py_ssize_t t, n = part.shape[0]
+    cdef double x, y, angle, mean_x = 0.0, mean_y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0
+    for t in range(n):
+        mean_x += points[part[t], 0]
+        mean_y += points[part[t], 1]
+    mean_x /= n
+    mean_y /= n
+    for t in range(n):
+        x, y = points[part[t], 0] - mean_x, points[part[t], 1] - mean_y
+        xx += x * x
+        xy += x * y
+        yy += y * y
+    angle = atan2(2 * xy, xx - yy) / 2
+    x, y = cos(angle), sin(angle)
+    for t in range(n):
+        along[t] = (points[part[t], 0] - mean_x) * x + (points[part[t], 1] - mean_y) * y
+
+
+cdef double find(double *v, Py_ssize_t n, Py_ssize_t k) noexcept:
+    """Return the k-th smallest number, counted from 0, of v (n,), which is reordered.
+
+    Hoare, Algorithm 65: Find, Comm. ACM 4, 1961.
+    """
+    cdef Py_ssize_t i, j, low = 0, high = n - 1
+    cdef double pivot
+    while low < high:
+        pivot, i, j = v[k], low, high
+        while i <= j:
+            while v[i] < pivot:
+                i += 1
+            while v[j] > pivot:
+                j -= 1
+            if i <= j:
+                v[i], v[j] = v[j], v[i]
+                i += 1
+                j -= 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    return v[k]
+
+
+def borders(
+    const int[::1] ptr,
+    const int[::1] idx,
+    const int[::1] order,
+    const int[::1] start,
+    const int[::1] children,
+):
+    """Find the border of each front: later neighbours of its own and its children's.
+
+    Returns first (F + 1,) and border, see `Fronts`.
+    """
+    cdef Py_ssize_t s, t, i, p, child, end = 0, waiting = 0
+    cdef Py_ssize_t nodes = order.shape[0], fronts = children.shape[0]
+    firsts = np.zeros(fronts + 1, dtype=np.int32)
+    cdef int[::1] first = firsts, stack = np.empty(fronts, dtype=np.int32)
+    cdef int[::1] position = np.empty(nodes, dtype=np.int32)
+    cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
+    found = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
+    cdef int[::1] unsorted = found
+    for p in range(nodes):
+        position[order[p]] = p
+    for s in range(fronts):
+        if end + nodes > unsorted.shape[0]:
+            found = unsorted = np.resize(found, 2 * found.size)
+        for i in range(children[s]):
+            waiting -= 1
+            child = stack[waiting]
+            for t in range(first[child], first[child + 1]):
+                p = unsorted[t]
+                if p >= start[s + 1] and seen[p] != s:
+                    seen[p], unsorted[end] = s, p
+                    end += 1
+        for i in range(start[s], start[s + 1]):
+            for t in range(ptr[order[i]], ptr[order[i] + 1]):
+                p = position[idx[t]]
+                if p >= start[s + 1] and seen[p] != s:
+                    seen[p], unsorted[end] = s, p
+                    end += 1
+        first[s + 1] = end
+        stack[waiting] = s
+        waiting += 1
+
+    # ascending in each front: by position first, and then back to the fronts
+    cdef int[::1] at = np.append(0, np.bincount(found[:end], minlength=nodes)).cumsum(
+        dtype=np.int32
+    )
+    cdef int[::1] of_front = np.empty(end, dtype=np.int32), filled = firsts.copy()
+    border = np.empty(end, dtype=np.int32)
+    cdef int[::1] ascending = border
+    for s in range(fronts):
+        for t in range(first[s], first[s + 1]):
+            of_front[at[unsorted[t]]] = s
+            at[unsorted[t]] += 1
+    t = 0
+    for p in range(nodes):
+        while t < at[p]:
+            ascending[filled[of_front[t]]] = p
+            filled[of_front[t]] += 1
+            t += 1
+    return firsts, border
