@@ -31,6 +31,7 @@ class Solver:
         tol: float,
         at: Iterate,
         infeasible: Callable[[Vector], bool],
+        watch: Callable[[int, Vector], Callable[[str, Vector, Vector], None]] | None,
     ) -> tuple[
         Vector,
         Vector,

@@ -768,7 +768,7 @@ cdef class Solver:
         return 0
 
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
-                      long most, bytearray trace) except -1:
+                      long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
         cdef long steps = 0, idle = 0
         cdef int letter
@@ -798,7 +798,7 @@ cdef class Solver:
                     return 0
                 if self.told[0] <= self.told[1]:
                     self.minimise_along_p()
-                    trace.append(b"c")
+                    self.tell(b"c", trace, note)
                     steps += 1
                     continue
                 letter = self.expand(self.told[0], self.told[1], not has_expanded)
@@ -808,8 +808,14 @@ cdef class Solver:
             self.split()
             self.enter_face()
             memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
-            trace.append(letter)
+            self.tell(letter, trace, note)
             steps += 1
+
+    cdef int tell(self, int letter, bytearray trace, note) except -1:
+        trace.append(letter)
+        if note is not None:
+            note(chr(letter), np.array(self.x), np.array(self.g))
+        return 0
 
     cdef void minimise_along_p(self):
         """Take the CG step whose `lengths` are told, and find the next direction."""
@@ -880,11 +886,15 @@ cdef class Solver:
 
     # the outer loop
 
-    def smalbe(self, constants, double tol, at, infeasible):
+    def smalbe(self, constants, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
-        `OuterIteration`, and the status. infeasible : asked whether ν proves that.
+        `OuterIteration`, and the status.
+
+        infeasible : asked whether ν proves that
+        watch : makes the observer of outer iteration k with that right-hand side, which
+            is told the letter of each step, x and g
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = -INFINITY, lagrangian, error, M = at.M
@@ -911,8 +921,9 @@ cdef class Solver:
                 self.preconditioner = self.model(self.rho)
                 if not self.plain:
                     self.B = self.preconditioner
+            note = watch and watch(len(at.outer) + len(done), np.array(self.rhs))
             stopped = self.minimise(
-                until, tol, energy, b_size, max(left, 0), trace
+                until, tol, energy, b_size, max(left, 0), trace, note
             )
             left -= len(trace) + 1
             solved = sqrt(self.phi_square + self.beta_square) <= until.small

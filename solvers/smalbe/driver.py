@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from harness import QP, Solution, Status, Vector, kkt_residuals
 from solvers.smalbe import compiled
 from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
-from solvers.smalbe.mprgp import Face, Point, Rules, Watch
+from solvers.smalbe.mprgp import Face, Point, Rules, Watch, split
 from solvers.smalbe.options import Options
 from solvers.smalbe.outer_loop import (
     Constants,
@@ -102,7 +102,7 @@ def prepared(
 
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
-    if carry is None and options.norm == "lanczos" and not options.history:
+    if carry is None and options.norm == "lanczos":
         return prepared_problem(qp, _lanczos_steps(options, qp.q.size))
     return projected_problem(qp, partial(_find, options, carry))
 
@@ -161,7 +161,7 @@ def outer_loop(
 ) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
     """Choose what runs the outer loop: compiled where it can be, or as it is written.
 
-    With a history, and with preconditioners that need more than products, it is not.
+    Where preconditioners need more than products, it is not.
     """
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced,
@@ -171,16 +171,17 @@ def outer_loop(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
     )  # fmt: skip
-    if is_compiled and history is None and options.preconditioner in WITHOUT_P:
+    watch = None if history is None else partial(history.watch, problem)
+    if is_compiled and options.preconditioner in WITHOUT_P:
         with_model = options.preconditioner == "model"
         solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
-        return partial(_compiled_loop, solver, problem, constants), solver
+        return partial(_compiled_loop, solver, problem, constants, watch), solver
     plain = partial(problem.plain_model, alpha=options.alpha)
     inner = InnerSolver(
         rules=rules,
         model=problem.model if options.expansion == "model" else plain,
         precondition=face_preconditioner(problem, qp, options.preconditioner),
-        watch=None if history is None else partial(history.watch, problem),
+        watch=watch,
     )
     return partial(smalbe, problem, constants, inner), None
 
@@ -189,14 +190,27 @@ def _compiled_loop(
     solver: compiled.Solver,
     problem: Projected,
     constants: Constants,
+    watch: Callable[[int, Vector], Watch] | None,
     tol: float,
     at: Iterate,
 ) -> Iterate:
     nu, g, mu, M, rho, done, status = solver.smalbe(
-        constants, tol, at, partial(infeasible, problem)
-    )
+        constants, tol, at, partial(infeasible, problem),
+        watch and partial(_observer, watch, problem),
+    )  # fmt: skip
     outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
     return Iterate(nu, g, mu, M, rho, outer, Status(status))
+
+
+def _observer(
+    watch: Callable[[int, Vector], Watch], problem: Projected, outer: int, rhs: Vector
+) -> Callable[[str, Vector, Vector], None]:
+    note = watch(outer, rhs)
+
+    def told(letter: str, x: Vector, g: Vector) -> None:
+        note(letter, Point(x, g), split(Point(x, g), problem.bounds))
+
+    return told
 
 
 def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | None]]:
