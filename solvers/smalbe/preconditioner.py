@@ -20,7 +20,6 @@ from typing import Literal, get_args
 
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array
-from sksparse.cholmod import cholesky
 
 from harness import QP, Structure, Vector
 from solvers.smalbe.kernels import Mask
@@ -79,6 +78,8 @@ def _structural(
     structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
 ) -> Operator:
     """Return B_D S B_Dᵀ with the stiffness S of the interface."""
+    from sksparse.cholmod import cholesky  # late: other preconditioners do without
+
     acting = np.ones(structure.K.shape[0], dtype=bool)
     acting[structure.fixed] = False
     K = csc_matrix(structure.K)[acting][:, acting]
@@ -100,6 +101,8 @@ def _lumped(K: csc_matrix, touched: Mask) -> Operator:
 
 def _schur(K: csc_matrix, touched: Mask) -> Operator:
     """Apply S_bb: one solve with K_ii."""
+    from sksparse.cholmod import cholesky
+
     K_bb, K_ib = K[touched][:, touched], csc_matrix(K[~touched][:, touched])
     solve = cholesky(csc_matrix(K[~touched][:, ~touched]))
     return lambda u: K_bb @ u - K_ib.T @ solve(K_ib @ u)
