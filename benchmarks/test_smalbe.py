@@ -6,13 +6,13 @@ from time import perf_counter
 
 import numpy as np
 import pytest
+from scipy.linalg.blas import dsymv
 
 from harness import Status, kkt_residuals
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
-from solvers.smalbe.outer_loop import first_iterate
-from solvers.smalbe.projected import by_lanczos, product, projected_problem
+from solvers.smalbe.compiled import Product
 from tests.support.generated_bodies import generated_case
 
 #: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8
@@ -148,29 +148,87 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
     )
 
 
-@pytest.mark.parametrize(("Nr", "Nh"), [(30, 15), (60, 30), (130, 65)])
-def test_a_step_costs_a_product_and_little_more(race, note, Nr, Nh):
-    """Time per step of a long run against one symmetric matrix-vector product."""
-    qp = dual(Nr, Nh, 10)
-    solver = replace(SOLVERS["smalbe"], eliminate="never")
-    short, long = (solver.prepare(qp, tol)().iterations for tol in (1e-3, 1e-10))
-    v, P = np.ones(qp.q.size), product(qp.P)
-    problem = projected_problem(qp, lambda F, rows: by_lanczos(F, rows, steps=12))
-    at = first_iterate(problem, v, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4)
+@pytest.mark.parametrize(
+    ("Nr", "Nh"), [(12, 6), (12, 7), (30, 15), (60, 30), (130, 65)]
+)
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_a_solve_costs_its_products_and_little_more(race, note, form, Nr, Nh):
+    """Prepare, and solve less 1.5 times its products, in units of a product."""
+    qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
+    v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
+    ready = []
+
+    def solve():
+        return ready.pop()()
 
     def repeated(f):
-        return lambda: [f() for _ in range(50)]
+        return lambda: [f() for _ in range(20)]
 
+    before = solver.prepare(qp, tol)
+    prepared = _prepare_products(solver, qp, tol)
+    spent = products(before()) - prepared
+    ready.extend(solver.prepare(qp, tol) for _ in range(40))
     medians = race(
         rounds=15,
-        product=repeated(lambda: P(v)),
-        operator=repeated(lambda: problem.H(at.nu, 1e4)),
-        short=lambda: solver.prepare(qp, 1e-3)(),
-        long=lambda: solver.prepare(qp, 1e-10)(),
+        ours=repeated(lambda: P(v)),
+        dsymv=repeated(lambda: dsymv(1.0, blas, v, lower=1)),
+        prepare=lambda: solver.prepare(qp, tol),
+        solve=solve,
     )
-    step = (medians["long"] - medians["short"]) / (long - short)
+    product = min(medians["ours"], medians["dsymv"]) / 20
+    most = 1.5 * spent * product + 100e-6
     note(
-        f"m={qp.q.size}: a step {1e6 * step:.1f} µs, a product "
-        f"{1e6 * medians['product'] / 50:.1f} µs, "
-        f"with projector and penalty {1e6 * medians['operator'] / 50:.1f} µs"
+        f"{form} m={qp.q.size}: prepare {1e6 * medians['prepare']:.0f} µs, solve "
+        f"{1e6 * medians['solve']:.0f} µs of at most {1e6 * most:.0f} for {spent} "
+        f"products of {1e6 * product:.1f} µs"
     )
+
+
+def _prepare_products(solver, qp, tol):
+    """Count the products of `prepare`: a solve stopped at its start shows them."""
+    stopped = replace(solver, max_steps=1)
+    s = stopped.prepare(qp, tol)()
+    return s.counts["P_products"] - s.iterations - 2  # its point, and the residuals
+
+
+ZOO = {
+    "journal-bearing": {"n": 300},
+    "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
+    "torsion": {"n": 100},
+    "string": {"n": 10_000},
+}
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_large_sparse_problems(race, note, name):
+    """Prepare and solve at 1e-6; a step against one product and five vector passes."""
+    family = PROBLEMS[name]
+    form = family.forms[0]
+    qp = family.build(form, family.complete(ZOO[name]), reference_solution).qp
+    n, tol = qp.q.size, 1e-6
+    fleet = [
+        f for f in ("smalbe", "smalbe-permon", "smalbe-espreso", "osqp", "clarabel",
+                    "piqp", "pdas") if verifies(SOLVERS[f], qp, tol)
+    ]  # fmt: skip
+    P, v, w = Product(qp.P, n), np.ones(n), np.ones(n)
+
+    def passes():
+        for _ in range(5):
+            np.add(v, w, out=w)
+
+    medians = race(
+        rounds=3, product=lambda: P(v), passes=passes,
+        **{f: partial(seconds, SOLVERS[f], qp, tol) for f in fleet},
+    )  # fmt: skip
+    spent = {
+        f: SOLVERS[f].prepare(qp, tol)().counts.get("P_products")
+        for f in fleet
+        if f.startswith("smalbe")
+    }
+    unit = medians["product"] + medians["passes"]
+    step = medians["smalbe"] / spent["smalbe"] / unit
+    told = ", ".join(
+        f"{f} {medians[f]:.2f} s" + (f" ({spent[f]})" if f in spent else "")
+        for f in fleet
+    )
+    note(f"{name} n={n}: {told}; a product with its step × {step:.2f}")

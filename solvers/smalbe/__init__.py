@@ -1,1 +1,1 @@
-"""SMALBE: the algorithm from the solver's face down to its compiled kernels."""
+"""SMALBE: the algorithm as it is written, and compiled."""

@@ -82,7 +82,7 @@ cdef class Product:
 
     def __call__(self, v):
         """Return Pv for v (n,)."""
-        cdef double[::1] vector = np.ascontiguousarray(v, dtype=float)
+        cdef const double[::1] vector = np.ascontiguousarray(v, dtype=float)
         cdef double[::1] result = np.empty(self.n)
         if self.n:
             self.apply(&vector[0], &result[0])
@@ -989,8 +989,9 @@ cdef class Solver:
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
         result = np.zeros((4, n))
-        cdef double[::1] x, z_box, Fx, rest, v = nu, at = np.empty(n)
-        cdef double[::1] a = self.norm * mu, da = np.zeros(r)
+        cdef const double[::1] v = nu
+        cdef double[::1] x, z_box, Fx, rest, at = np.empty(n)
+        cdef double[::1] a = self.norm * np.asarray(mu), da = np.zeros(r)
         cdef double[:, ::1] S = np.zeros((r, r))
         cdef double s
         x, z_box, Fx, rest = result
