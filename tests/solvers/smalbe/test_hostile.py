@@ -1,0 +1,79 @@
+"""A search for QPs on which SMALBE claims what it has not, or gives up."""
+
+import numpy as np
+import pytest
+
+from harness import QP, Status, kkt_residuals, no_rows
+from solvers import SOLVERS
+
+TOLERANCES = (1e-6, 1e-9, 1e-12)
+
+
+def hostile(seed):
+    """Draw a QP with a KKT point: ill-conditioned, degenerate, of any scale.
+
+    P has condition numbers to 1e10 or is singular, a third of the multipliers of active
+    bounds is zero, and two rows may differ by 1e-8 alone (less, and the rounding of b
+    makes QPs without a feasible point of them).
+    """
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 60))
+    m = int(rng.integers(0, min(n, 5) + 1))
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    eigenvalues = np.logspace(0, -rng.uniform(0, 10), n)
+    if rng.random() < 0.3:
+        eigenvalues[rng.random(n) < 0.3] = 0
+    P = (Q * eigenvalues) @ Q.T * 10 ** rng.uniform(-6, 6)
+    P = (P + P.T) / 2
+    size = 10 ** rng.uniform(-4, 4)
+    x = size * rng.standard_normal(n)
+    kind, active = rng.integers(0, 4, n), rng.random(n) < 0.4
+    room = size * rng.exponential(size=(3, n))
+    lb = np.where(kind == 1, x - room[0], np.where(kind == 3, x - size, -np.inf))
+    lb = np.where(active, x, lb)
+    ub = np.where(kind == 2, x + room[1], np.inf)
+    scale = np.abs(P).max() * size
+    degenerate = rng.random(n) < 0.3
+    z = np.where(active & ~degenerate, -scale * room[2] / size, 0.0)
+    A = rng.standard_normal((m, n))
+    if m >= 2 and rng.random() < 0.4:
+        A[-1] = A[0] + 10 ** rng.uniform(-8, -2) * rng.standard_normal(n)
+    A *= 10 ** rng.uniform(-3, 3, (m, 1))
+    y = rng.standard_normal(m) * scale / np.abs(A).max(initial=1e-3)
+    return QP(
+        P=P, q=-(P @ x + A.T @ y + z), A=A if m else no_rows(n), b=A @ x,
+        G=no_rows(n), h=np.zeros(0), lb=lb, ub=ub,
+    )  # fmt: skip
+
+
+def ends(name, seeds):
+    """Solve; return how many runs gave up, of how many, and what was claimed wrongly."""
+    given_up, runs, wrong = 0, 0, []
+    for seed in seeds:
+        qp = hostile(seed)
+        for tol in TOLERANCES:
+            s = SOLVERS[name].prepare(qp, tol)()
+            runs += 1
+            if s.status is not Status.SOLVED:
+                given_up += s.status is Status.ITERATION_LIMIT
+                wrong += [(seed, tol)] * (s.status is Status.INFEASIBLE)
+            elif not kkt_residuals(qp, s).worst <= 10 * tol:
+                wrong.append((seed, tol))
+    return given_up, runs, wrong
+
+
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed"])
+def test_nothing_is_claimed_wrongly(name):
+    given_up, runs, wrong = ends(name, range(1000, 1060))
+
+    assert wrong == []
+    assert given_up <= 0.02 * runs
+
+
+@pytest.mark.slow
+def test_of_2100_runs_one_in_two_hundred_gives_up_at_most():
+    given_up, runs, wrong = ends("smalbe", range(700))
+
+    assert runs == 2100
+    assert wrong == []
+    assert given_up <= 0.005 * runs
