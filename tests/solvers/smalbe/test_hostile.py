@@ -47,7 +47,7 @@ def hostile(seed):
 
 
 def ends(name, seeds):
-    """Solve; return how many runs gave up, of how many, and what was claimed wrongly."""
+    """Return how many runs gave up, of how many, and what was claimed wrongly."""
     given_up, runs, wrong = 0, 0, []
     for seed in seeds:
         qp = hostile(seed)
