@@ -177,7 +177,9 @@ class Registries:
         from solvers.common.libraries import PACKAGES
 
         if ONE_THREAD.items() <= os.environ.items():
-            return capture(self.files, PACKAGES)
+            here = capture(self.files, PACKAGES)
+            if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
+                return here  # or they were set when libraries were loaded already
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:

@@ -41,6 +41,8 @@ BLAS_LIBRARIES = (
     ("libflexiblas", "FlexiBLAS"), ("libatlas", "ATLAS"), ("libsatlas", "ATLAS"),
     ("libblas", "reference BLAS"),
 )  # fmt: skip
+#: whose thread pools what we measure with calls
+OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
 CHOLMOD_OWNERS = ("system", "scikit_sparse")  #: whose libraries CHOLMOD may call
 
 VOLATILE = ("now",)  #: the parts of an environment that its digest leaves out
@@ -64,8 +66,10 @@ def capture(
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
+    # others may be loaded, too: plug-ins' libraries, or those of a notebook
     pools = sorted(
-        map(_pool, threadpool_info()), key=lambda p: (p["library"], p["owner"])
+        (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
+        key=lambda p: (p["library"], p["owner"]),
     )
     mapped = mapped_libraries()
     return {
