@@ -73,7 +73,7 @@ def write_report(
     return written
 
 
-def answer(directory: Path, factor: float = VERIFIED_FACTOR) -> list[str]:
+def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
     """Say per form who was fastest, by how much, and who failed: a line per sentence.
 
     The sentences are those that the report of the folder opens with.
@@ -86,7 +86,7 @@ def answer(directory: Path, factor: float = VERIFIED_FACTOR) -> list[str]:
         For a folder that holds no measurements.
 
     """
-    evidence = read_evidence(directory, factor)
+    evidence = read_evidence(Path(directory), factor)
     groups = all_groups(evidence)
     rankings = [ranking_of(group) for group in groups if group.comparable]
     answers = answers_of(evidence)
