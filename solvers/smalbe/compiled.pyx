@@ -16,6 +16,7 @@ Between two products a step makes three passes over its vectors. Its loops
 over vectors are in `vectors.h`.
 """
 
+from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dgemv, dsymv
@@ -104,6 +105,10 @@ cdef class Product:
             vector = told
             memcpy(&vector[0], v, self.n * sizeof(double))
             result = np.ascontiguousarray(self.matrix @ told, dtype=float)
+            if result.shape[0] != self.n:
+                raise ValueError(
+                    f"P @ v has {result.shape[0]} components; expected {self.n}"
+                )
             memcpy(y, &result[0], self.n * sizeof(double))
             if s != 1:
                 scale(s, y, self.n)
@@ -280,7 +285,7 @@ cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
 
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
 cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
-cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is
+cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
     NEWTON_STEPS = 100
@@ -637,18 +642,14 @@ cdef class Solver:
         move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
              self.n)
 
-    cdef int step_by_model(self) except -1:
-        """Minimise the model over the box, then the cost along that step.
+    cdef double searched(self, double *s, double *Hs) except? -1:
+        """Find the length along s of the least cost, in the box where 1 is not beyond.
 
-        0 where there is nothing to gain, or the cost falls without end.
+        0 for s = 0, inf where the cost falls without end. It turns s round, so that
+        x − αs is where it leads, and leaves its `lengths` in `told`; one product.
         """
         cdef Py_ssize_t i, n = self.n
-        cdef double *s = &self.s[0]
-        cdef double *Hs = &self.Hs[0]
-        cdef double length
         cdef bint moves = False
-        self.step_of_model(self.B, &self.x[0], &self.g[0], &self.lower[0],
-                           &self.upper[0], s)
         for i in range(n):
             moves = moves or s[i] != 0
         if not moves:
@@ -658,8 +659,21 @@ cdef class Solver:
         scale(-1.0, Hs, n)
         lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
                 &self.told[0])
-        length = fmin(self.told[0], fmax(1.0, self.told[1]))
-        if isinf(length):
+        return fmin(self.told[0], fmax(1.0, self.told[1]))
+
+    cdef int step_by_model(self) except -1:
+        """Minimise the model over the box, then the cost along that step.
+
+        0 where there is nothing to gain, or the cost falls without end.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef double *s = &self.s[0]
+        cdef double *Hs = &self.Hs[0]
+        cdef double length
+        self.step_of_model(self.B, &self.x[0], &self.g[0], &self.lower[0],
+                           &self.upper[0], s)
+        length = self.searched(s, Hs)
+        if length == 0 or isinf(length):
             return 0
         if self.told[0] < 1:
             self.B = self.raised(self.B, s, dot(s, Hs, n))
@@ -722,7 +736,7 @@ cdef class Solver:
         cdef double *lower = &self.box_lower[0]
         cdef double *upper = &self.box_upper[0]
         cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
-        cdef bint held, moves = False, release = is_first and self.B.k > 0
+        cdef bint held, release = is_first and self.B.k > 0
         change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
         self.to(feasible, p, Hp)
         for i in range(n):
@@ -741,16 +755,9 @@ cdef class Solver:
         if dot(&self.g[0], s, n) >= 0:
             beyond = 0.0
             self.step_of_model(self.B, &self.x[0], &self.g[0], lower, upper, s)
-        for i in range(n):
-            moves = moves or s[i] != 0
-        if not moves:
+        length = self.searched(s, Hs)
+        if length == 0:
             return b"e"
-        self.H(s, Hs)
-        scale(-1.0, s, n)
-        scale(-1.0, Hs, n)
-        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
-                &self.told[0])
-        length = fmin(self.told[0], fmax(1.0, self.told[1]))
         if isinf(length):
             return 0
         if -self.told[2] + 0.5 * self.told[3] + change < 0:
@@ -779,6 +786,7 @@ cdef class Solver:
         self.enter_face()
         memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
         while True:
+            PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
                 return 1
             if steps >= most:

@@ -67,6 +67,15 @@ def test_a_product_is_the_product_and_is_counted(seed, kind):
     assert P.count == 2
 
 
+def test_a_product_of_another_length_is_refused():
+    class Short(Operator):
+        def __matmul__(self, v):
+            return (self._P @ v)[:-1]
+
+    with pytest.raises(ValueError, match="4 components; expected 5"):
+        compiled.Product(Short(np.eye(5)), 5)(np.ones(5))
+
+
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_a_product_with_any_layout(order):
     W = np.random.default_rng(271828).standard_normal((17, 17))
