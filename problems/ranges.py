@@ -86,6 +86,17 @@ def fits(family: str, components: int) -> None:
         )
 
 
+def fits_dense(family: str, n: int) -> None:
+    """Raise InputError for a full matrix of n² numbers that cannot fit into memory."""
+    needed, limit = 8 * n**2 / 2**20, case_limit_mib()
+    if needed > limit:
+        raise InputError(
+            f"{family}: a full matrix of {n} rows takes {needed:.2g} MiB of memory; "
+            f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
+            "what there is"
+        )
+
+
 def one_of(
     family: str, params: Mapping[str, Value], known: Mapping[str, tuple[Value, ...]]
 ) -> None:

@@ -24,7 +24,6 @@ Their load is therefore smaller unless it is set.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,6 +45,7 @@ from problems.duality.case_forms import contact_case
 from problems.duality.stepping import primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
+from problems.models.line_contact import LineContact
 
 RADIUS = 8e-3  #: m
 MATERIAL = Material(E=200e9, nu=0.3)
@@ -53,29 +53,6 @@ UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
 GROWTH = 1.15  #: of neighbouring cells away from the contact
 UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
-
-
-@dataclass(frozen=True)
-class LineContact:
-    """Hertz's solution for a force per thickness."""
-
-    P: float  #: N/m
-    R: float  #: relative radius, m
-    E_star: float  #: contact modulus, Pa
-
-    @property
-    def a(self) -> float:
-        """Half width of the contact, m."""
-        return float(np.sqrt(4 * self.P * self.R / (np.pi * self.E_star)))
-
-    @property
-    def p0(self) -> float:
-        """Peak pressure, Pa."""
-        return 2 * self.P / (np.pi * self.a)
-
-    def pressure(self, x: Vector) -> Vector:
-        """Return p(x), Pa; zero outside the contact."""
-        return np.asarray(self.p0 * np.sqrt(np.maximum(1 - (x / self.a) ** 2, 0)))
 
 
 def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:

@@ -8,7 +8,8 @@ from scipy.integrate import quad
 
 from harness import InputError, kkt_residuals
 from problems.families.hertz import HertzCylinder, HertzPlane
-from problems.models.hertz import LineContact, two_cylinders
+from problems.models.hertz import two_cylinders
+from problems.models.line_contact import LineContact
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
