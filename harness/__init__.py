@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from harness.errors import InputError
     from harness.limits import memory_limit_mib, too_large
-    from harness.mechanics import Grid, Mechanics
+    from harness.mechanics import Friction, Grid, Mechanics
     from harness.plugin import (
         About,
         Case,
@@ -34,6 +34,7 @@ _MODULES = {
     "Chained": "harness.plugin",
     "Family": "harness.plugin",
     "Fields": "harness.plugin",
+    "Friction": "harness.mechanics",
     "Grid": "harness.mechanics",
     "InputError": "harness.errors",
     "Matrix": "harness.qp",
@@ -74,6 +75,7 @@ __all__ = [
     "Chained",
     "Family",
     "Fields",
+    "Friction",
     "Grid",
     "InputError",
     "Matrix",

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from harness import QP, Fields, Solution, Vector
+from harness import QP, Fields, Friction, Solution, Vector
+from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
@@ -15,18 +17,22 @@ from problems.fem.stress import centre_stress, recover, von_mises
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
 
-def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
+def quantities(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> dict[str, Any]:
     """Report counts, energy, contact forces and stresses.
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
-    its slave where the master is rigid), −ΣBᵀλ, N/m. max_von_mises: per body, of the
-    patch-recovered stress, Pa.
+    its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
+    max_von_mises: per body, of the patch-recovered stress, Pa. With friction those of
+    `frictional`, too.
     """
     l, F = bodies.length, bodies.force
     slave, master = bodies.pairs[0]
     side = master if master.size else slave
     held = bodies.body_of_node == bodies.body_of_node[side[0]]
-    forces = contact_forces(bodies, primal, s)
+    forces = contact_forces(bodies, primal, s, friction)
+    normal = s.z[: primal.h.size]
     stress = nodal_stresses(bodies, s.x * l)["von_mises"]
     return {
         "nodes": len(bodies.mesh.points),
@@ -34,18 +40,59 @@ def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
         "dofs": bodies.mesh.dofs,
         "equality_rows": primal.b.size,
         "contact_rows": primal.h.size,
-        "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
+        "active": int(_active(normal).sum()),
         "energy": primal.objective(s.x) * F * l,
         "contact_force": forces[held].sum(axis=0).tolist(),
-        "multiplier_sum": float(s.z.sum() * F),
+        "multiplier_sum": float(normal.sum() * F),
         "max_von_mises": {
             name: float(stress[bodies.body_of_node == b].max())
             for b, name in enumerate(bodies.names)
         },
-    }
+    } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
 
 
-def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
+def frictional(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction
+) -> dict[str, Any]:
+    """Report what friction does.
+
+    open, stick, slip: numbers of rows of pairs with friction, which are not active, or
+    active and below the bound, or at it. friction_residual: ‖g − mu·λ_n‖/‖g‖ of
+    Coulomb's law, 0 of Tresca's. dissipation: Σ g|Tu − s|, the work of the friction in
+    this step, J/m.
+    """
+    state = states(primal, s, friction)
+    slip = friction.T @ s.x - friction.start
+    return {
+        **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
+        "friction_residual": friction.residual(s.z[: primal.h.size]),
+        "dissipation": float(friction.bound @ np.abs(slip))
+        * bodies.force * bodies.length,
+    }  # fmt: skip
+
+
+def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
+    """Tell of each friction row (k,) whether its contact is open, sticks or slips.
+
+    An active row slips where its slip is larger than what the rest of its bound would
+    bring about on the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
+    """
+    normal, tangential = np.split(s.z, [primal.h.size])
+    diagonal = csr_array(primal.P).diagonal()
+    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
+    slip = np.abs(friction.T @ s.x - friction.start)
+    sticks = (friction.bound - np.abs(tangential)) * softness > slip
+    closed = _active(normal)[friction.row]
+    return np.where(closed, np.where(sticks, "stick", "slip"), "open")
+
+
+def _active(normal: Vector) -> NDArray[np.bool_]:
+    return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
+
+
+def fields(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> Fields:
     """Collect the deformed state for pictures."""
     u = s.x * bodies.length
     slaves = np.concatenate([pair.slave for pair in bodies.pairs])
@@ -56,13 +103,16 @@ def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
         displacement=as_vectors(u),
         nodal=nodal_stresses(bodies, u),
         contact_nodes=slaves,
-        contact_forces=contact_forces(bodies, primal, s)[slaves],
+        contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
     )
 
 
-def contact_forces(bodies: Bodies, primal: QP, s: Solution) -> NDArray[np.float64]:
-    """Return the contact forces −Bᵀλ on the nodes (N, 2), N/m."""
-    return as_vectors(-(primal.G.T @ s.z) * bodies.force)
+def contact_forces(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> NDArray[np.float64]:
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, 2), N/m."""
+    B, _ = contact_rows(primal, friction)
+    return as_vectors(-(B.T @ s.z) * bodies.force)
 
 
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import QP, Case, Solution, Value, Vector
+from harness import QP, Case, Solution, Value, Vector, no_rows
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -153,7 +153,10 @@ def above_plane(mesh: Mesh) -> ContactRows:
     arc = mesh.boundaries["arc"]
     one = np.full(arc.size, -1.0)
     B = csr_array((one, (np.arange(arc.size), 2 * arc + 1)), (arc.size, mesh.dofs))
-    return ContactRows(B, mesh.points[arc, 1])
+    return ContactRows(
+        B, mesh.points[arc, 1], no_rows(mesh.dofs), np.zeros(0, dtype=np.int64),
+        nodal_lengths(mesh.points[arc]), np.arange(arc.size),
+    )  # fmt: skip
 
 
 def pressed(mesh: Mesh, flat: Nodes, P: float) -> Vector:
