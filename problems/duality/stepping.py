@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -82,6 +83,13 @@ class ContactProblem:
         return self._solution.x[-m - k :][:m]
 
 
+class State(NamedTuple):
+    """Where a load step begins."""
+
+    u: Vector  #: (n,) displacement, right on the contact sides
+    pressed: Vector  #: (places,) normal force of each slave node
+
+
 @dataclass(frozen=True, eq=False)
 class LoadPath:
     """The load steps of one analysis; what was solved once is remembered.
@@ -104,6 +112,7 @@ class LoadPath:
     transform: Transform = dual_bounds
     laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
     quasi_static: bool = True  #: whether slip is that of the step
+    begin: State | None = None  #: before the first step; none: at rest, without forces
     _steps: list[list[ContactProblem]] = field(default_factory=list)  #: 1, 2, …
 
     def primal(self, k: int) -> QP:
@@ -126,6 +135,21 @@ class LoadPath:
             )
         return sequence[iterate - 1]
 
+    def iterates(self, k: int) -> int:
+        """Count the problems of the fixed point of step k; 1 without Coulomb's law."""
+        self.problem(k)
+        return len(self._steps[k - 1])
+
+    def state(self, k: int) -> State:
+        """Return what step k leaves to the next one; for k = 0 what it begins from."""
+        if k:
+            last = self.problem(k)
+            return State(last.on_sides, self._pressed(last))
+        if self.begin is not None:
+            return self.begin
+        places = sum(pair.slave.size for pair in self.bodies.pairs)
+        return State(np.zeros(self.bodies.mesh.dofs), np.zeros(places))
+
     def answer(self, k: int) -> Solution:
         """Return the solution of the primal problem of step k (1 … steps)."""
         return self.problem(k).answer
@@ -136,11 +160,7 @@ class LoadPath:
 
     def _posed(self, k: int) -> list[ContactProblem]:
         """Pose step k from the one before: the problems of its last fixed point."""
-        u = np.zeros(self.bodies.mesh.dofs)
-        pressed = np.zeros(sum(pair.slave.size for pair in self.bodies.pairs))
-        if k > 1:
-            last = self._steps[k - 2][-1]
-            u, pressed = last.on_sides, self._pressed(last)
+        u, pressed = self.state(k - 1)
         before = u if self.quasi_static else np.zeros_like(u)
         for _ in range(self.relin - 1):
             *_, last = self._fixed_point(u, k, before, pressed)

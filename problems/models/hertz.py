@@ -27,9 +27,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from harness import QP, Case, Solution, Value, Vector, no_rows
+from harness import QP, Case, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -41,6 +40,7 @@ from problems.contact.bodies import (
 from problems.contact.linearise import linearisation
 from problems.contact.node_to_segment import ContactRows
 from problems.contact.results import contact_forces, quantities
+from problems.contact.rigid_plane import above_plane
 from problems.duality.case_forms import contact_case
 from problems.duality.stepping import primal_qp
 from problems.fem.elasticity import Material, Plane
@@ -69,7 +69,7 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    return _case(bodies, above_plane(mesh), form, exact)
+    return _case(bodies, above_plane(mesh, mesh.boundaries["arc"]), form, exact)
 
 
 def cylinder_on_cylinder(form: str, params: Mapping[str, Value]) -> Case:
@@ -146,17 +146,6 @@ def halved(x: Vector, times: int) -> Vector:
     """Insert the midpoints of an increasing sequence, so many times."""
     places = np.arange(x.size)
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
-
-
-def above_plane(mesh: Mesh) -> ContactRows:
-    """Keep the nodes of the arc above the rigid plane y = 0:  −u_y ≤ y, exactly."""
-    arc = mesh.boundaries["arc"]
-    one = np.full(arc.size, -1.0)
-    B = csr_array((one, (np.arange(arc.size), 2 * arc + 1)), (arc.size, mesh.dofs))
-    return ContactRows(
-        B, mesh.points[arc, 1], no_rows(mesh.dofs), np.zeros(0, dtype=np.int64),
-        nodal_lengths(mesh.points[arc]), np.arange(arc.size),
-    )  # fmt: skip
 
 
 def pressed(mesh: Mesh, flat: Nodes, P: float) -> Vector:
