@@ -143,6 +143,20 @@ def without_friction(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
+def tangential(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak: parts of μP, no sliding."""
+    Q, peak = float(params["Q"]), float(params["peak"])
+    if not 0 < peak < 1:
+        key = "Q" if peak == Q else "peak"
+        raise InputError(
+            f"{family}: {key}={params[key]} must be between 0 and 1, a part of μP"
+        )
+    if abs(Q) > peak:
+        raise InputError(
+            f"{family}: Q={params['Q']} must be between -peak and peak={params['peak']}"
+        )
+
+
 def one_of(
     family: str, params: Mapping[str, Value], known: Mapping[str, tuple[Value, ...]]
 ) -> None:

@@ -113,7 +113,8 @@ class LoadPath:
     laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
     quasi_static: bool = True  #: whether slip is that of the step
     begin: State | None = None  #: before the first step; none: at rest, without forces
-    _steps: list[list[ContactProblem]] = field(default_factory=list)  #: 1, 2, …
+    #: 1, 2, …
+    _steps: list[list[ContactProblem]] = field(default_factory=list, init=False)
 
     def primal(self, k: int) -> QP:
         """Emit the QP of step k (1 … steps), as last linearised, without friction."""

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from harness import Family, InputError
-from problems.ranges import at_least, fits_dense, one_of
+from problems.ranges import at_least, fits_dense, one_of, tangential
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
@@ -36,7 +36,13 @@ class HalfPlane(Family):
         at_least(2, self.name, params, ("n",))
         fits_dense(self.name, int(params["n"]))
         one_of(self.name, params, {"law": ("hertz", "cattaneo")})
-        check_tangential(self.name, params, needed=params["law"] == "cattaneo")
+        if params["law"] == "cattaneo":
+            tangential(self.name, params)
+        elif key := next((key for key in ("Q", "peak") if params[key]), ""):
+            raise InputError(
+                f"{self.name}: {key}={params[key]} needs law=cattaneo; law=hertz has "
+                "no tangential force"
+            )
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -47,26 +53,3 @@ class HalfPlane(Family):
         del form, reference
         self.check(params)
         return half_planes(params)
-
-
-def check_tangential(family: str, params: Mapping[str, Value], *, needed: bool) -> None:
-    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak, or both are zero.
-
-    needed : whether there must be a tangential force; if not, there must be none
-    """
-    Q, peak = float(params["Q"]), float(params["peak"])
-    if not needed and (Q or peak):
-        key = "Q" if Q else "peak"
-        raise InputError(
-            f"{family}: {key}={params[key]} needs law=cattaneo; law=hertz has no "
-            "tangential force"
-        )
-    if needed and not 0 < peak < 1:
-        key = "Q" if peak == Q else "peak"
-        raise InputError(
-            f"{family}: {key}={params[key]} must be between 0 and 1, a part of μP"
-        )
-    if abs(Q) > peak:
-        raise InputError(
-            f"{family}: Q={params['Q']} must be between -peak and peak={params['peak']}"
-        )

@@ -142,7 +142,8 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)
-        c = exact.stick_half_width(float(force @ (x**2 + width**2 / 12)))
+        moment = float(force @ (x**2 + width**2 / 12))
+        c = exact.stick_half_width(moment, EXACT.P * EXACT.a**2 / 4)
         next_to = slice((n - 1) // 2, n // 2 + 1)
         centre, at_centre = (float(v[next_to].mean()) for v in (q, mindlin))
         slips = np.abs(s.x) >= bound * (1 - ACTIVE)

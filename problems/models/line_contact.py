@@ -83,7 +83,7 @@ class TangentialContact:
     @property
     def c(self) -> float:
         """Half width of the part that sticks, m: c, or c′ when unloading."""
-        return self.normal.a * self.semicircles[-1][1]
+        return float(self.normal.a * self.semicircles[-1][1])
 
     def traction(self, x: Vector) -> Vector:
         """Return q(x), Pa."""
@@ -95,16 +95,16 @@ class TangentialContact:
         s, P = x / self.normal.a, self.mu * self.normal.P
         return np.asarray(P * sum(w * _share(s / c) for w, c in self.semicircles))
 
-    def stick_half_width(self, moment: float) -> float:
-        """Return c, m, of a traction with this ∫x²q dx, N·m.
+    def stick_half_width(self, shear: float, pressure: float) -> float:
+        """Return c, m, of a traction with the moments ∫x²q dx and ∫x²p dx, N·m.
 
-        While loading  ∫x²q = μPa²/4 (1 − (c/a)⁴).  When unloading, the traction before
-        is taken for exact. Where no c gives the moment, the nearest is returned.
+        While loading  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  When unloading,
+        the traction before is taken for exact. Where no c gives the moment, the nearest
+        is returned.
         """
-        unit = self.mu * self.normal.P * self.normal.a**2 / 4
         *known, (w, c) = self.semicircles
-        rest = moment / unit - sum(v * d**2 for v, d in known)
-        return self.normal.a * float(np.clip(rest * c**2 / w, 0, 1) ** 0.25)
+        rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in known)
+        return float(self.normal.a * np.clip(rest * c**2 / w, 0, 1) ** 0.25)
 
 
 def _root(s: Vector) -> Vector:
