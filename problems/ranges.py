@@ -17,18 +17,18 @@ CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 #: values of the keys that choose the method; node-to-segment takes no notice of basis
 METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
 PLANES = {"plane": ("strain", "stress")}
+#: the keys of friction with their defaults; -1 is no bound and no mu
+LAW: Mapping[str, Value] = {
+    "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static"
+}  # fmt: skip
+FRICTION: Mapping[str, Value] = {**LAW, "iterate": 0}
 #: what the name of a case of bodies may set, with the value where its file says nothing
 SETTINGS: Mapping[str, Value] = {
-    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
-}  # fmt: skip
-#: the keys of friction and their values where a name says nothing; below zero there is
-#: no bound and no mu
-FRICTION: Mapping[str, Value] = {
-    "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static",
-    "iterate": 0,
+    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1, **LAW
 }  # fmt: skip
 #: the laws of friction, each with the key that it needs
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
+LOADINGS = {"loading": ("quasi-static", "static")}
 NEEDED = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
@@ -103,29 +103,25 @@ def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) 
 
     elsewhere : whether pairs of sides may have laws of their own
     """
-    one_of(family, params, {
-        "friction": tuple(LAWS), "loading": ("quasi-static", "static")
-    })  # fmt: skip
+    one_of(family, params, {"friction": tuple(LAWS), **LOADINGS})
     law = str(params["friction"])
     for key, what in NEEDED.items():
         value = float(params[key])
         if key != LAWS[law] and value != FRICTION[key]:
+            (user,) = (other for other, needed in LAWS.items() if needed == key)
             raise InputError(
-                f"{family}: {key}={params[key]} is not used by friction={law}; "
-                f"expected no {key}" + "".join(
-                    f", or friction={other}" for other, k in LAWS.items() if k == key
-                )
-            )  # fmt: skip
-        if key == LAWS[law] and value == FRICTION[key] and not elsewhere:
-            raise InputError(
-                f"{family}: friction={law} needs {key}; expected {key}=, {what}"
+                f"{family}: {key}={value:g} is not used by friction={law}; expected "
+                f"no {key}, or friction={user}"
             )
+        if key == LAWS[law] and value == FRICTION[key] and not elsewhere:
+            raise InputError(f"{family}: friction={law} needs {key}, {what}")
         if value != FRICTION[key] and not (value == 0 or LEAST <= value <= MOST):
-            raise InputError(f"{family}: {key}={params[key]}; expected {what}")
+            raise InputError(f"{family}: {key}={value:g}; expected {what}")
     at_least(0, family, params, ("iterate",))
     if law == "none" and not elsewhere and params["loading"] != FRICTION["loading"]:
         raise InputError(
-            f"{family}: loading={params['loading']} is not used by friction=none"
+            f"{family}: loading={params['loading']} is not used by friction=none; "
+            "expected no loading, or friction=tresca or friction=coulomb"
         )
     if law != "coulomb" and not elsewhere and params["iterate"]:
         raise InputError(

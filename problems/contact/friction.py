@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from harness import Friction, Vector
+from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import Bodies
 from problems.contact.node_to_segment import ContactRows
 
@@ -68,6 +69,8 @@ def friction_of(
         friction by
 
     """
+    if not rows.row.size:
+        return NO_FRICTION
     owner = np.repeat(np.arange(len(laws)), [pair.slave.size for pair in bodies.pairs])
     place = rows.place[rows.row]
     bound, mu = (

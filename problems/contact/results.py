@@ -74,14 +74,14 @@ def frictional(
 def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     """Tell of each friction row (k,) whether its contact is open, sticks or slips.
 
-    An active row slips where its slip is larger than what the rest of its bound would
-    bring about on the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
+    An active row sticks up to the slip that the rest of its bound would bring about on
+    the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
     """
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
     slip = np.abs(friction.T @ s.x - friction.start)
-    sticks = (friction.bound - np.abs(tangential)) * softness > slip
+    sticks = (friction.bound - np.abs(tangential)) * softness >= slip
     closed = _active(normal)[friction.row]
     return np.where(closed, np.where(sticks, "stick", "slip"), "open")
 

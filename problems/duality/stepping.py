@@ -33,11 +33,10 @@ from harness import (
     Vector,
     kkt_residuals,
 )
-from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import Bodies
 from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.node_to_segment import ContactRows
-from problems.duality.dualisation import Transformed, bounded, dual_bounds
+from problems.duality.dualisation import Transformed, bounded, dual_bounds, dualise
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import Nodes
 
@@ -179,9 +178,7 @@ class LoadPath:
         rows = self.linearise(u * self.bodies.length)
         primal = primal_qp(self.bodies, rows, k / self.steps)
         coulomb = any(law.mu for law in self.laws)
-        first = NO_FRICTION
-        if rows.row.size:
-            first = friction_of(self.bodies, rows, self.laws, before, pressed)
+        first = friction_of(self.bodies, rows, self.laws, before, pressed)
 
         @cache
         def dual() -> Transformed:
@@ -227,6 +224,35 @@ class LoadPath:
     def _free(self) -> Vector:
         """K⁺f: the full load without contact."""
         return self.inverse(self.bodies.f)
+
+
+def single_load(
+    bodies: Bodies,
+    linearise: Linearise,
+    laws: tuple[FrictionLaw, ...],
+    *,
+    factorise: Callable[[], GeneralisedInverse],
+    reference: Reference,
+    steps: int = 1,
+    iterate: int = 0,
+) -> tuple[QP, Friction]:
+    """Pose the first load step of bodies that contact alone may hold.
+
+    factorise : K with its rigid modes; called where Coulomb's law needs solutions
+    steps, iterate : as of `LoadPath`
+    """
+    if any(law.mu for law in laws):
+        path = LoadPath(
+            bodies, linearise, factorise(), reference, steps,
+            transform=dualise, laws=laws,
+        )  # fmt: skip
+        problem = path.problem(1, iterate)
+        return problem.primal, problem.friction
+    at_rest = np.zeros(bodies.mesh.dofs)
+    rows = linearise(at_rest)
+    pressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
+    friction = friction_of(bodies, rows, laws, at_rest, pressed)
+    return primal_qp(bodies, rows, 1 / steps), friction
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
