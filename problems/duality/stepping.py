@@ -12,7 +12,7 @@ With friction, slip is that of the load step (``quasi-static``: T(u − u_prev),
 depends on the path), or of the whole load at once (``static``: T u). Coulomb's law is
 the fixed point of problems with a given bound, g ← mu·λ_n from the solution of the one
 before on; each linearisation is settled, and the emitted QP is the last of its last. It
-begins from the normal forces that are known, none in the first step.
+begins from the normal forces of the step before, in the first one without friction.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ class LoadPath:
     ArithmeticError
         When a reference solve is not accurate.
     InputError
-        When a fixed point of Coulomb's law does not settle, or has less iterates.
+        When a fixed point of Coulomb's law does not settle, has less iterates, or comes
+        to bounds that hold no equilibrium.
 
     """
 
@@ -111,7 +112,9 @@ class LoadPath:
     transform: Transform = dual_bounds
     laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
     quasi_static: bool = True  #: whether slip is that of the step
-    begin: State | None = None  #: before the first step; none: at rest, without forces
+    #: normal force of each slave node that the very first bound of Coulomb's law is of
+    pressed: float = 0.0
+    begin: State | None = None  #: where the first step begins; none: at rest
     #: 1, 2, …
     _steps: list[list[ContactProblem]] = field(default_factory=list, init=False)
 
@@ -147,8 +150,8 @@ class LoadPath:
             return State(last.on_sides, self._pressed(last))
         if self.begin is not None:
             return self.begin
-        places = sum(pair.slave.size for pair in self.bodies.pairs)
-        return State(np.zeros(self.bodies.mesh.dofs), np.zeros(places))
+        rest = np.zeros(self.bodies.mesh.dofs)
+        return State(rest, np.full(self._places, self.pressed))
 
     def answer(self, k: int) -> Solution:
         """Return the solution of the primal problem of step k (1 … steps)."""
@@ -192,7 +195,14 @@ class LoadPath:
             found.append(ContactProblem(primal, friction, rows.place, dual, solve))
             if not coulomb:
                 return found
-            normal = found[-1].normal
+            try:
+                normal = found[-1].normal
+            except ArithmeticError as e:
+                raise InputError(
+                    f"load step {k}: no equilibrium was found with the {len(found)}. "
+                    "bound of Coulomb's law; expected supports or friction that hold "
+                    f"the bodies: {e}"
+                ) from None
             residuals.append(friction.residual(normal))
             if residuals[-1] <= SETTLED:
                 return found
@@ -205,9 +215,13 @@ class LoadPath:
             f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
         )
 
+    @property
+    def _places(self) -> int:
+        return sum(pair.slave.size for pair in self.bodies.pairs)
+
     def _pressed(self, problem: ContactProblem) -> Vector:
         """Return the normal force (places,) of each slave node; zero without a row."""
-        force = np.zeros(sum(pair.slave.size for pair in self.bodies.pairs))
+        force = np.zeros(self._places)
         force[problem.place] = np.maximum(problem.normal, 0.0)
         return force
 
@@ -238,13 +252,16 @@ def single_load(
 ) -> tuple[QP, Friction]:
     """Pose the first load step of bodies that contact alone may hold.
 
+    As friction may have to hold them, Coulomb's fixed point begins at bounds that let
+    it: each node is taken to be pressed by the whole load.
+
     factorise : K with its rigid modes; called where Coulomb's law needs solutions
     steps, iterate : as of `LoadPath`
     """
     if any(law.mu for law in laws):
         path = LoadPath(
             bodies, linearise, factorise(), reference, steps,
-            transform=dualise, laws=laws,
+            transform=dualise, laws=laws, pressed=float(np.abs(bodies.f).sum()),
         )  # fmt: skip
         problem = path.problem(1, iterate)
         return problem.primal, problem.friction
