@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,10 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from harness import Verdict
 from harness.files.qpfile import load_qp
+from harness.names import parse
 from harness.processes.reaper import lives
-from harness.registry import load_plugin
+from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
+from harness.verify.verdicts import new_record
+from mortarbench import progress
 from mortarbench.cli.main import main
 from mortarbench.progress import shown_on
 from mortarbench.registries import Registries
@@ -722,6 +727,38 @@ def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
 
     assert "1/7" in terminal.getvalue()
     assert "osqp on [red]/primal" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
+def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
+    """Also one whose measurements take long, and that goes on with an earlier run."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(width))
+    now = [0.0]
+    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    case = "beam-ring/Nr=30/Nh=15/step=7/contact=mortar/basis=standard/dual"
+    record = new_record(
+        parse("well/n=2/primal", FAMILIES),
+        SolverSpec(name="exact", label="exact"),
+        options={}, tol=1e-8, repeat=0, environment="here",
+    ).but(verdict=Verdict.VERIFIED)  # fmt: skip
+
+    with shown_on(terminal) as bar:
+        bar.start(1234)
+        for _ in range(1000):
+            bar.advance(None)
+        bar.say(f"{case}, tol 1e-08, repeat 3")
+        now[0] = 100.0
+        bar.advance(record)
+        terminal.truncate(terminal.seek(0))
+
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal.getvalue())
+    lines = [line for line in re.split(r"[\r\n]+", shown) if line.strip()]
+    assert lines
+    assert all(len(line) <= width for line in lines)
+    assert all("1001/1234 6:28:20 left beam" in line for line in lines)
 
 
 def test_the_module_is_the_same_command_from_any_folder(tmp_path):

@@ -326,16 +326,18 @@ def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
 
 
 @pytest.mark.parametrize(
-    ("done", "total", "seconds", "said"),
+    ("measured", "to_do", "seconds", "said"),
     [
         (0, 9, 1.0, ""),
-        (9, 9, 1.0, ""),
-        (1, 61, 60.0, "1:00:00 left"),
-        (2, 4, 7, "0:00:07 left"),
+        (9, 0, 1.0, ""),
+        (1, 60, 60.0, "1:00:00 left"),
+        (2, 2, 7, "0:00:07 left"),
     ],
 )
-def test_what_is_left_takes_as_long_as_what_is_done(done, total, seconds, said):
-    assert remaining(done, total, seconds) == said
+def test_what_is_left_takes_as_long_as_what_was_measured(
+    measured, to_do, seconds, said
+):
+    assert remaining(measured, to_do, seconds) == said
 
 
 def test_a_case_built_in_many_threads_is_the_one_that_was_measured(tmp_path):
