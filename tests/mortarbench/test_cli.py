@@ -692,7 +692,8 @@ def test_a_plugin_that_changed_is_another_environment(cli, pit, tmp_path):
 
     assert (first, code) == (0, 2)
     assert "another environment" in err
-    assert ": plugins.plug.py changed); choose another --out or use --fresh" in err
+    assert ": content of the plug-in plug.py: " in err
+    assert " now); choose another --out or use --fresh" in err
 
 
 @pytest.mark.parametrize(("load", "lines"), [(0.4, 0), (0.6, 1)])
