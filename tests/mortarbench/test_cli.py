@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
 from harness.verify.verdicts import new_record
 from mortarbench import progress
+from mortarbench.cli import main as main_module
 from mortarbench.cli.main import main
 from mortarbench.progress import shown_on
 from mortarbench.registries import Registries
@@ -578,6 +580,23 @@ def test_help_is_no_error(cli, capsys):
 
     assert e.value.code == 0
     assert "--memory-limit MIB" in capsys.readouterr().out
+
+
+def test_the_version_is_that_of_the_package(cli, capsys):
+    with pytest.raises(SystemExit) as e:
+        cli("--version")
+
+    assert e.value.code == 0
+    assert capsys.readouterr().out == f"mortarbench {version('mortarbench')}\n"
+
+
+def test_every_command_and_option_says_what_it_is_for(capsys):
+    parser = main_module._parser()
+    (commands,) = parser._subparsers._group_actions
+    for name, command in commands.choices.items():
+        assert command.description, name
+        assert all(action.help for action in command._actions), name
+    assert {c.dest for c in commands._choices_actions} == set(commands.choices)
 
 
 PLUGIN = """

@@ -89,12 +89,17 @@ def test_an_answer_is_drawn_and_written_for_paraview(answer, tmp_path):
         answer.plot(tmp_path / "a.txt")
 
 
+def test_an_answer_shows_no_options_that_are_the_defaults(answer):
+    assert "solver                    smalbe\n" in repr(answer)
+
+
 def test_options_are_those_asked_for_and_history_can_be_left_out():
     case = mb.build(SMALL)
     few = mb.solve(case, "smalbe", options={"max_steps": 3, "history": False})
 
     assert few.verdict is Verdict.ITERATION_LIMIT
     assert few.record.options["max_steps"] == 3
+    assert "solver                    smalbe (max_steps=3)\n" in repr(few)
     assert few.history == {}
     with pytest.raises(mb.InputError, match="smalbe: unknown option 'max_step'"):
         mb.solve(case, "smalbe", options={"max_step": 3})
@@ -227,6 +232,7 @@ def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
     [
         ["--help"],
         ["run", "--help"],
+        ["--version"],
         ["list", "solvers"],
         ["list", "problems", "--json"],
         ["list", "suites"],
