@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.environment.environment import VOLATILE
-from harness.environment.wording import in_words
+from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
 from harness.files.reading import MOST_TOML, read_json, read_text, read_toml, toml

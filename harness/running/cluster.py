@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from harness.environment.environment import packages_of
-from harness.environment.wording import in_words
+from harness.environment.labels import in_words
 from harness.errors import InputError
 from harness.operators import Maker
 from harness.results.folder import differences

@@ -299,6 +299,12 @@ def _add_report_options(command: _Parser) -> None:
         help="call an answer verified if every residual is within F times the "
         "tolerance; default: 10",
     )
+    command.add_argument(
+        "--pool-forms",
+        action="store_true",
+        help="compare solvers over the cases of all forms together (means, ranks and "
+        "profiles); otherwise each form is compared apart",
+    )
 
 
 def _add_replay_options(command: _Parser) -> None:

@@ -32,7 +32,7 @@ SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 
-def report(folder, formats, *, factor=10.0):
+def report(folder, formats, *, factor=10.0, pool_forms=False):
     name = "index" if factor == 10 else f"index-{factor:g}"
     return [folder / f"{name}.{f}" for f in formats]
 

@@ -1,4 +1,4 @@
-"""What differs between two environments, in words."""
+"""The entries of an environment as people call them, and what differs in words."""
 
 from __future__ import annotations
 
