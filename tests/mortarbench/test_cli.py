@@ -34,7 +34,7 @@ FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 def report(folder, formats, *, factor=10.0, pool_forms=False):
     name = "index" if factor == 10 else f"index-{factor:g}"
-    return [folder / f"{name}.{f}" for f in formats]
+    return [folder / f"{name}{'-pooled' * pool_forms}.{f}" for f in formats]
 
 
 def paper(registries, out, quick, say):
@@ -210,6 +210,17 @@ def test_report_judges_at_the_factor_that_is_asked_for(cli, tmp_path):
     assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
         0, "folder/index-2.5.md\n", "",
     )  # fmt: skip
+
+
+def test_report_pools_forms_of_one_folder_and_refuses_to_for_two(cli, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    asked = ("--pool-forms", "--format", "md")
+
+    assert cli("report", "one", *asked) == (0, "one/index-pooled.md\n", "")
+    code, out, err = cli("report", "one", "two", *asked)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--pool-forms" in err
 
 
 def compare(before, after, formats, factor):
