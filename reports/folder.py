@@ -220,7 +220,7 @@ def _grown(found: Sequence[SizeSeries], evidence: Evidence) -> Section | None:
         return None
     drawn = sorted(found, key=lambda series: -series.answers)[:MOST_SERIES]
     rest = (
-        f" Of {len(found)} ladders, the {MOST_SERIES} with most answers are drawn."
+        f" Of {len(found)} series, the {MOST_SERIES} with most answers are drawn."
         * (len(found) > MOST_SERIES)
     )
     pictures = tuple(

@@ -14,8 +14,8 @@ from reports import write_report
 from reports.data.evidence import Evidence, arrange
 from reports.data.quantities import spreads
 from reports.data.size_series import size_series
+from reports.document import layout
 from reports.document.formatting import clean, exponent, seconds, significant
-from reports.document.layout import Page
 from reports.folder import compose
 from reports.render.html_page import breakable
 from reports.render.latex import escaped, latex
@@ -440,7 +440,7 @@ def test_a_report_takes_away_numbered_figures_that_only_an_earlier_one_had(tmp_p
     for name in ("profiles-2.pdf", "deformed.png", "profiles-2.txt", "my-2 notes.pdf"):
         (figures / name).touch()
 
-    write_figures(Page(title="", dateline="", sections=()), tmp_path)
+    write_figures(layout.Page(title="", dateline="", sections=()), tmp_path)
 
     left = {path.name for path in figures.iterdir()}
     assert left == {"deformed.png", "profiles-2.txt", "my-2 notes.pdf"}
