@@ -78,7 +78,8 @@ class Fields:
     """A deformed state of bodies, for pictures and files; SI units."""
 
     points: NDArray[Any]  #: (N, 2) reference positions, m
-    cells: NDArray[Any]  #: (E, 4) node numbers, counter-clockwise
+    #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
+    cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, 2) m
     nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa

@@ -20,8 +20,8 @@ def write_vtu(fields: Fields, path: Path) -> None:
     """Write a deformed state, SI units; points and vectors get a third component 0.
 
     Point data: displacement (m), contact_force (N/m, on slave nodes, else 0),
-    in_contact (0 or 1) and the nodal fields; cell data: body. *Warp By Vector* in
-    ParaView takes vectors of three components only.
+    in_contact (0 or 1) and the nodal fields; cell data: body. Triangles come before
+    quadrilaterals. *Warp By Vector* in ParaView takes vectors of three components only.
 
     Raises
     ------
@@ -34,16 +34,23 @@ def write_vtu(fields: Fields, path: Path) -> None:
         forces[fields.contact_nodes] = fields.contact_forces
     sizes = np.linalg.norm(forces, axis=1)
     touching = sizes > IN_CONTACT * sizes.max(initial=0.0)
+    cells, bodies = np.asarray(fields.cells), np.asarray(fields.bodies).astype(np.int32)
+    triangle = cells[:, 2] == cells[:, 3]
+    blocks = [
+        (kind, which, corners)
+        for kind, which, corners in (("triangle", triangle, 3), ("quad", ~triangle, 4))
+        if which.any()
+    ]
     mesh = meshio.Mesh(
         _padded(fields.points),
-        [("quad", np.asarray(fields.cells))],
+        [(kind, cells[which, :corners]) for kind, which, corners in blocks],
         point_data={
             "displacement": _padded(fields.displacement),
             "contact_force": _padded(forces),
             "in_contact": touching.astype(np.int32),
             **fields.nodal,
         },
-        cell_data={"body": [np.asarray(fields.bodies).astype(np.int32)]},
+        cell_data={"body": [bodies[which] for _, which, _ in blocks]},
     )
     try:
         mesh.write(path, file_format="vtu")

@@ -149,19 +149,21 @@ def _bodies(fields: Fields, scale: ColourScale | None) -> list[FieldMark]:
 
 
 def triangles(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Halve quadrilaterals: (2E, 3) node numbers."""
-    return np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
+    """Halve quadrilaterals, keep triangles: node numbers (t, 3)."""
+    halves = cells[cells[:, 2] != cells[:, 3]]
+    return np.vstack([cells[:, [0, 1, 2]], halves[:, [0, 2, 3]]])
 
 
 def edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Every edge of quadrilaterals once, (k, 2) node numbers."""
+    """Every edge of cells once, (k, 2) node numbers."""
     edges: NDArray[np.int64] = np.unique(np.sort(_sides(cells), axis=1), axis=0)
     return edges
 
 
 def _sides(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """List the four directed sides of every cell, (4E, 2) node numbers."""
-    return np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
+    """List the directed sides of every cell, (s, 2) node numbers."""
+    sides = np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
+    return np.asarray(sides[sides[:, 0] != sides[:, 1]])
 
 
 def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -11,12 +11,13 @@ from harness import InputError
 from harness.names import parse
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
-from problems.fem.mesh import nodal_lengths
+from problems.fem.mesh import Mesh, nodal_lengths
 from problems.models.beam_ring import model
 from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT
+from tests.support.triangles import halved
 
 NR, NH = 2, 1
 RING = model(NR, NH, 2, "strain")
@@ -160,6 +161,35 @@ def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, 
     (pair,), (expected,) = ours.pairs, RING.pairs
     np.testing.assert_array_equal(pair.slave, expected.slave)
     np.testing.assert_array_equal(pair.master, expected.master)
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
+    quads, curves, spots = parts()
+    triangles = {
+        name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
+        for name, cells in quads.items()
+    }
+    given = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
+    (tmp_path / "m.msh").write_text(msh22(POINTS, given, curves, spots, quad_type=2))
+    read = read_msh(tmp_path / "m.msh")
+
+    for name, expected in triangles.items():
+        got = read.cells[read.surfaces[name]]
+        np.testing.assert_array_equal(np.sort(got[:, :3]), np.sort(expected))
+        np.testing.assert_array_equal(got[:, 3], got[:, 2])
+        (ax, ay), (bx, by) = (
+            (read.points[got[:, k]] - read.points[got[:, 0]]).T for k in (1, 2)
+        )
+        assert (ax * by > ay * bx).all()
+    whole = read_mesh_of_quads(tmp_path, quads, curves, spots)
+    for name, edge in whole.curves.items():
+        np.testing.assert_array_equal(read.curves[name], edge)
+
+
+def read_mesh_of_quads(tmp_path, *contents):
+    (tmp_path / "quads.msh").write_text(msh22(POINTS, *contents))
+    return read_msh(tmp_path / "quads.msh")
 
 
 @pytest.mark.parametrize(
@@ -377,8 +407,15 @@ def bent(points):
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
-        (lambda p, c: (p, {"a": c[:, :3]}, {}, {}, 2), "cells of type triangle; expec"),
-        (lambda p, c: (p, {"": c}, {}, {}), "4 quadrilaterals without a name"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0, 1]]}, {}, {}, 9),
+         "cells of type triangle6; expected cells of first order: Mesh.ElementOrder = 1"
+         " in the .geo file, or gmsh -2 -order 1"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3] * 2]}, {}, {}, 16),
+         "cells of type quad8; expected cells of first order: Mesh.ElementOrder = 1"),
+        (lambda p, c: (p, {"a": c}, {}, {}, 4), "cells of type tetra; expected plane"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
+        (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
+         ' named surface: Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),

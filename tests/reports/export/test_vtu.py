@@ -1,5 +1,6 @@
 """VTU files, read back by meshio and by an XML parser."""
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import meshio
@@ -47,6 +48,19 @@ def test_cells_know_their_body(grid):
     assert block.type == "quad"
     np.testing.assert_array_equal(block.data, FIELDS.cells)
     np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
+
+
+def test_triangles_are_triangles_with_their_bodies(tmp_path):
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
+    write_vtu(
+        replace(FIELDS, cells=cells, bodies=np.array([3, 4, 5])), tmp_path / "a.vtu"
+    )
+    grid = meshio.read(tmp_path / "a.vtu")
+
+    assert [block.type for block in grid.cells] == ["triangle", "quad"]
+    np.testing.assert_array_equal(grid.cells[0].data, cells[1:, :3])
+    np.testing.assert_array_equal(grid.cells[1].data, cells[:1])
+    assert [body.tolist() for body in grid.cell_data["body"]] == [[4, 5], [3]]
 
 
 def test_contact_is_a_force_and_a_flag_without_gaps_elsewhere(grid):
