@@ -158,13 +158,24 @@ def _add_solve_options(command: _Parser) -> None:
     command.add_argument("--solver", metavar="NAME", required=True)
     command.add_argument("--tol", metavar="T", type=float, default=1e-8)
     command.add_argument(
-        "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
+        "--plot",
+        metavar="FILE.png|pdf|svg",
+        type=Path,
+        help="the deformed bodies, and each contact enlarged",
+    )
+    command.add_argument(
+        "--scale",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="of the displacement in the picture; default: 1",
     )
     command.add_argument(
         "--vtu",
         metavar="FILE.vtu",
         type=Path,
-        help="the same for ParaView; FILE.pvd: all load steps up to this one",
+        help="the same for ParaView, and a CSV along each contact; FILE.pvd: all load "
+        "steps up to this one",
     )
     _add_plugin(command)
     _add_json(command)

@@ -35,7 +35,7 @@ def contact_sides(bodies: Bodies, primal: QP, s: Solution) -> tuple[ContactSide,
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        force = as_vectors(-(B[rows].T @ s.z[rows]) * F)
+        force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)
         side = current_polyline(points, u, pair.slave, "slave")
         length = nodal_lengths(points[pair.slave])
         normal = np.einsum("sx,sx->s", force[pair.slave], side.node_normal)
@@ -44,7 +44,7 @@ def contact_sides(bodies: Bodies, primal: QP, s: Solution) -> tuple[ContactSide,
         found.append(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
-                force=force[pair.slave], pressure=-normal / length, gap=gap,
+                force=force[pair.slave], pressure=(0.0 - normal) / length, gap=gap,
             )
         )  # fmt: skip
     return tuple(found)
