@@ -37,6 +37,8 @@ def run(registries: Registries, options: Namespace) -> int:
     from mortarbench.case import built_case
 
     case = built_case(parsed, registries)
+    for remark in case.made.remarks:
+        say(remark)
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     if drawn and case.made.fields is None:
         wanted = ", ".join(f"--{o}" for o in drawn)

@@ -51,6 +51,9 @@ slave = "outer"
 master = "bottom"
 """
 
+FLOATING = TOML.replace('[[supports]]\nboundary = "left"\nfix = ["x", "y"]\n', "")
+TOP = 'force = [0, 0]\n[[loads]]\nboundary = "top"\nforce = [0, -1e8]'
+
 
 def edges(chain):
     return np.column_stack([chain[:-1], chain[1:]])
@@ -269,8 +272,7 @@ def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
 
 
 def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(described):
-    floating = TOML.replace('[[supports]]\nboundary = "left"\nfix = ["x", "y"]\n', "")
-    text = described(toml=floating)
+    text = described(toml=FLOATING.replace("force = [0, -1e8]", TOP))
 
     dual = build(f"{text}/steps=1/dual")
     assert dual.qp.b.size == 6
@@ -279,6 +281,52 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
         build(f"{text}/dual")
     with pytest.raises(InputError, match=r"dual-bounds does not exist"):
         build(f"{text}/steps=1/dual-bounds")
+
+
+@pytest.mark.parametrize(
+    ("load", "told"),
+    [
+        ("force = [0, -1e8]", "body 'beam': nothing balances the moment of its load"),
+        (f'{TOP}\n[[loads]]\nboundary = "left"\nforce = [-1e3, 0]', "beam"),
+    ],
+)
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_a_load_that_nothing_balances_is_named_before_solving(
+    described, load, told, form
+):
+    text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
+    with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
+        build(f"{text}/steps=1/{form}")
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"), [("mm", 1e-3), ("cm", 1e-2), ("in", 0.0254), ("m", 1.0)]
+)
+def test_a_mesh_in_another_unit_of_length_is_the_same_problem(described, unit, size):
+    ours = build(f"{described()}/step=1/dual-bounds")
+    inches = TOML.replace("steps = 2", f'steps = 2\nlength_unit = "{unit}"')
+    theirs = build(
+        f"{described(msh22(POINTS / size, *parts()), inches)}/step=1/dual-bounds"
+    )
+    s = reference_solution(ours.qp)
+
+    np.testing.assert_allclose(theirs.qp.P, ours.qp.P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(theirs.qp.q, ours.qp.q, rtol=1e-9, atol=1e-12)
+    assert theirs.quantities(s)["energy"] == pytest.approx(
+        ours.quantities(s)["energy"], rel=1e-9
+    )
+
+
+def test_a_modulus_in_megapascals_is_remarked_upon_and_a_rubber_is_not(described):
+    soft = build(f"{described(toml=TOML.replace('200e9', '210000'))}/step=1/primal")
+    (remark,) = soft.remarks
+
+    assert remark.startswith("a.toml: bodies[1]: E = 210000 Pa is softer than rubber;")
+    assert remark.endswith("if 210000 MPa is meant, write 2.1e+11")
+    assert build(f"{described(toml=TOML.replace('20e9', '1e6'))}/primal").remarks == ()
 
 
 def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
@@ -336,6 +384,8 @@ def test_nodes_of_no_cell_are_left_out(described):
         ("steps", "stops", "a.toml: unknown key 'stops'; did you mean 'steps'?"),
         ("steps = 2", "steps = 2.5", "a.toml: steps = 2.5; expected an integer"),
         ("steps = 2", 'plane = "bent"', "a.toml: unknown value of plane 'bent'"),
+        ("steps = 2", 'length_unit = "mn"', "a.toml: unknown length_unit 'mn'; did"),
+        ("steps = 2", "length_unit = 1e-3", "a.toml: length_unit = 0.001; expected"),
         ("steps = 2", "steps 2", "a.toml: line "),
         ('name = "ring"', 'name = "rink"',
          "a.toml: bodies[0]: name: unknown physical surface 'rink'; did you mean 'r"),
