@@ -37,7 +37,7 @@ def run(registries: Registries, options: Namespace) -> int:
     from mortarbench.case import built_case
 
     case = built_case(parsed, registries)
-    for remark in case.made.remarks:
+    for remark in case.remarks:
         say(remark)
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     if drawn and case.made.fields is None:

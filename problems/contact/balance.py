@@ -112,7 +112,7 @@ def _slides(bodies: Bodies, r: Floats, B: Matrix, sign: float) -> bool:
 
 
 def _remainder(load: Floats, closing: Floats) -> Floats:
-    """Return what is left of a load (k,) beside the best forces λ ≥ 0 of rows (m, k)."""
+    """Return what is left of a load (k,) by the best forces λ ≥ 0 on rows (m, k)."""
     from scipy.optimize import nnls  # late: only bodies that supports do not hold
 
     sizes = np.linalg.norm(closing, axis=1)
