@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corner
 SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them
 _MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
 _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
+_LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
@@ -49,7 +50,7 @@ class _Loaded(NamedTuple):
     """The slave nodes of one contact that carry load."""
 
     name: str  #: of the pair; empty where the fields tell of no pairs
-    places: Points  #: where the displacement puts them
+    nodes: NDArray[np.int64]  #: (k,)
     forces: Points  #: on them, N/m
 
 
@@ -70,7 +71,7 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies of no width or no height: there is no picture")
     points = moved(fields, scale)
-    loaded = _loaded(fields, points)
+    loaded = _loaded(fields)
     low, high = _box(fields, points)
     width, height = high - low
     pad = 0.02 * width
@@ -84,24 +85,32 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
     )
     corners = low - pad, high + pad
     span = float((high - low).max())
-    windows = [
-        (f"({chr(ord('b') + i)})", contact, _window(contact, span))
-        for i, contact in enumerate(loaded)
-    ]
+    letters = [f"({chr(ord('b') + i)})" for i in range(len(loaded))]
     frames = [
         mark
-        for letter, _, window in windows
-        for mark in _frame(letter, window, corners)
+        for letter, contact in zip(letters, loaded, strict=True)
+        for mark in _frame(letter, _window(points[contact.nodes], span), corners)
     ]
+    there = moved(fields)  # enlarged by more, bodies in contact would overlap
+    near = (
+        *_bodies(fields, there, colours),
+        *(Path(points=there[o], look=_OUTLINE) for o in outlines(fields.cells)),
+    )
+    truly = "" if scale == SCALE else f"displacement × {SCALE:g}"
     overview = FieldPanel(
         low=_pair(corners[0]), high=_pair(corners[1]),
         marks=(*bodies, *before, *after, *frames),
         title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {scale:g}; "
         "dashed: undeformed",
-        xlabel="$x$ in m", ylabel="$y$ in m",
+        **_axes(span),
     )  # fmt: skip
+    windows = [
+        _enlarged(near, f"{letter} {_listed(contact.name, truly)}", contact,
+                  there[contact.nodes], span)
+        for letter, contact in zip(letters, loaded, strict=True)
+    ]  # fmt: skip
     return FieldFigure(
-        panels=(overview, *(_enlarged((*bodies, *after), *w) for w in windows)),
+        panels=(overview, *windows),
         height=drawn + 0.55 + len(windows) * (enlarged + 0.69),
         heights=(drawn, *[enlarged] * len(windows)),
         scale=colours,
@@ -207,7 +216,19 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
-def _loaded(fields: Fields, points: Points) -> list[_Loaded]:
+def _axes(span: float) -> dict[str, Any]:
+    """Choose m, mm or µm for the axes of bodies of this size."""
+    unit, name = next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
+    return {"xlabel": f"$x$ in {name}", "ylabel": f"$y$ in {name}", "unit": unit}
+
+
+def _listed(*words: str) -> str:
+    """Join what a title begins with; empty where that is nothing."""
+    given = ", ".join(filter(None, words))
+    return f"{given}: " if given else ""
+
+
+def _loaded(fields: Fields) -> list[_Loaded]:
     """List the contacts that carry load; all as one where they are not told apart."""
     told = [(side.name, side.nodes, side.force) for side in fields.contacts]
     if not told and fields.contact_nodes is not None:
@@ -217,26 +238,23 @@ def _loaded(fields: Fields, points: Points) -> list[_Loaded]:
     for name, nodes, forces in told:
         size = np.hypot(*forces.T)
         if (active := size > _ACTIVE * size.max(initial=0.0)).any():
-            found.append(_Loaded(name, points[nodes[active]], forces[active]))
+            found.append(_Loaded(name, nodes[active], forces[active]))
     return found
 
 
-def _window(contact: _Loaded, span: float) -> tuple[Vector, Vector]:
+def _window(places: Points, span: float) -> tuple[Vector, Vector]:
     """Lower left and upper right corner of an enlargement; span: size of all bodies."""
-    low, high = contact.places.min(axis=0), contact.places.max(axis=0)
+    low, high = places.min(axis=0), places.max(axis=0)
     reach = max(0.75 * float((high - low).max()), 0.06 * span)
     half = np.array([reach, _FLAT * reach])
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 def _enlarged(
-    bodies: Sequence[FieldMark],
-    letter: str,
-    contact: _Loaded,
-    window: tuple[Vector, Vector],
+    bodies: Sequence[FieldMark], title: str, contact: _Loaded, tips: Points, span: float
 ) -> FieldPanel:
     """Zoom to the loaded nodes of a contact and show the force on each as an arrow."""
-    (_, tips, forces), (low, high) = contact, window
+    forces, (low, high) = contact.forces, _window(tips, span)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
     arrows = Vectors(
@@ -246,9 +264,9 @@ def _enlarged(
     factor, prefix = _prefixed(largest)
     return FieldPanel(
         low=_pair(low), high=_pair(high), marks=(*bodies, arrows), axes="frame",
-        title=f"{letter} {contact.name + ': ' if contact.name else ''}contact forces "
-        f"on the slave nodes; the largest is {largest / factor:.3g} {prefix}N/m",
-        xlabel="$x$ in m", ylabel="$y$ in m",
+        title=f"{title}contact forces on the slave nodes; the largest is "
+        f"{largest / factor:.3g} {prefix}N/m",
+        **_axes(span),
     )  # fmt: skip
 
 

@@ -197,6 +197,30 @@ def test_the_scale_is_that_of_the_displacement(bodies):
     assert "displacement × 4;" in there.title
 
 
+def test_contacts_are_enlarged_as_they_are_whatever_the_scale_of_the_whole(bodies):
+    """Where displacements are multiplied, bodies in contact overlap."""
+    one, four = (deformed_figure(bodies, scale).panels[1] for scale in (1.0, 4.0))
+
+    assert (one.low, one.high) == (four.low, four.high)
+    np.testing.assert_array_equal(one.marks[-1].feet, four.marks[-1].feet)
+    assert one.title.startswith("(b) contact forces")
+    assert four.title.startswith("(b) displacement × 1: contact forces")
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "name"),
+    [(1.0, 1.0, "m"), (0.05, 1e-3, "mm"), (5e-5, 1e-6, "µm"), (1e-9, 1e-6, "µm")],
+)
+def test_axes_number_lengths_in_a_unit_of_their_size(bodies, size, unit, name):
+    small = replace(
+        bodies, points=size * bodies.points / 2, displacement=0 * bodies.displacement
+    )
+    (panel, *_) = deformed_figure(small).panels
+
+    assert panel.unit == unit
+    assert panel.xlabel == f"$x$ in {name}"
+
+
 def test_triangles_are_drawn_once_and_without_sides_of_no_length():
     cells = np.array([[0, 1, 2, 2], [0, 2, 3, 3], [3, 2, 4, 5]])
 
