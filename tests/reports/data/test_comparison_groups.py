@@ -277,7 +277,7 @@ def test_the_sections_render(record, evidence):
 # ---- pictures
 
 
-@pytest.mark.parametrize("count", [2, 7, 20, 50])
+@pytest.mark.parametrize("count", [2, 7, 20, pytest.param(50, marks=pytest.mark.slow)])
 def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
     records = [
         record(f"s{k:02d}", case, (1 + (k % 6) + k / 100) * 0.01 * (case + 1))
