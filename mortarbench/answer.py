@@ -38,6 +38,7 @@ class Answer:
     record: Record  #: the measurement, as a line of a journal
     solution: Solution | None  #: point and claim; None where the process ended
     spec: SolverSpec
+    defaults: Mapping[str, Any]  #: options that the solver has if none are given
 
     @property
     def verdict(self) -> Verdict:
@@ -142,13 +143,13 @@ class Answer:
         return path
 
     def __repr__(self) -> str:
-        return outcome(self.record)
+        return outcome(self.record, self.defaults)
 
     def _repr_html_(self) -> str:
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in outcome_rows(self.record)
+            for name, value in outcome_rows(self.record, self.defaults)
         )
         return f"<table>{''.join(rows)}</table>"
 
@@ -215,8 +216,11 @@ def answers_of(
     given = dict(options or {})
     spec = SolverSpec(name=solver, label=solver, options=given)
     configured = resolve(spec, registries.solvers)
+    plainly = SolverSpec(name=solver, label=solver)
+    defaults = options_of(resolve(plainly, registries.solvers))
     if options_of(configured).get("history") is False and "history" not in given:
         # what telling costs is not at stake where nothing is compared
+        defaults = {**defaults, "history": True}
         spec = replace(spec, options={**given, "history": True})
         configured = resolve(spec, registries.solvers)
     environment = digest(registries.environment())
@@ -234,7 +238,9 @@ def answers_of(
             record, solution = measured_once(
                 worker, case.made, record, registries.reference
             )
-        return Answer(case=case, record=record, solution=solution, spec=spec)
+        return Answer(
+            case=case, record=record, solution=solution, spec=spec, defaults=defaults
+        )
 
     command = registries.worker_command(spec)
     work = None
