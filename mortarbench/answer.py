@@ -21,7 +21,13 @@ from harness.record import finite
 from harness.registry import SolverSpec, options_of, resolve
 from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.arguments import (
+    GRIDS,
+    PICTURES,
+    drawn_scale,
+    tolerance,
+    writable,
+)
 from mortarbench.case import Case, build, built_case
 from mortarbench.registries import Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
@@ -93,19 +99,22 @@ class Answer:
             raise InputError(f"no picture: {self.record.solver} returned no point")
         return self.case.fields(self.solution)
 
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the deformed bodies with their stresses; into a file, too, if given.
+    def plot(self, path: str | Path | None = None, *, scale: float = 1.0) -> Figure:
+        """Draw the deformed bodies with their stresses, and each contact enlarged.
+
+        path : of a file to write, too: .png, .pdf or .svg
+        scale : of the displacement, as drawn
 
         Raises
         ------
         InputError
-            As `fields`; when the file cannot be written.
+            As `fields`; when the file cannot be written, or the scale is no number.
 
         """
         from reports.figures.deformed import deformed_figure
         from reports.render.saving import draw, save
 
-        figure = deformed_figure(self.fields())
+        figure = deformed_figure(self.fields(), drawn_scale(scale))
         if path is not None:
             save(figure, writable(Path(path), PICTURES))
         return draw(figure)

@@ -25,6 +25,12 @@ UNITS = {
     "max_von_mises": "Pa",
     "stress_error": "(dimensionless)",
 }
+_CONTACTS = "contacts"  #: the quantity that has a table per pair of sides
+_OF_A_CONTACT = {
+    "largest_pressure": "Pa",
+    "smallest_gap": "m",
+    "half_width": "m",
+}
 
 
 _HEADS = {
@@ -154,9 +160,27 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         *(
             (name.replace("_", " "), _text(value, units.get(name, "")))
             for name, value in r.quantities.items()
+            if name != _CONTACTS
         ),
+        *_contacts(r.quantities.get(_CONTACTS)),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def _contacts(pairs: object) -> list[tuple[str, str]]:
+    """Lay out what elastic bodies tell of each pair of sides that may touch."""
+    if not isinstance(pairs, Mapping):
+        return []
+    rows = []
+    for name, found in pairs.items():
+        parts = (
+            f"{what.replace('_', ' ')} {_text(found.get(what), unit, digits=4)}"
+            for what, unit in _OF_A_CONTACT.items()
+            if found.get(what) is not None
+        )
+        rows.append((f"contact {name}", ", ".join(parts)))
+        rows.append(("  force on", _text(found.get("force"), "N/m", digits=6)))
+    return rows
 
 
 def _bound(r: Record) -> str:

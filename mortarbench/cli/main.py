@@ -238,15 +238,23 @@ def _add_solve_options(command: _Parser) -> None:
     )
     command.add_argument(
         "--plot",
-        metavar="FILE.png",
+        metavar="FILE.png|pdf|svg",
         type=Path,
-        help="draw the deformed bodies with their stresses",
+        help="draw the deformed bodies with their stresses, and each contact enlarged",
+    )
+    command.add_argument(
+        "--scale",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="multiply the displacement in the picture; default: 1",
     )
     command.add_argument(
         "--vtu",
         metavar="FILE.vtu",
         type=Path,
-        help="write them for ParaView; FILE.pvd: all load steps up to this one",
+        help="write them for ParaView, and a CSV along each contact; FILE.pvd: all "
+        "load steps up to this one",
     )
     _add_plugin(command)
     _add_json(command)

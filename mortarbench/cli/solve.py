@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from harness.errors import InputError, say
 from harness.names import parse
 from harness.registry import check_name
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -22,7 +22,12 @@ def run(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
     tolerance(options.tol, "--tol")
     if options.plot is not None:
-        writable(options.plot, PICTURES[:1])
+        writable(options.plot, PICTURES)
+    drawn_scale(options.scale, "--scale")
+    if options.plot is None and options.scale != 1.0:
+        raise InputError(
+            f"--scale {options.scale:g} without --plot; expected a picture"
+        )
     if options.vtu is not None:
         writable(options.vtu, GRIDS)
     registries = registries.with_files(options.plugin)
@@ -37,6 +42,8 @@ def run(registries: Registries, options: Namespace) -> int:
     forks = registries.hold_own_code_only() and not _loads_from_here()
     with answers_of(options.solver, registries, forks=forks) as solved:
         case = built_case(parsed, registries)  # after the fork, which has no use for it
+        for remark in case.remarks:
+            say(remark)
         if drawn and case.made.fields is None:
             wanted = ", ".join(f"--{o}" for o in drawn)
             raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
@@ -78,6 +85,6 @@ def _draw(answer: Answer, options: Namespace) -> None:
         say(f"no picture: {answer.record.solver} returned no point")
         return
     if options.plot is not None:
-        answer.plot(options.plot)
+        answer.plot(options.plot, scale=options.scale)
     if options.vtu is not None:
         answer.save_vtu(options.vtu)

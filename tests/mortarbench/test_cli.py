@@ -435,6 +435,14 @@ WRONG = {
         (*SOLVE, "--plot", "a.txt"),
         "unknown format '.txt'; expected .",
     ),
+    "scale without picture": (
+        (*SOLVE, "--scale", "3"),
+        "--scale 3 without --plot; expected a picture",
+    ),
+    "scale": (
+        (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
+        "--scale = nan; expected a number, at most 1e+09",
+    ),
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),
         "no/a.png: no folder no; expec",

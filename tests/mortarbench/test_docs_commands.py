@@ -7,6 +7,7 @@ run in a shorter form, and what cannot be run here is named with the reason.
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -101,10 +102,13 @@ ELSEWHERE = {
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
     "python cluster.py": "it submits jobs to a batch system",
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
+    "gmsh -2 -order 1 press.geo": "gmsh is not here; what it makes is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
         "the environment is there"
     ),
 }
+#: what a page needs of programs that are not here
+SUPPLIED = {"own-geometry": ("press.msh",)}
 #: what a page promises of the files that its commands leave
 PROMISED = {
     "tutorial": {
@@ -112,6 +116,11 @@ PROMISED = {
         "out/mine/report/report.md": r"osqp-polish",
         "out/mine/report/records.parquet": "",
         "out/again/report/against-mine/index.html": r"what changed from mine to again",
+    },
+    "own-geometry": {
+        "press.png": "",
+        "press.vtu": r'Name="pressure"',
+        "press-disc-on-upper.csv": "pressure_Pa",
     },
     "howto": {
         "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
@@ -209,6 +218,8 @@ def execute(tmp_path, monkeypatch, capsys):
 def test_every_command_of_a_page_works(page, execute, tmp_path):
     """In its order; what one command writes, the next may read."""
     instead, elsewhere = normal(SHORTER), normal(ELSEWHERE)
+    for name in SUPPLIED.get(page.stem, ()):
+        shutil.copy(ROOT / "tests" / "data" / name, tmp_path)
     for kind, what, more in shown(page):
         if kind == "file":
             (tmp_path / what).write_text(more, "utf-8")
