@@ -207,7 +207,7 @@ def execute(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as ended:
             root.main()
         output = capsys.readouterr()
-        assert "Traceback" not in output.err
+        assert "Traceback" not in output.err, output.err
         return ended.value.code
 
     return run
