@@ -159,6 +159,15 @@ class Registries:
             extended = replace(extended, files=(*extended.files, file))
         return extended
 
+    def hold_own_code_only(self) -> bool:
+        """Whether nothing of a plug-in has been loaded."""
+        return (
+            self.families is PROBLEMS
+            and self.solvers is SOLVERS
+            and not self.operators
+            and not self.files
+        )
+
     def worker_command(self, spec: SolverSpec) -> list[str]:
         """Make the command that starts the worker of a solver, less its two pipes."""
         request = {

@@ -35,7 +35,7 @@ HOSTILE = (
 )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def measured():
     """Factory: one record of beam-ring/size=N/FORM, verified unless told otherwise."""
 
@@ -304,7 +304,7 @@ class Page(HTMLParser):
                 self.links.append(value)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def hostile(measured):
     def record(text, size):
         return measured(
@@ -319,13 +319,14 @@ def hostile(measured):
     ]
 
 
-@pytest.fixture
-def hostile_folder(hostile, tmp_path):
-    folder = write(tmp_path / "run", hostile)
+@pytest.fixture(scope="module")
+def hostile_folder(hostile, tmp_path_factory, svg_only):
+    folder = write(tmp_path_factory.mktemp("hostile") / "run", hostile)
     (folder / "environment.json").write_text(
         '{"machine": {"cpu": "<b>$x_1$ & co</b>"}, "list": [{"</style>": null}]}'
     )
-    write_report(folder, ["html", "md", "tex"])
+    with svg_only():
+        write_report(folder, ["html", "md", "tex"])
     return folder / "report"
 
 

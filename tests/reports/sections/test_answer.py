@@ -141,7 +141,9 @@ def test_a_winner_over_cases_takes_both_the_interval_and_the_test_of_all_pairs(
     assert why in claim
 
 
-@pytest.mark.parametrize("cases", [1, 2, 7])
+@pytest.mark.parametrize(
+    "cases", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 7))]
+)
 def test_of_equal_solvers_one_is_named_in_one_run_of_twenty_at_most(
     record, evidence, cases
 ):
