@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from sys import stderr
@@ -15,7 +16,7 @@ from harness import Fields, Record, Residuals, Solution, Verdict
 from harness.environment.environment import digest
 from harness.errors import InputError
 from harness.names import assemble
-from harness.processes.measurement import measured_once
+from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite
 from harness.registry import SolverSpec, options_of, resolve
 from harness.solution import History
@@ -28,7 +29,7 @@ from mortarbench.arguments import (
     writable,
 )
 from mortarbench.case import Case, build, built_case
-from mortarbench.registries import Plugins, one_thread
+from mortarbench.registries import Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Answer:
     record: Record  #: the measurement, as a line of a journal
     solution: Solution | None  #: point and claim; None where the process ended
     spec: SolverSpec
+    defaults: Mapping[str, Any]  #: options that the solver has if none are given
 
     @property
     def verdict(self) -> Verdict:
@@ -150,13 +152,13 @@ class Answer:
         return path
 
     def __repr__(self) -> str:
-        return outcome(self.record)
+        return outcome(self.record, self.defaults)
 
     def _repr_html_(self) -> str:
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in outcome_rows(self.record)
+            for name, value in outcome_rows(self.record, self.defaults)
         )
         return f"<table>{''.join(rows)}</table>"
 
@@ -196,24 +198,64 @@ def solve(
         registries = registries.with_files(
             [file for file in plugins if Path(file).resolve() not in held]
         )
+    with answers_of(solver, registries, options) as answer:
+        return answer(case, tol)
+
+
+@contextmanager
+def answers_of(
+    solver: str,
+    registries: Registries,
+    options: Mapping[str, Any] | None = None,
+    *,
+    forks: bool = False,
+) -> Iterator[Callable[[Case, float], Answer]]:
+    """Give what has a solver solve a case to a tolerance, in a process of its own.
+
+    solver, options : as of `solve`
+    forks : whether that process may be a fork of this one, made now, if that is safe;
+        see `harness.processes.forking`
+
+    Raises
+    ------
+    InputError
+        When there is no such solver or option.
+
+    """
     given = dict(options or {})
     spec = SolverSpec(name=solver, label=solver, options=given)
     configured = resolve(spec, registries.solvers)
+    plainly = SolverSpec(name=solver, label=solver)
+    defaults = options_of(resolve(plainly, registries.solvers))
     if options_of(configured).get("history") is False and "history" not in given:
         # what telling costs is not at stake where nothing is compared
+        defaults = {**defaults, "history": True}
         spec = replace(spec, options={**given, "history": True})
         configured = resolve(spec, registries.solvers)
-    record = new_record(
-        case.id,
-        spec,
-        options=options_of(configured),
-        tol=tol,
-        repeat=0,
-        environment=digest(registries.environment()),
-    )
-    command = registries.worker_command(spec)
-    with one_thread(), redirect_stdout(stderr):  # whatever the family prints
-        record, solution = measured_once(
-            command, case.made, record, registries.reference
+    environment = digest(registries.environment())
+
+    def answer(case: Case, tol: float) -> Answer:
+        record = new_record(
+            case.id,
+            spec,
+            options=options_of(configured),
+            tol=tol,
+            repeat=0,
+            environment=environment,
         )
-    return Answer(case=case, record=record, solution=solution, spec=spec)
+        with one_thread(), redirect_stdout(stderr):  # whatever the family prints
+            record, solution = measured_once(
+                worker, case.made, record, registries.reference
+            )
+        return Answer(
+            case=case, record=record, solution=solution, spec=spec, defaults=defaults
+        )
+
+    command = registries.worker_command(spec)
+    work = None
+    if forks:
+        from harness.processes.worker import serve  # late: few need it here
+
+        work = partial(serve, configured)
+    with single_worker(command, work) as worker:
+        yield answer

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
@@ -33,17 +35,19 @@ def run(registries: Registries, options: Namespace) -> int:
     check_name(options.solver, registries.solvers)
 
     from harness.record import Verdict
-    from mortarbench.answer import solve
+    from mortarbench.answer import answers_of
     from mortarbench.case import built_case
 
-    case = built_case(parsed, registries)
-    for remark in case.remarks:
-        say(remark)
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
-    if drawn and case.made.fields is None:
-        wanted = ", ".join(f"--{o}" for o in drawn)
-        raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
-    answer = solve(case, options.solver, tol=options.tol)
+    forks = registries.hold_own_code_only() and not _loads_from_here()
+    with answers_of(options.solver, registries, forks=forks) as solved:
+        case = built_case(parsed, registries)  # after the fork, which has no use for it
+        for remark in case.remarks:
+            say(remark)
+        if drawn and case.made.fields is None:
+            wanted = ", ".join(f"--{o}" for o in drawn)
+            raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
+        answer = solved(case, options.tol)
     record = answer.record
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
@@ -55,6 +59,15 @@ def run(registries: Registries, options: Namespace) -> int:
     if drawn:
         _draw(answer, options)
     return 0 if record.verdict is Verdict.VERIFIED else 1
+
+
+def _loads_from_here() -> bool:
+    """Whether a library may have come from the working directory, and only from there.
+
+    ``python -m`` looks there first. Workers do not, so they must not be forks then.
+    """
+    first, *others = sys.path
+    return first in ("", os.getcwd()) and first not in others
 
 
 def _show_iterations(answer: Answer) -> None:

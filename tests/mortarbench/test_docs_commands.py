@@ -46,6 +46,7 @@ SHORTER = {
     ),
     "mortarbench validate out/make-demo": "mortarbench validate out/demo",
     "mortarbench run mine.toml": "mortarbench run mine.toml --repeats 2",
+    "mortarbench run profiles.toml": "mortarbench run profiles.toml --repeats 1",
     "mortarbench run mine.toml --out out/again": (
         "mortarbench run mine.toml --repeats 2 --out out/again"
     ),
@@ -78,6 +79,9 @@ SHORTER = {
     ),
     "mortarbench report out/make-demo --factor 1": (
         "mortarbench report out/demo --format md --factor 1"
+    ),
+    "mortarbench report out/make-demo --pool-forms": (
+        "mortarbench report out/demo --format csv --pool-forms"
     ),
     "mortarbench report out/make-demo out/demo": (
         "mortarbench report out/demo out/demo"
@@ -121,6 +125,10 @@ PROMISED = {
     "howto": {
         "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",
         "out/scaling/report/figures/scaling-1.pdf": "",
+        "out/profiles/report/figures/profiles-1.pdf": "",
+        "out/profiles/report/figures/pairwise-1.pdf": "",
+        "out/profiles/report/tables/contests.csv": r"all forms",
+        "out/profiles/report/report.md": r"Forms together: dual 6 cases, primal 6",
         "out/crossval/validation.json": "",
         "out/crossval/report/validation.html": r"No disagreement",
         "out/demo/report/report.md": r"1 × tolerance",
@@ -199,7 +207,7 @@ def execute(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit) as ended:
             root.main()
         output = capsys.readouterr()
-        assert "Traceback" not in output.err
+        assert "Traceback" not in output.err, output.err
         return ended.value.code
 
     return run
