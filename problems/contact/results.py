@@ -11,6 +11,7 @@ from scipy.sparse import csr_array
 from harness import QP, Fields, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
+from problems.contact.sides import bodies_of, contact_sides
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
 
@@ -24,8 +25,8 @@ def quantities(
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
     its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
-    max_von_mises: per body, of the patch-recovered stress, Pa. With friction those of
-    `frictional`, too.
+    max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
+    `pair_results`. With friction those of `frictional`, too.
     """
     l, F = bodies.length, bodies.force
     slave, master = bodies.pairs[0]
@@ -48,6 +49,7 @@ def quantities(
             name: float(stress[bodies.body_of_node == b].max())
             for b, name in enumerate(bodies.names)
         },
+        "contacts": pair_results(bodies, primal, s, friction),
     } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
 
 
@@ -90,6 +92,36 @@ def _active(normal: Vector) -> NDArray[np.bool_]:
     return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
 
 
+def pair_results(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> dict[str, dict[str, Any]]:
+    """Report each contact pair by its name.
+
+    force: on each of its bodies, N/m. largest_pressure: at a slave node, Pa.
+    smallest_gap: m; below zero where bodies overlap. half_width: half the length of the
+    undeformed slave side that belongs to nodes under pressure, m.
+    """
+    found = {}
+    sides = contact_sides(bodies, primal, s, friction)
+    for pair, side in zip(bodies.pairs, sides, strict=True):
+        slave, master = bodies_of(bodies, pair)
+        total = side.force.sum(axis=0)
+        force = {slave: total.tolist()}
+        if pair.master.size:
+            force = {master: (0.0 - total).tolist()} | force
+        size = np.hypot(*side.force.T)
+        loaded = size > ACTIVE * size.max(initial=0.0)
+        found[side.name] = {
+            "force": force,
+            "largest_pressure": float(side.pressure.max()),
+            "smallest_gap": (
+                None if np.isnan(side.gap).all() else float(np.nanmin(side.gap))
+            ),
+            "half_width": float(side.length[loaded].sum() / 2),
+        }
+    return found
+
+
 def fields(
     bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
 ) -> Fields:
@@ -104,6 +136,7 @@ def fields(
         nodal=nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
+        contacts=contact_sides(bodies, primal, s, friction),
     )
 
 

@@ -6,11 +6,17 @@ The TOML file is described in `problems.models.description`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.sparse import vstack
+
 from harness import QP, Case, Friction, InputError, Reference, Value
+from harness.checked import located
+from problems.contact.balance import check_balance
 from problems.contact.bodies import Bodies, clamped, floating, supported
 from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
@@ -22,6 +28,7 @@ from problems.models.description import (
     described_bodies,
     pair_laws,
     read_description,
+    remarks,
 )
 
 
@@ -31,13 +38,14 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     source = (p["path"], p["sha256"], p["plane"])
     bodies = model(*source)
     primal, friction = _posed(source, p, reference)
-    return contact_case(
+    case = contact_case(
         bodies, primal, form,
         floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
         supported=lambda: _supported(*source),
         quantities=lambda s: quantities(bodies, primal, s, friction),
         friction=friction,
     )  # fmt: skip
+    return replace(case, remarks=remarks(Path(p["path"])))
 
 
 def _posed(
@@ -48,8 +56,12 @@ def _posed(
     method = (p["contact"], p["basis"])
     if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
         bodies = model(*source)
+        linearise = linearisation(bodies, *method, laws)
+        rows = linearise(np.zeros(bodies.mesh.dofs))
+        with located(source[0]):  # friction may hold either way
+            check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
         return single_load(
-            bodies, linearisation(bodies, *method, laws), laws,
+            bodies, linearise, laws,
             factorise=lambda: _floating(*source), reference=reference,
             steps=p["steps"], iterate=p["iterate"],
         )  # fmt: skip
