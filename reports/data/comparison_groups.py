@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -12,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from harness import Record, Verdict
+from harness.running.pairs import Block, ratio_of
 from reports.data.evidence import Evidence
 from reports.document.formatting import clean, listing, plural, tolerance
 
@@ -22,7 +24,13 @@ LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short ti
 _CELL = ["kind", "case", "solver"]
 
 Times = NDArray[np.float64]
+Pairs = NDArray[np.bool_]
+Seconds = Mapping[Block, float]
 Name = TypeVar("Name")
+
+
+def _no_pairs() -> Pairs:
+    return np.zeros((0, 0), dtype=bool)
 
 
 class Kind(NamedTuple):
@@ -68,6 +76,10 @@ class ComparisonGroup:
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
     incomplete: int = 0  #: cases left out, since some solver was not measured on them
+    apart: Pairs = field(default_factory=_no_pairs)
+    """(solvers, solvers) whether two share no block on some case; none: all share."""
+    told: Pairs = field(default_factory=_no_pairs)
+    """Of those, whether row is faster than column on every case, by its interval."""
 
     @property
     def title(self) -> str:
@@ -78,7 +90,7 @@ class ComparisonGroup:
     def notes(self) -> tuple[str, ...]:
         """Say what takes no part."""
         refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
-        return refused * bool(self.refused) + self.unmeasured
+        return refused * bool(self.refused) + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
@@ -88,6 +100,24 @@ class ComparisonGroup:
         return rare * bool(self.rare) + (
             f"Not measured by all, left out: {cases}.",
         ) * bool(self.incomplete)
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """Say who was measured in other sessions than whom."""
+        left = self.apart.copy()
+        pairs = []
+        while left.any():
+            late = int(left.sum(axis=1).argmax())
+            others = [self.solvers[i] for i in np.flatnonzero(left[late])]
+            pairs.append(f"{clean(self.solvers[late], 40)} with {listing(others, 4)}")
+            left[late] = left[:, late] = False
+        if not pairs:
+            return ()
+        return (
+            "Measured in different sessions, not within blocks, and told apart only "
+            "where the unpaired interval excludes 1 on every case: "
+            f"{'; '.join(pairs)}.",
+        )
 
     @property
     def comparable(self) -> bool:
@@ -141,10 +171,58 @@ def all_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
     outcomes = _outcomes(pd.DataFrame(rows))
     limit = _limit(evidence, outcomes)
     groups = zip(kinds, outcomes.groupby("kind"), strict=True)
-    return tuple(
+    made = (
         _group(kind, group, [*cases], evidence.solvers, limit)
         for kind, (_, group) in groups
     )
+    if len({r.session for r in records}) < 2:
+        return tuple(made)
+    blocks = _blocks(records)
+    return tuple(_with_sessions(group, blocks) for group in made)
+
+
+def _blocks(records: Iterable[Record]) -> dict[tuple[Kind, str, str], Seconds]:
+    """Seconds by block of each solver on each case; of a sweep, of its best answer."""
+    cells: dict[tuple[Kind, str, str], dict[float, list[Record]]] = {}
+    for r in records:
+        by_tol = cells.setdefault((kind_of(r), r.case, r.solver), {})
+        by_tol.setdefault(r.tol, []).append(r)
+
+    def rank(answer: list[Record]) -> tuple[bool, float]:
+        failed = any(r.verdict is not Verdict.VERIFIED for r in answer)
+        return failed, float(np.median([r.total_seconds or np.inf for r in answer]))
+
+    return {
+        cell: {
+            (r.session, r.repeat): r.total_seconds
+            for r in min(by_tol.values(), key=rank)
+            if r.total_seconds
+        }
+        for cell, by_tol in cells.items()
+    }
+
+
+def _with_sessions(
+    group: ComparisonGroup, blocks: Mapping[tuple[Kind, str, str], Seconds]
+) -> ComparisonGroup:
+    """Mark the solvers that were not measured together on every case."""
+    n = len(group.solvers)
+    apart, told = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
+    for i, j in combinations(range(n), 2):
+        pairs = [
+            tuple(
+                blocks[group.kind, case, group.solvers[s]] if group.solved[k, s] else {}
+                for s in (i, j)
+            )
+            for k, case in enumerate(group.cases)
+        ]
+        if all(a.keys() & b.keys() for a, b in pairs if a and b):
+            continue
+        apart[i, j] = apart[j, i] = True
+        ratios = [ratio_of(a, b) if a and b else None for a, b in pairs]
+        told[i, j] = all(r is not None and r.high < 1 for r in ratios)
+        told[j, i] = all(r is not None and r.low > 1 for r in ratios)
+    return replace(group, apart=apart, told=told)
 
 
 def kind_of(r: Record) -> Kind:

@@ -14,6 +14,7 @@ from harness.files.reading import read_json, read_toml
 from harness.record import VERIFIED_FACTOR
 from harness.results.faults import Fault, left, read_faults
 from harness.results.journal import read_journal
+from harness.running.pairs import Block
 from harness.verify.kkt import allowed, rejudged
 from reports.statistics.intervals import Interval, median_interval
 
@@ -112,9 +113,13 @@ class Outcome:
         return self._intervals[phase]
 
     @property
-    def by_repeat(self) -> dict[int, float]:
-        """Total seconds of each repeat that has them; repeats are of equal blocks."""
-        return {r.repeat: r.total_seconds for r in self.records if r.total_seconds}
+    def by_block(self) -> dict[Block, float]:
+        """Total seconds of each repeat that has them; see `harness.running.pairs`."""
+        return {
+            (r.session, r.repeat): r.total_seconds
+            for r in self.records
+            if r.total_seconds
+        }
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
