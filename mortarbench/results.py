@@ -18,6 +18,7 @@ from harness.registry import resolve
 from harness.results.faults import in_words
 from harness.results.folder import keep_environment
 from harness.results.journal import read_journal
+from harness.results.merge import merge as merge_folders
 from harness.running.executor import one_by_one
 from harness.running.progress import Progress
 from harness.running.run import Missing
@@ -107,6 +108,30 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     if not records:
         raise InputError(f"{path}: no measurements; expected a result folder of `run`")
     return Results(folder=path, records=tuple(records))
+
+
+def merge(
+    *folders: str | Path, out: str | Path, tell: Callable[[str], None] = ignore
+) -> Results:
+    """Make one result folder of several, or add them to one that was made so.
+
+    Every measurement is there once. What was measured in different environments stays
+    apart: records keep theirs, and reports mark it.
+
+    out : a new folder, or one of an earlier merge
+    tell : is told, in a line each, what was there before, or is missing
+
+    Raises
+    ------
+    InputError
+        When a folder holds no measurements, or two suites differ in their limits,
+        their accuracy or in what a label means; `out` is then as it was.
+
+    """
+    if not folders:
+        raise InputError("no folder to merge; expected result folders of `run`")
+    records = merge_folders([*map(Path, folders)], Path(out), tell)
+    return Results(folder=Path(out), records=tuple(records))
 
 
 def run(

@@ -135,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
         add("validate", "do all answers of a folder agree", "validate")
     )
     _add_report_options(add("report", "report on a result folder", "report"))
+    _add_merge_options(add("merge", "one result folder of several", "merge"))
     _add_replay_options(add("replay", "one measurement again", "replay"))
     _add_test_options(
         add("test-solver", "the conformance suite, on solvers", "test_solver")
@@ -206,6 +207,17 @@ def _add_report_options(command: _Parser) -> None:
         metavar="F",
         type=float,
         help="verified: every residual within F times the tolerance; default: 10",
+    )
+
+
+def _add_merge_options(command: _Parser) -> None:
+    command.add_argument("folders", metavar="DIR", type=Path, nargs="+")
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        type=_folder,
+        required=True,
+        help="a new folder, or one that was merged before, which is added to",
     )
 
 
