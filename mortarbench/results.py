@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.environment.doctor import load_advice
 from harness.environment.environment import digest
 from harness.errors import InputError, some
-from harness.record import Record
+from harness.record import Record, Verdict
 from harness.registry import resolve
 from harness.results.faults import in_words
 from harness.results.folder import keep_environment
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
     from harness.results.work_unit import Opens
 
 
+#: the solver said something of its answer that is not so
+REFUTED = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Results:
     """The measurements of a result folder."""
@@ -44,6 +49,7 @@ class Results:
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
     solvers: tuple[str, ...] = ()  #: of the suite, in its order
+    cases: frozenset[str] = frozenset()  #: that were asked for; all where none is named
     #: what was not measured; the same call tries it again
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
@@ -53,6 +59,43 @@ class Results:
         from pandas import DataFrame
 
         return DataFrame([record.to_dict() for record in self.records])
+
+    @property
+    def refuted(self) -> tuple[Record, ...]:
+        """Of what was asked for, the answers whose claim is refuted."""
+        return tuple(r for r in self._asked if r.verdict in REFUTED)
+
+    @property
+    def failed(self) -> tuple[Record, ...]:
+        """Of what was asked for, measurements that ended without an answer.
+
+        A limit that was met is among them; what a solver declined is not.
+        """
+        answered = (*REFUTED, Verdict.VERIFIED, Verdict.DECLINED)
+        return tuple(r for r in self._asked if r.verdict not in answered)
+
+    @property
+    def _asked(self) -> tuple[Record, ...]:
+        return tuple(
+            r
+            for r in self.records
+            if (not self.solvers or r.solver in self.solvers)
+            and (not self.cases or r.case in self.cases)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give counts and failures as plain data, as ``run --json`` prints them."""
+        counts: dict[str, Counter[str]] = {}
+        for r in self._asked:
+            counts.setdefault(r.solver, Counter())[r.verdict.value] += 1
+        return {
+            "folder": str(self.folder),
+            "measurements": len(self.records),
+            "solvers": {solver: dict(count) for solver, count in counts.items()},
+            "refuted": [_named(r) for r in self.refuted],
+            "failed": [_named(r) for r in self.failed],
+            "not_measured": self.shortfall,
+        }
 
     @property
     def shortfall(self) -> list[str]:
@@ -90,6 +133,20 @@ class Results:
         ]
         notes = "".join(f"<p>{escape(line)}</p>" for line in self.shortfall)
         return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>{notes}"
+
+
+def _named(r: Record) -> dict[str, Any]:
+    """Say which measurement it is and how it ended."""
+    return {
+        "run_id": r.run_id,
+        "case": r.case,
+        "solver": r.solver,
+        "tol": r.tol,
+        "repeat": r.repeat,
+        "status": r.verdict.value,
+        "claimed": r.claimed,
+        "message": r.message,
+    }
 
 
 def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:
@@ -222,5 +279,6 @@ def run(
         folder=folder,
         records=tuple(records),
         solvers=tuple(s.label for s in asked.solvers),
+        cases=frozenset(case.name for case in asked.names),
         missing=missing,
     )

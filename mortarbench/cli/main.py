@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
-from mortarbench.arguments import FORMATS
+from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
@@ -193,11 +193,12 @@ def _add_validate_options(command: _Parser) -> None:
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path)
     command.add_argument(
-        "other",
+        "others",
         metavar="DIR2",
         type=Path,
-        nargs="?",
-        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+        nargs="*",
+        help="what changed from DIR to DIR2, and to each further one, into "
+        "DIR2/report/against-DIR",
     )
     command.add_argument(
         "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
@@ -208,6 +209,13 @@ def _add_report_options(command: _Parser) -> None:
         type=float,
         help="verified: every residual within F times the tolerance; default: 10",
     )
+    command.add_argument(
+        "--fail-on",
+        metavar=",".join(GATES),
+        help="exit with 1 where a verdict became worse, or a solver slower beyond "
+        "chance, from DIR to DIR2",
+    )
+    _add_json(command)
 
 
 def _add_merge_options(command: _Parser) -> None:
@@ -272,6 +280,12 @@ def _add_run_options(command: _Parser) -> None:
         metavar="ADDRESS|local",
         help="measure on the workers of a Dask scheduler, see docs/cluster.md",
     )
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 where a claim is refuted or a solver failed",
+    )
+    _add_json(command)
 
 
 def _folder(text: str) -> Path:
