@@ -1,8 +1,11 @@
 """Campaigns that grow, are merged and gate a CI: real runs of toy problems."""
 
+import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from contextlib import suppress
 
 import pytest
@@ -12,11 +15,12 @@ from harness.files.reading import read_toml
 from harness.files.store import is_stored
 from harness.results.folder import environment_of
 from harness.results.journal import read_journal
+from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from reports.data.evidence import read_evidence
 from reports.folder import compose
 from reports.render.markdown import markdown
-from tests.support import TOY_PROBLEM
+from tests.support import ROOT, TOY_PROBLEM
 
 
 def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
@@ -290,3 +294,134 @@ def killed_merge(folders, out, instant):
 
 def read_all(results):
     return [r.to_json() for r in results.records]
+
+
+# what a CI asks
+
+
+@pytest.fixture
+def cli(tmp_path, capsys, monkeypatch):
+    """Run a command line in the folder of the test; returns code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def cli(*argv):
+        code = main(Registries(), [str(word) for word in argv])
+        streams = capsys.readouterr()
+        return code, streams.out, streams.err
+
+    return cli
+
+
+def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(cli, tmp_path):
+    asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
+    (tmp_path / "s.toml").write_text(
+        suite('"exact", "picky", "liar", "lost"', depths="2")
+    )
+    good = (*asked, "--solver", "exact", "--solver", "picky")
+
+    assert cli(*good, "--strict")[0] == 0  # who declined has not failed
+    assert cli(*asked)[0] == 0
+    code, out, _ = cli(*asked, "--strict")
+    assert code == 1
+    assert out.splitlines()[-1] == (
+        "strict: 1 answer that refutes its claim (liar on well/depth=2/dual) and 1 "
+        "measurement without an answer (lost on well/depth=2/dual)"
+    )
+    assert cli(*good, "--strict")[0] == 0  # the others are not asked for
+    code, out, _ = cli(*asked, "--strict", "--json")
+    told = json.loads(out)
+    assert code == 1
+    assert told["solvers"]["exact"] == {"verified": 1}
+    assert [one["solver"] for one in told["refuted"]] == ["liar"]
+    assert [(one["solver"], one["status"]) for one in told["failed"]] == [
+        ("lost", "failed")
+    ]
+    assert told["not_measured"] == []
+
+
+def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
+    cli, measure, tmp_path, monkeypatch
+):
+    """A solver that sleeps takes ten times as long in b; another one lies in c."""
+    monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
+    slow = '{{ name = "slow", label = "{}", options.seconds = {} }}'
+    honest, liar = slow.format("old", 0.02), '{ name = "liar", label = "old" }'
+    for name, seconds, old in (
+        ("a", 0.02, honest),
+        ("b", 0.2, honest),
+        ("c", 0.02, liar),
+    ):
+        solvers = f"{slow.format('new', seconds)}, {old}"
+        measure(name, solvers=solvers, depths="2, 3, 4")
+
+    assert cli("report", "a", "b", "--fail-on", "worse", "--format", "md")[0] == 0
+    code, out, _ = cli("report", "a", "b", "--fail-on", "worse,slower", "--json")
+    told = json.loads(out)
+    assert (code, told["failed_on"]) == (1, ["slower"])
+    (change,) = told["changes"]
+    assert {one["solver"] for one in change["slower"]} == {"new"}
+    assert change["slower"][0]["relative"]["low"] > 1
+    assert (change["cells"], change["worse"]) == (6, [])
+    code, out, _ = cli("report", "a", "b", "c", "--fail-on", "worse", "--format", "md")
+    assert code == 1
+    assert out.splitlines()[-1] == "failed on worse"
+    assert "c/report/since-a/report.md" in out
+    assert "| new |" in (tmp_path / "c/report/since-a/report.md").read_text()
+    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
+
+
+def test_what_cannot_be_judged_fails_by_its_own_line(cli, stored, measure):
+    assert cli("report", "a", "--fail-on", "worse")[0] == 2
+    code, _, err = cli("report", "a", "b", "--fail-on", "worse")
+    assert code == 2
+    assert "no cell (a solver on a case at a tolerance) is in both a and b" in err
+    code, _, err = cli("report", "a", "a", "--fail-on", "slower")
+    assert code == 2
+    assert "fail-on slower: a and a: fewer than 3 cases of a solver" in err
+    code, _, err = cli("report", "a", "b", "--fail-on", "slowr")
+    assert (code, "did you mean 'slower'" in err) == (2, True)
+
+
+def test_folders_are_merged_from_the_command_line(cli, stored):
+    code, out, _ = cli("merge", "a", "b", "--out", "all")
+    assert code == 0
+    assert out.splitlines()[-1] == "all: 12 measurements"
+    code, out, err = cli("merge", "a", "nowhere", "--out", "more")
+    assert (code, out) == (2, "")
+    assert "nowhere: no such folder; expected a result folder of `run`" in err
+
+
+def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
+    """By SIGKILL, as it is about to write its fourth line."""
+    before = measure(depths="2", repeats=1).records
+    grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}
+    (tmp_path / "grown.toml").write_text(suite(**grown))
+    given = [tmp_path / "grown.toml", tmp_path / "out", 3, TOY_PROBLEM]
+    program = [sys.executable, "-c", KILLED_RUN, *map(str, given)]
+    assert subprocess.run(program, cwd=ROOT).returncode == -signal.SIGKILL
+    held = read_journal(tmp_path / "out")
+    assert len(held) == len(before) + 3
+    whole = measure(**grown).records
+
+    assert len(whole) == len({r.run_id for r in whole}) == 3 * 2 * 2
+    assert list(whole[: len(held)]) == held
+
+
+KILLED_RUN = """
+import os, signal, sys
+import mortarbench as mb
+from harness.results.journal import Journal
+from mortarbench.registries import Registries
+
+suite, out, lines, plugin = sys.argv[1:]
+Registries.environment = lambda _: {"machine": {"cpu": "one"}}
+append, left = Journal.append, iter(range(int(lines)))
+
+def append_or_die(self, record):
+    if next(left, None) is None:
+        os.kill(os.getpid(), signal.SIGKILL)
+    append(self, record)
+
+Journal.append = append_or_die
+mb.run(suite, out=out, plugins=[plugin])
+"""
