@@ -20,7 +20,13 @@ from harness.record import finite
 from harness.registry import SolverSpec, options_of, resolve
 from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.arguments import (
+    GRIDS,
+    PICTURES,
+    drawn_scale,
+    tolerance,
+    writable,
+)
 from mortarbench.case import Case, build, built_case
 from mortarbench.registries import Plugins, one_thread
 from mortarbench.text import outcome, outcome_rows
@@ -37,6 +43,7 @@ class Answer:
     record: Record  #: the measurement, as a line of a journal
     solution: Solution | None  #: point and claim; None where the process ended
     spec: SolverSpec
+    defaults: Mapping[str, Any]  #: options that the solver has if none are given
 
     @property
     def verdict(self) -> Verdict:
@@ -91,19 +98,22 @@ class Answer:
             raise InputError(f"no picture: {self.record.solver} returned no point")
         return self.case.fields(self.solution)
 
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the deformed bodies with their stresses; into a file, too, if given.
+    def plot(self, path: str | Path | None = None, *, scale: float = 1.0) -> Figure:
+        """Draw the deformed bodies with their stresses, and each contact enlarged.
+
+        path : of a file to write, too: .png, .pdf or .svg
+        scale : of the displacement, as drawn
 
         Raises
         ------
         InputError
-            As `fields`; when the file cannot be written.
+            As `fields`; when the file cannot be written, or the scale is no number.
 
         """
         from reports.figures.deformed import deformed_figure
         from reports.render.saving import draw, save
 
-        figure = deformed_figure(self.fields())
+        figure = deformed_figure(self.fields(), drawn_scale(scale))
         if path is not None:
             save(figure, writable(Path(path), PICTURES))
         return draw(figure)
@@ -141,13 +151,13 @@ class Answer:
         return path
 
     def __repr__(self) -> str:
-        return outcome(self.record)
+        return outcome(self.record, self.defaults)
 
     def _repr_html_(self) -> str:
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in outcome_rows(self.record)
+            for name, value in outcome_rows(self.record, self.defaults)
         )
         return f"<table>{''.join(rows)}</table>"
 
@@ -190,8 +200,11 @@ def solve(
     given = dict(options or {})
     spec = SolverSpec(name=solver, label=solver, options=given)
     configured = resolve(spec, registries.solvers)
+    plainly = SolverSpec(name=solver, label=solver)
+    defaults = options_of(resolve(plainly, registries.solvers))
     if options_of(configured).get("history") is False and "history" not in given:
         # what telling costs is not at stake where nothing is compared
+        defaults = {**defaults, "history": True}
         spec = replace(spec, options={**given, "history": True})
         configured = resolve(spec, registries.solvers)
     record = new_record(
@@ -207,4 +220,6 @@ def solve(
         record, solution = measured_once(
             command, case.made, record, registries.reference
         )
-    return Answer(case=case, record=record, solution=solution, spec=spec)
+    return Answer(
+        case=case, record=record, solution=solution, spec=spec, defaults=defaults
+    )

@@ -63,6 +63,7 @@ def report(
     formats: Sequence[str] = FORMATS,
     factor: float = VERIFIED_FACTOR,
     fail_on: Sequence[str] = (),
+    pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
     """Write DIR/report, or what changed from `folder` to each other into the latter.
@@ -73,13 +74,15 @@ def report(
     factor : verified means every residual within factor·tol
     fail_on : what `Report.failed_on` tells of: ``worse``, a verdict became worse;
         ``slower``, an interval lies wholly above 1, see docs/statistics.md
+    pool_forms : means, ranks and profiles compare the cases of all forms together, not
+        form by form; a form that a solver declines is unsolved by it
     registries : whose way to report is used, instead of ours
 
     Raises
     ------
     InputError
-        When a folder holds no measurements, or a format or the factor is none, or what
-        to fail on cannot be judged.
+        When a folder holds no measurements, a format or the factor is none, forms are
+        to be pooled in a comparison, or what to fail on cannot be judged.
 
     """
     check_formats(formats, "formats")
@@ -91,19 +94,25 @@ def report(
     if not after:
         write = (registries or Registries()).report
         with full_disk_told(first):
-            return Report(files=tuple(write(first, formats, factor=factor)))
+            files = write(first, formats, factor=factor, pool_forms=pool_forms)
+            return Report(files=tuple(files))
+    if pool_forms:
+        raise InputError(
+            "forms are pooled in the report on one folder (--pool-forms), not in a "
+            "comparison of two, which pairs equal cases; leave one of them out"
+        )
     from reports import write_comparisons
 
     with ExitStack() as told:
         for one in after:
             told.enter_context(full_disk_told(one))
-        found, said, files = write_comparisons(first, after, formats, factor)
+        found, said, pages = write_comparisons(first, after, formats, factor)
     changes = tuple(map(_change, found))
     if fail_on:
         _refuse_unjudged(changes, fail_on)
     failed = [what for what in fail_on if any(change[what] for change in changes)]
     return Report(
-        files=tuple(files),
+        files=tuple(pages),
         said=tuple(said),
         changes=changes,
         failed_on=tuple(dict.fromkeys(failed)),

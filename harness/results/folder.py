@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.environment.environment import VOLATILE
+from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
 from harness.files.reading import MOST_TOML, read_json, read_text, read_toml, toml
@@ -276,10 +277,10 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
     if environment_file.exists():
         then = _environment(environment_file)
         if then["digest"] != environment["digest"]:
-            keys = some(key for key, *_ in differences(then, environment))
+            what = in_words(differences(then, environment), "then", "now")
             raise InputError(
                 f"{out} was measured in another environment ({then['digest']}, now "
-                f"{environment['digest']}{keys and f': {keys} changed'}); {REMEDY}"
+                f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
     return then is not None and then != now
 

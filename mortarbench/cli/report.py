@@ -32,6 +32,7 @@ def run(registries: Registries, options: Namespace) -> int:
         formats=formats,
         factor=VERIFIED_FACTOR if options.factor is None else options.factor,
         fail_on=gates,
+        pool_forms=options.pool_forms,
         registries=registries,
     )
     if options.json:

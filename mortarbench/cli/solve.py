@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness.errors import InputError, say
 from harness.names import parse
 from harness.registry import check_name
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -20,7 +20,12 @@ def run(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
     tolerance(options.tol, "--tol")
     if options.plot is not None:
-        writable(options.plot, PICTURES[:1])
+        writable(options.plot, PICTURES)
+    drawn_scale(options.scale, "--scale")
+    if options.plot is None and options.scale != 1.0:
+        raise InputError(
+            f"--scale {options.scale:g} without --plot; expected a picture"
+        )
     if options.vtu is not None:
         writable(options.vtu, GRIDS)
     registries = registries.with_files(options.plugin)
@@ -32,6 +37,8 @@ def run(registries: Registries, options: Namespace) -> int:
     from mortarbench.case import built_case
 
     case = built_case(parsed, registries)
+    for remark in case.remarks:
+        say(remark)
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     if drawn and case.made.fields is None:
         wanted = ", ".join(f"--{o}" for o in drawn)
@@ -65,6 +72,6 @@ def _draw(answer: Answer, options: Namespace) -> None:
         say(f"no picture: {answer.record.solver} returned no point")
         return
     if options.plot is not None:
-        answer.plot(options.plot)
+        answer.plot(options.plot, scale=options.scale)
     if options.vtu is not None:
         answer.save_vtu(options.vtu)

@@ -14,12 +14,14 @@ from reports import write_report
 from reports.data.evidence import Evidence, arrange
 from reports.data.quantities import spreads
 from reports.data.size_series import size_series
+from reports.document import layout
 from reports.document.formatting import clean, exponent, seconds, significant
 from reports.folder import compose
 from reports.render.html_page import breakable
 from reports.render.latex import escaped, latex
 from reports.render.markdown import escaped as md_escaped
 from reports.render.markdown import markdown
+from reports.render.writing import write_figures
 from reports.sections.summary import sentences
 from reports.statistics.intervals import power_law
 
@@ -430,6 +432,18 @@ def test_the_same_journal_gives_the_same_bytes(measured, square, tmp_path):
             "figures/deformed.pdf", "figures/scaling-1.svg"} <= set(names)  # fmt: skip
     for a, b in zip(first, second, strict=True):
         assert a.read_bytes() == b.read_bytes(), a.name
+
+
+def test_a_report_takes_away_numbered_figures_that_only_an_earlier_one_had(tmp_path):
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    for name in ("profiles-2.pdf", "deformed.png", "profiles-2.txt", "my-2 notes.pdf"):
+        (figures / name).touch()
+
+    write_figures(layout.Page(title="", dateline="", sections=()), tmp_path)
+
+    left = {path.name for path in figures.iterdir()}
+    assert left == {"deformed.png", "profiles-2.txt", "my-2 notes.pdf"}
 
 
 def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):

@@ -124,7 +124,7 @@ def test_equal_solvers_are_a_tie_and_the_next_is_behind_it(record, opened, make)
     ("logs", "why"),
     [
         # signs of six cases: five of one sign occur by chance in 2 of 2⁵
-        ([0.3, 0.3, 0.3, 0.3, 0.3, -0.01], "does not outlast a test of all pairs"),
+        ([0.3, 0.3, 0.3, 0.3, 0.3, -0.01], "but a test of all pairs at once does"),
         # all of one sign, but the interval of their mean holds 0
         ([0.01, 0.01, 0.01, 0.01, 0.01, 3.0], "b took 1.66 [0.4"),
     ],
