@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
-from mortarbench.arguments import FORMATS
+from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
@@ -186,13 +186,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_report_options(
         add(
             "report",
-            "write the report on a result folder, or on what changed between two",
+            "write the report on a result folder, or on what changed between several",
             "report",
         )
     )
     _add_replay_options(
         add("replay", "repeat one stored measurement, and compare", "replay")
     )
+    _add_merge_options(add("merge", "make one result folder of several", "merge"))
     _add_test_options(
         add(
             "test-solver",
@@ -288,11 +289,12 @@ def _add_validate_options(command: _Parser) -> None:
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
     command.add_argument(
-        "other",
+        "others",
         metavar="DIR2",
         type=Path,
-        nargs="?",
-        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+        nargs="*",
+        help="what changed from DIR to DIR2, and to each further one, into "
+        "DIR2/report/against-DIR",
     )
     command.add_argument(
         "--format",
@@ -312,6 +314,24 @@ def _add_report_options(command: _Parser) -> None:
         action="store_true",
         help="compare solvers over the cases of all forms together (means, ranks and "
         "profiles); otherwise each form is compared apart",
+    )
+    command.add_argument(
+        "--fail-on",
+        metavar=",".join(GATES),
+        help="exit with 1 where a verdict became worse, or a solver slower beyond "
+        "chance, from DIR to DIR2",
+    )
+    _add_json(command)
+
+
+def _add_merge_options(command: _Parser) -> None:
+    command.add_argument("folders", metavar="DIR", type=Path, nargs="+")
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        type=_folder,
+        required=True,
+        help="a new folder, or one that was merged before, which is added to",
     )
 
 
@@ -403,6 +423,12 @@ def _add_run_options(command: _Parser) -> None:
         help="measure on the workers of a Dask scheduler, or on several processes of "
         "this machine; see docs/cluster.md",
     )
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 where a claim is refuted or a solver failed",
+    )
+    _add_json(command)
 
 
 def _folder(text: str) -> Path:
