@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.environment.doctor import load_advice
 from harness.environment.environment import digest
@@ -23,6 +23,7 @@ from harness.running.progress import Progress
 from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
+from harness.suite.solver_options import as_given
 from harness.suite.suite import load_suite
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import Plugins, Registries, known
@@ -118,6 +119,7 @@ def run(
     repeats: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    options: Mapping[str, Any] | None = None,
     fresh: bool = False,
     dask: str | None = None,
     plugins: Plugins = (),
@@ -133,6 +135,7 @@ def run(
     solvers : only these; names that the suite has not are added
     cases : only these, patterns or names
     repeats, time_limit, memory_limit : instead of the suite's; s, MiB
+    options : of every solver that has them; a list of values sweeps
     fresh : forget first what the folder holds
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families
@@ -158,6 +161,7 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
+        options=as_given(options or {}),
     )
     folder = Path("out") / asked.name if out is None else Path(out)
     environment = registries.environment()

@@ -22,6 +22,7 @@ from uuid import uuid4
 from harness.environment.environment import packages_of
 from harness.errors import InputError, some
 from harness.operators import Maker
+from harness.registry import PluginFile
 from harness.results.folder import differences
 from harness.results.work_unit import (
     Commands,
@@ -51,7 +52,7 @@ _CODE = ("source", "versions.mortarbench", "plugins")
 def on_cluster(
     address: str,
     *,
-    plugins: Sequence[Path],
+    plugins: Sequence[PluginFile],
     operators: Mapping[str, Maker],
     environment: Mapping[str, Any],
     keep: Keep,
@@ -90,7 +91,7 @@ def on_cluster(
             client = _connected(address, stack)
             name = f"mortarbench-{client.id}"
             _forget_lost_runs(client)
-            files = [file.resolve() for file in plugins]
+            files = [file.resolved() for file in plugins]
             sharing, packages = _sharing(client), packages_of(environment)
             node = ExecutorPlugin(commands, files, operators, sharing, packages)
             client.register_plugin(node, name=name)

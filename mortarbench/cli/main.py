@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
+from harness.registry import PluginFile
 from mortarbench.arguments import FORMATS
 from mortarbench.registries import Registries, installed
 
@@ -157,6 +158,7 @@ def _add_solve_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE", help="FAMILY/key=value/…/FORM")
     command.add_argument("--solver", metavar="NAME", required=True)
     command.add_argument("--tol", metavar="T", type=float, default=1e-8)
+    _add_option(command, "of the solver, instead of its default")
     command.add_argument(
         "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
     )
@@ -248,6 +250,7 @@ def _add_run_options(command: _Parser) -> None:
     command.add_argument(
         "--case", metavar="PATTERN", action="append", default=[], help="only these"
     )
+    _add_option(command, "of the solvers that have it; VALUE,VALUE measures both")
     _add_plugin(command)
     command.add_argument("--repeats", metavar="N", type=int)
     command.add_argument("--time-limit", metavar="SECONDS", type=float)
@@ -268,14 +271,20 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _add_option(command: _Parser, what: str) -> None:
+    command.add_argument(
+        "--option", metavar="KEY=VALUE", action="append", default=[], help=what
+    )
+
+
 def _add_plugin(command: _Parser) -> None:
     command.add_argument(
         "--plugin",
-        metavar="FILE.py",
-        type=Path,
+        metavar="[LABEL=]FILE.py",
+        type=PluginFile.of,
         action="append",
         default=[],
-        help="more solvers or problems",
+        help="more solvers or problems; of LABEL=FILE.py solvers are LABEL:NAME",
     )
 
 

@@ -7,6 +7,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from harness.files.durable import full_disk_told
+from harness.suite.solver_options import given_options
 from mortarbench.registries import Registries
 
 
@@ -14,6 +15,7 @@ def run(registries: Registries, options: Namespace) -> int:
     """Measure what the result folder lacks of a suite, and report; 1 if not all."""
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)
+    changed = given_options(options.option)
 
     from mortarbench import results
     from mortarbench.progress import shown_on
@@ -28,6 +30,7 @@ def run(registries: Registries, options: Namespace) -> int:
             repeats=options.repeats,
             time_limit=options.time_limit,
             memory_limit=options.memory_limit,
+            options=changed,
             fresh=options.fresh,
             dask=options.dask,
             progress=progress,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from harness.errors import InputError, say
 from harness.names import parse
 from harness.registry import check_name
+from harness.suite.solver_options import options_for
 from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
 from mortarbench.registries import Registries
 
@@ -26,6 +27,7 @@ def run(registries: Registries, options: Namespace) -> int:
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
+    changed = options_for(options.solver, options.option, registries.solvers)
 
     from harness.record import Verdict
     from mortarbench.answer import solve
@@ -36,7 +38,7 @@ def run(registries: Registries, options: Namespace) -> int:
     if drawn and case.made.fields is None:
         wanted = ", ".join(f"--{o}" for o in drawn)
         raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
-    answer = solve(case, options.solver, tol=options.tol)
+    answer = solve(case, options.solver, tol=options.tol, options=changed)
     record = answer.record
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
