@@ -174,7 +174,7 @@ def _add_solve_options(command: _Parser) -> None:
 
 def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE")
-    command.add_argument("file", metavar="FILE.npz|mat|parquet", type=Path)
+    command.add_argument("file", metavar="FILE.npz|mat|parquet|qps", type=Path)
     _add_plugin(command)
 
 

@@ -80,7 +80,8 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
 
     assert code == 0, err
     assert {s: (str(r.verdict), r.iterations) for s, r in records.items()} == {
-        "old:mine": ("wrong", 2), "new:mine": ("verified", 1), "exact": ("verified", None)
+        "old:mine": ("wrong", 2), "new:mine": ("verified", 1),
+        "exact": ("verified", None),
     }  # fmt: skip
     assert len({r.block for r in records.values()}) == 1
     assert environment["plugins"].keys() == {"old=mine.py", "new=mine.py"}
