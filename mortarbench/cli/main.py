@@ -140,6 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_test_options(
         add("test-solver", "the conformance suite, on solvers", "test_solver")
     )
+    _add_new_options(add("new", "a solver, problem or suite to start from", "new"))
     _add_paper_options(add("paper", "every figure of the paper", "paper"))
     _add_json(add("doctor", "is this machine fit to measure", "doctor"))
     return parser
@@ -230,6 +231,13 @@ def _add_test_options(command: _Parser) -> None:
         help="only what equivalent formulations change, as in docs/weaknesses.md",
     )
     _add_json(shown)
+
+
+def _add_new_options(command: _Parser) -> None:
+    command.add_argument("kind", choices=("solver", "problem", "suite"))
+    command.add_argument(
+        "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
+    )
 
 
 def _add_paper_options(command: _Parser) -> None:

@@ -15,7 +15,9 @@ quadratic programming problems", Optim. Methods Softw. 11/12:
 Undefined names and numbers that are none are refused, with their line: HiGHS' reader
 (1.15) ignores the one and takes the other for 0.
 
-What is written here is read here as the same QP, to the last digit of every number.
+What is written here is read here as the same QP, to the last digit of every number. Of
+a P that is symmetric up to rounding only, that is its symmetric part: the objective has
+no other, and HiGHS refuses a QMATRIX whose triangles differ in the last digit.
 """
 
 from __future__ import annotations
@@ -143,9 +145,8 @@ def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
         for kind, value in _bound_kinds(low, high):
             yield f" {kind} bnd       x{j + 1}  {value}".rstrip()
     P = csc_array(explicit_matrices(qp)[0]["P"])
-    is_symmetric = (P != P.T).nnz == 0
-    entries = coo_array(tril(P) if is_symmetric else P.T)
-    yield "QUADOBJ" if is_symmetric else "QMATRIX"
+    entries = coo_array(tril((P + P.T) / 2))
+    yield "QUADOBJ"
     for i, j, value in zip(*entries.coords, entries.data, strict=True):
         yield f"    x{j + 1}  x{i + 1}  {_digits(value)}"
     yield "ENDATA"

@@ -1,14 +1,18 @@
 """What authors of solvers do: sweeps, versions side by side, files to start from."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
+from harness.conformance.conformance import CHECKS, Grade, run_check
 from harness.registry import load_plugin
 from harness.results.journal import read_journal
+from harness.suite.suite import load_suite
 from mortarbench.cli.main import main
+from mortarbench.cli.test_solver import conforms
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
@@ -140,3 +144,107 @@ def test_one_solve_has_options_too(cli, versions):
         "mortarbench: --option: new:mine: unknown option 'faktor'; did you mean "
         "'factor'? known: factor\n"
     )
+
+
+# files to start from
+
+
+@pytest.fixture
+def starting(capsys, monkeypatch, tmp_path):
+    """Run the command line with all that there is, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+
+    def run(*argv):
+        return main(Registries(), [*map(str, argv)]), *capsys.readouterr()
+
+    return run
+
+
+def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
+    code, out, err = starting("new", "solver", "my-own")
+    solver = load_plugin("my-own.py").solvers["my-own"]
+    results = {check: run_check(check, solver) for check in CHECKS}
+
+    assert (code, out) == (0, "my-own.py\n")
+    assert "mortarbench test-solver my-own --plugin my-own.py" in err
+    assert conforms(results)
+    assert {c for c, r in results.items() if r.grade is Grade.DECLINE} == {
+        "takes or declines an operator", "solves a sequence"
+    }  # fmt: skip
+
+
+def test_a_new_problem_builds_what_its_name_says(starting):
+    """−u″ = −1 and u = −depth where it touches: u leaves it at √(2·depth)."""
+    starting("new", "problem", "mine")
+    name = "mine/n=399/primal"
+    solve = ("solve", name, "--solver", "clarabel", "--plugin", "mine.py", "--json")
+    code, out, err = starting(*solve)
+    quantities = json.loads(out)["quantities"]
+
+    assert code == 0, err
+    assert quantities["lowest"] == pytest.approx(-0.05, rel=1e-6)
+    assert quantities["touching"] / 400 == pytest.approx(1 - 2 * 0.1**0.5, abs=0.01)
+    assert starting(*solve[:1], "mine/n=1/primal", *solve[2:])[2] == (
+        "mortarbench: mine: n = 1; expected at least 2\n"
+    )
+
+
+def test_a_new_suite_is_one_of_known_solvers_and_cases(starting):
+    starting("new", "suite", "mine")
+    registries = Registries()
+    suite = load_suite(Path("mine.toml"), registries.families, registries.solvers)
+
+    assert suite.name == "mine"
+    assert len(suite.cases) == 4
+    assert [s.label for s in suite.solvers] == ["smalbe", "osqp", "clarabel-50"]
+
+
+@pytest.mark.slow
+def test_a_new_suite_runs(starting):
+    starting("new", "suite", "mine")
+
+    assert starting("run", "mine.toml", "--repeats", "1")[0] == 0
+    assert {str(r.verdict) for r in read_journal(Path("out/mine"))} <= {
+        "verified", "declined", "inaccurate"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["solver", "problem", "suite"])
+def test_nothing_is_written_over(starting, tmp_path, kind):
+    name = "mine.toml" if kind == "suite" else "mine.py"
+    (tmp_path / name).write_text("precious")
+    (tmp_path / "other.py").symlink_to("gone")
+    code, out, err = starting("new", kind, "mine")
+
+    assert (code, out) == (2, "")
+    assert err == (
+        f"mortarbench: {name} exists; expected another name, or no such file\n"
+    )
+    assert (tmp_path / name).read_text() == "precious"
+    assert starting("new", "solver", "other")[0] == 2
+    assert not (tmp_path / "gone").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("solver", "osqp"), "there is a solver 'osqp'; expected a name of its own"),
+        (
+            ("problem", "obstacle"),
+            "there is a problem 'obstacle'; expected a name of its",
+        ),
+        (("suite", "demo"), "there is a suite 'demo'; expected a name of its own"),
+        (("solver", "a/b"), "name 'a/b'; expected letters, digits, '-' and '_'"),
+        (("solver", "../b"), "name '../b'; expected letters"),
+        (("solver", ""), "name ''; expected letters"),
+        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', a lett"),
+        (("familie", "b"), "argument kind: invalid choice: 'familie' (choose from"),
+    ],
+)
+def test_a_name_that_is_none_is_refused(starting, tmp_path, words, message):
+    code, _, err = starting("new", *words)
+
+    assert code == 2
+    assert err.startswith(f"mortarbench: {message}")
+    assert [*tmp_path.iterdir()] == []
