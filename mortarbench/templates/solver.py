@@ -78,7 +78,9 @@ def iterates(
     """
     p = d.size
     x, y = solved(P, A, C, np.ones(p), C.T @ d - q, b)
-    s, z = np.maximum(d - C @ x, 1.0), np.ones(p)
+    gap = d - C @ x
+    s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)  # far inside, in any units
+    z = np.full(p, np.abs(q).max(initial=0.0) or 1.0)
 
     def newton(r_z: Vector) -> tuple[Vector, Vector, Vector, Vector]:
         """Solve Newton's equations, the last of which is z ds + s dz = −r_z."""
@@ -102,11 +104,11 @@ def iterates(
 def solved(
     P: Vector, A: Vector, C: Vector, weights: Vector, right: Vector, b: Vector
 ) -> tuple[Vector, Vector]:
-    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b."""
+    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b; singular ones nearly."""
     m, n = A.shape
     K = np.block([[P + C.T @ (weights[:, None] * C), A.T], [A, np.zeros((m, m))]])
-    delta = 1e-12 * max(1.0, np.abs(P).max(initial=0.0))  # K may be singular
-    K += delta * np.diag(np.append(np.ones(n), -np.ones(m)))
+    size = np.abs(P).max(initial=0.0) or 1.0
+    K += 1e-12 * np.diag(np.append(np.full(n, size), np.full(m, -1 / size)))
     x, y = np.split(np.linalg.solve(K, np.append(right, b)), [n])
     return x, y
 
