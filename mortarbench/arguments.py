@@ -10,6 +10,7 @@ from harness.errors import InputError, unknown
 EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
+MOST_SCALE = 1e9  #: of displacements in pictures
 GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
 
 
@@ -60,6 +61,22 @@ def tolerance(tol: float, where: str = "tol") -> float:
     if not 0 < tol < 1:
         raise InputError(f"{where} = {tol}; expected a number between 0 and 1")
     return tol
+
+
+def drawn_scale(scale: float, where: str = "scale") -> float:
+    """Take a factor of displacements in pictures.
+
+    Raises
+    ------
+    InputError
+        When it is no finite number of a usual size.
+
+    """
+    if not abs(scale) <= MOST_SCALE:  # a NaN, too
+        raise InputError(
+            f"{where} = {scale:g}; expected a number, at most {MOST_SCALE:g}"
+        )
+    return scale
 
 
 def budget(seconds: float, where: str = "budget") -> float:

@@ -43,6 +43,11 @@ class Case:
         """Which of the equivalent QPs of the problem this is: primal, dual, …."""
         return self.id.form
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What may be wrong with the input, a line each: moduli of odd sizes."""
+        return self.made.remarks
+
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
         return dict(plain(self.made.quantities(solution)))

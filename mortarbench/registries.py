@@ -40,9 +40,14 @@ class Reporter(Protocol):
     """Writes the report on a result folder, and returns the files."""
 
     def __call__(
-        self, folder: Path, formats: Sequence[str], *, factor: float = ...
+        self,
+        folder: Path,
+        formats: Sequence[str],
+        *,
+        factor: float = ...,
+        pool_forms: bool = ...,
     ) -> list[Path]:
-        """Report; verdicts are those at factor·tol."""
+        """Report; verdicts are those at factor·tol, forms are compared together."""
 
 
 def suites_folder() -> Path:
@@ -74,12 +79,17 @@ def reference(qp: QP) -> Solution:
 
 
 def _report(
-    folder: Path, formats: Sequence[str], *, factor: float | None = None
+    folder: Path,
+    formats: Sequence[str],
+    *,
+    factor: float | None = None,
+    pool_forms: bool = False,
 ) -> list[Path]:
     from harness.record import VERIFIED_FACTOR
     from reports import write_report
 
-    return write_report(folder, formats, VERIFIED_FACTOR if factor is None else factor)
+    factor = VERIFIED_FACTOR if factor is None else factor
+    return write_report(folder, formats, factor, pool_forms=pool_forms)
 
 
 ValidationPage: TypeAlias = (
@@ -152,6 +162,15 @@ class Registries:
                 raise InputError(f"{file.path}: {e}") from None
             extended = replace(extended, files=(*extended.files, file))
         return extended
+
+    def hold_own_code_only(self) -> bool:
+        """Whether nothing of a plug-in has been loaded."""
+        return (
+            self.families is PROBLEMS
+            and self.solvers is SOLVERS
+            and not self.operators
+            and not self.files
+        )
 
     def worker_command(self, spec: SolverSpec) -> list[str]:
         """Make the command that starts the worker of a solver, less its two pipes."""

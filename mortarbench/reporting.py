@@ -8,6 +8,7 @@ from html import escape
 from pathlib import Path
 
 from harness.checked import positive
+from harness.errors import InputError
 from harness.files.durable import full_disk_told
 from harness.record import VERIFIED_FACTOR
 from mortarbench.arguments import FORMATS, check_formats
@@ -43,6 +44,7 @@ def report(
     *,
     formats: Sequence[str] = FORMATS,
     factor: float = VERIFIED_FACTOR,
+    pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
     """Write DIR/report, or what changed from `folder` to `other` into the latter.
@@ -51,12 +53,15 @@ def report(
     ----------
     formats : of html, md, tex, csv, parquet
     factor : verified means every residual within factor·tol
+    pool_forms : means, ranks and profiles compare the cases of all forms together, not
+        form by form; a form that a solver declines is unsolved by it
     registries : whose way to report is used, instead of ours
 
     Raises
     ------
     InputError
-        When a folder holds no measurements, or a format or the factor is none.
+        When a folder holds no measurements, a format or the factor is none, or forms
+        are to be pooled in a comparison of two folders.
 
     """
     check_formats(formats, "formats")
@@ -65,10 +70,16 @@ def report(
     if other is None:
         write = (registries or Registries()).report
         with full_disk_told(before):
-            return Report(files=tuple(write(before, formats, factor=factor)))
+            files = write(before, formats, factor=factor, pool_forms=pool_forms)
+            return Report(files=tuple(files))
+    if pool_forms:
+        raise InputError(
+            "forms are pooled in the report on one folder (--pool-forms), not in a "
+            "comparison of two, which pairs equal cases; leave one of them out"
+        )
     from reports import write_comparison
 
     after = Path(other)
     with full_disk_told(after):
-        said, files = write_comparison(before, after, formats, factor)
-    return Report(files=tuple(files), said=tuple(said))
+        said, changed = write_comparison(before, after, formats, factor)
+    return Report(files=tuple(changed), said=tuple(said))

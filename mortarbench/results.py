@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from html import escape
@@ -165,7 +166,7 @@ def run(
     )
     folder = Path("out") / asked.name if out is None else Path(out)
     environment = registries.environment()
-    with shown(progress) as display:
+    with shown(progress) as display, ExitStack() as stack:
         if load_advice(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
@@ -177,13 +178,15 @@ def run(
         else:
             from harness.running.cluster import on_cluster
 
-            engine = on_cluster(
-                dask,
-                plugins=registries.files,
-                operators=registries.own_operators,
-                environment=environment,
-                keep=lambda name, there: keep_environment(folder, name, there),
-                warn=display.warn,
+            engine = stack.enter_context(
+                on_cluster(
+                    dask,
+                    plugins=registries.files,
+                    operators=registries.own_operators,
+                    environment=environment,
+                    keep=lambda name, there: keep_environment(folder, name, there),
+                    warn=display.warn,
+                )
             )
         missing = run_suite(
             asked,

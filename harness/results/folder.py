@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from harness.environment.environment import VOLATILE
+from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
 from harness.files.reading import MOST_TOML, read_json, read_text, read_toml, toml
@@ -271,10 +272,10 @@ def _check_same(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None
     if environment_file.exists():
         then = _environment(environment_file)
         if then["digest"] != environment["digest"]:
-            keys = some(key for key, *_ in differences(then, environment))
+            what = in_words(differences(then, environment), "then", "now")
             raise InputError(
                 f"{out} was measured in another environment ({then['digest']}, now "
-                f"{environment['digest']}{keys and f': {keys} changed'}); {remedy}"
+                f"{environment['digest']}{what and f': {what}'}); {remedy}"
             )
 
 

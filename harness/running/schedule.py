@@ -91,7 +91,9 @@ class Schedule:
                     block = self._block(group, tol, repeat)
                     if block is not None:
                         first = block.turns[0][0]
-                        self.progress.say(f"{first.case}, tol {tol:g}, {repeat + 1}")
+                        self.progress.say(
+                            f"{first.case}, tol {tol:g}, repeat {repeat + 1}"
+                        )
                         yield block
 
     @property

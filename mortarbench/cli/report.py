@@ -25,6 +25,7 @@ def run(registries: Registries, options: Namespace) -> int:
         options.other,
         formats=formats,
         factor=VERIFIED_FACTOR if options.factor is None else options.factor,
+        pool_forms=options.pool_forms,
         registries=registries,
     )
     pages = [file for file in found.files if file.suffix == ".html"]

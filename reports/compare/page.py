@@ -270,7 +270,7 @@ def conditions_that_differ(c: Comparison) -> Section:
     if other:
         prose.append(
             f"{plural(len(other), 'cell')} had another QP after than before, bit for "
-            "bit: the generator, its parameters' meaning or the BLAS changed. The "
+            "bit: the family, its parameters' meaning or the BLAS changed. The "
             f"first: {cell_name(other[0])}. Where sizes differ, nothing is compared."
         )
     return Section(

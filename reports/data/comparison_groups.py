@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
@@ -17,6 +18,7 @@ from reports.document.formatting import clean, listing, plural, tolerance
 
 #: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
 CASES = 6
+POOLED = "all forms"  #: instead of a form, of a group that cases of every form are in
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
 _CELL = ["kind", "case", "solver"]
@@ -67,6 +69,7 @@ class ComparisonGroup:
     limit: float  #: s per measurement; the longest one, where the suite has no limit
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
+    forms: Mapping[str, int] = field(default_factory=dict)  #: cases of each, if pooled
     incomplete: int = 0  #: cases left out, since some solver was not measured on them
 
     @property
@@ -78,7 +81,16 @@ class ComparisonGroup:
     def notes(self) -> tuple[str, ...]:
         """Say what takes no part."""
         refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
-        return refused * bool(self.refused) + self.unmeasured
+        counted = [
+            f"{clean(form, 24)} {plural(n, 'case')}" for form, n in self.forms.items()
+        ]
+        pooled = (
+            f"Forms together: {', '.join(counted)}. A form that a solver declines is "
+            "unsolved by it.",
+        )
+        return (
+            pooled * bool(self.forms) + refused * bool(self.refused) + self.unmeasured
+        )
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
@@ -92,8 +104,16 @@ class ComparisonGroup:
     @property
     def comparable(self) -> bool:
         """Whether cases, solvers and answers are enough for a statement over cases."""
-        shape = len(self.cases) >= CASES and len(self.solvers) > 1
-        return shape and bool(self.solved.any())
+        return not self.lack
+
+    @property
+    def lack(self) -> str:
+        """Say what is missing for a statement over cases; empty if nothing is."""
+        if len(self.solvers) < 2:
+            return plural(len(self.solvers), "solver")
+        if len(self.cases) < CASES:
+            return plural(len(self.cases), "case")
+        return "" if self.solved.any() else "no verified answer"
 
     @cached_property
     def solved(self) -> NDArray[np.bool_]:
@@ -113,37 +133,53 @@ class ComparisonGroup:
         return float(max(self.limit, both[np.isfinite(both)].max()))
 
 
-def comparison_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
-    """Group what was measured by form and accuracy; groups of few cases are left out.
+def comparison_groups(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> tuple[ComparisonGroup, ...]:
+    """Group what was measured, as `all_groups`; groups of few cases are left out.
 
     At least `CASES` cases, two solvers and one verified answer make a group.
     """
-    return tuple(group for group in all_groups(evidence) if group.comparable)
+    groups = all_groups(evidence, pool_forms=pool_forms)
+    return tuple(group for group in groups if group.comparable)
 
 
-def all_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
+def all_groups(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> tuple[ComparisonGroup, ...]:
     """Group what was measured by form and accuracy, whatever can be said of it.
 
     Forms are apart, since the primal and the dual QP of one problem are two problems to
     a solver; so are cold solves and sequences.
+
+    pool_forms : put all forms into one group; each QP is still a case of its own
     """
     records = [r for r in evidence.records if not r.role]
     if not records:
         return ()
-    kinds = _numbered(map(kind_of, records))
+    of = [kind_of(r) for r in records]
+    if pool_forms:
+        of = [kind._replace(form=POOLED) for kind in of]
+    kinds = _numbered(of)
     cases = _numbered(r.case for r in records)
     solvers = _numbered(evidence.solvers)
     rows = [
-        {"kind": kinds[kind_of(r)], "case": cases[r.case], "solver": solvers[r.solver]}
+        {"kind": kinds[kind], "case": cases[r.case], "solver": solvers[r.solver]}
         | _row(r)
-        for r in records
+        for kind, r in zip(of, records, strict=True)
     ]
     outcomes = _outcomes(pd.DataFrame(rows))
     limit = _limit(evidence, outcomes)
-    groups = zip(kinds, outcomes.groupby("kind"), strict=True)
-    return tuple(
+    found = tuple(
         _group(kind, group, [*cases], evidence.solvers, limit)
-        for kind, (_, group) in groups
+        for kind, (_, group) in zip(kinds, outcomes.groupby("kind"), strict=True)
+    )
+    if not pool_forms:
+        return found
+    form = {r.case: r.form for r in records}
+    return tuple(
+        replace(group, forms=Counter(form[case] for case in group.cases))
+        for group in found
     )
 
 

@@ -40,9 +40,10 @@ def summary(evidence: Evidence) -> Section:
     prose = [
         f"{_made(evidence)}: "
         f"{plural(len(evidence.solvers), 'solver')}, {plural(cases, 'case')}, "
-        f"tolerance {', '.join(map(tolerance, tols))}. A solver claims; the harness "
-        "verifies: every verdict below comes from what we evaluated ourselves at the "
-        "returned point, and only verified answers enter a comparison of times.",
+        f"tolerance {', '.join(map(tolerance, tols))}. What a solver says of its "
+        "answer is recorded beside our verdict: every verdict below comes from "
+        "residuals that we evaluated at the returned point, and only verified answers "
+        "enter a comparison of times.",
     ]
     digests = sorted({r.environment for r in evidence.records})
     if len(digests) > 1:

@@ -226,8 +226,9 @@ def precision(evidence: Evidence) -> Section | None:
         )
     if canary is not None:
         prose.append(
-            "Just before every measurement the worker times a small kernel that is "
-            "always the same: where that moves, the machine moved, not a solver."
+            "Just before every measurement the worker times one small computation, the "
+            "canary, which is always the same. Where its time changes, the machine has "
+            "changed, and not a solver."
         )
     return Section(
         name="precision",

@@ -105,7 +105,7 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
     (tmp_path / "old" / "step.py").write_text("LENGTH = 3")
     code, _, err = cli("run", "mine.toml", *versions)
     assert code == 2
-    assert "plugins.old=mine.py changed" in err
+    assert "content of the plug-in old=mine.py: " in err
 
 
 def test_versions_without_labels_are_told_of_them(cli, versions):
