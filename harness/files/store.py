@@ -86,7 +86,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
     with _restorable():
         _, arrays = _as_stored(folder, digest, _ALWAYS)
     nodal = _with_prefix(_NODAL, arrays)
-    known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
+    known: dict[str, Any] = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
     return Fields(nodal=nodal, **known)
 
 
