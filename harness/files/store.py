@@ -17,7 +17,7 @@ from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
 from harness.files.durable import replace_file
-from harness.plugin import Fields
+from harness.plugin import ContactSide, Fields
 from harness.solution import History, Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -27,6 +27,8 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces")
 _NODAL = "nodal_"
+_SIDE = "side_{}_"  #: of the contact of that number
+_ALONG = ("nodes", "length", "force", "pressure", "gap")
 _HISTORY = "history_"
 
 
@@ -71,6 +73,10 @@ def field_arrays(fields: Fields) -> Arrays:
     """List the arrays of a deformed state by name."""
     arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
+    for i, side in enumerate(fields.contacts):
+        arrays |= {
+            _SIDE.format(i) + name: getattr(side, name) for name in ("name", *_ALONG)
+        }
     return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
 
@@ -86,8 +92,19 @@ def load_fields(folder: Path, digest: str) -> Fields:
     with _restorable():
         _, arrays = _as_stored(folder, digest, _ALWAYS)
     nodal = _with_prefix(_NODAL, arrays)
-    known: dict[str, Any] = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
-    return Fields(nodal=nodal, **known)
+    known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
+    return Fields(nodal=nodal, contacts=tuple(_sides(arrays)), **known)
+
+
+def _sides(arrays: Arrays) -> Iterator[ContactSide]:
+    """Find the contacts of a deformed state; none in files of old."""
+    for i in range(len(arrays)):
+        side = _with_prefix(_SIDE.format(i), arrays)
+        if not set(side) >= {"name", *_ALONG}:
+            return
+        yield ContactSide(
+            name=str(side["name"]), **{name: side[name] for name in _ALONG}
+        )
 
 
 def write_point(path: Path, solution: Solution) -> None:

@@ -31,6 +31,10 @@ from reports.render.drawing import STYLE, look_of
 _CASING: list[patheffects.AbstractPathEffect] = [
     patheffects.withStroke(linewidth=1.6, foreground="white")
 ]
+#: wide enough that the strokes of a letter do not show white between them
+_LETTER_CASING: list[patheffects.AbstractPathEffect] = [
+    patheffects.withStroke(linewidth=3.2, foreground="white")
+]
 
 
 def draw_fields(figure: FieldFigure) -> Canvas:
@@ -111,7 +115,7 @@ def _mark(axes: Axes, mark: FieldMark, height: float) -> None:
             axes.annotate(
                 mark.text, mark.place, xytext=mark.offset, color=mark.colour,
                 textcoords="offset points", ha=mark.align[0], va=mark.align[1],
-                path_effects=_CASING if mark.cased else [], zorder=height,
+                path_effects=_LETTER_CASING if mark.cased else [], zorder=height,
             )  # fmt: skip
 
 
