@@ -7,7 +7,7 @@ from pathlib import Path
 
 from harness.errors import InputError, unknown
 
-EXPORTS = (".npz", ".mat", ".parquet")  #: files that a QP is written to
+EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
 GATES = ("worse", "slower")  #: what a comparison may fail on

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -26,6 +26,7 @@ from harness.running.progress import Progress
 from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
+from harness.suite.solver_options import as_given
 from harness.suite.suite import load_suite
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import Plugins, Registries, known
@@ -201,6 +202,7 @@ def run(
     repeats: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    options: Mapping[str, Any] | None = None,
     fresh: bool = False,
     dask: str | None = None,
     plugins: Plugins = (),
@@ -216,6 +218,7 @@ def run(
     solvers : only these; names that the suite has not are added
     cases : only these, patterns or names
     repeats, time_limit, memory_limit : instead of the suite's; s, MiB
+    options : of every solver that has them; a list of values sweeps
     fresh : forget first what the folder holds
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families
@@ -241,6 +244,7 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
+        options=as_given(options or {}),
     )
     folder = Path("out") / asked.name if out is None else Path(out)
     environment = registries.environment()

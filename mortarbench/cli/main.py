@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
+from harness.registry import PluginFile
 from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
 
@@ -211,6 +212,14 @@ def _parser() -> argparse.ArgumentParser:
             "doctor",
         )
     )
+    _add_new_options(
+        add(
+            "new",
+            "write a solver, a problem or a suite to start from",
+            "new",
+            "The file passes its checks as it is. Nothing is written over.",
+        )
+    )
     return parser
 
 
@@ -237,6 +246,7 @@ def _add_solve_options(command: _Parser) -> None:
         default=1e-8,
         help="relative accuracy that the solver is asked for; default: 1e-8",
     )
+    _add_option(command, "an option of the solver, instead of its default")
     command.add_argument(
         "--plot",
         metavar="FILE.png|pdf|svg",
@@ -265,9 +275,9 @@ def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE", help=_CASE)
     command.add_argument(
         "file",
-        metavar="FILE.npz|mat|parquet",
+        metavar="FILE.npz|mat|parquet|qps",
         type=Path,
-        help="for NumPy, MATLAB and Octave, or qpbenchmark",
+        help="for NumPy, MATLAB and Octave, qpbenchmark, or what reads QPS",
     )
     _add_plugin(command)
 
@@ -361,6 +371,13 @@ def _add_test_options(command: _Parser) -> None:
     _add_json(shown)
 
 
+def _add_new_options(command: _Parser) -> None:
+    command.add_argument("kind", choices=("solver", "problem", "suite"))
+    command.add_argument(
+        "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
+    )
+
+
 def _add_paper_options(command: _Parser) -> None:
     command.add_argument(
         "--out",
@@ -397,6 +414,10 @@ def _add_run_options(command: _Parser) -> None:
         action="append",
         default=[],
         help="measure only these cases, e.g. '*/dual'; may be repeated",
+    )
+    _add_option(
+        command,
+        "an option of every solver that has it; several values are measured each",
     )
     _add_plugin(command)
     command.add_argument(
@@ -437,14 +458,21 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _add_option(command: _Parser, what: str) -> None:
+    command.add_argument(
+        "--option", metavar="KEY=VALUE", action="append", default=[], help=what
+    )
+
+
 def _add_plugin(command: _Parser) -> None:
     command.add_argument(
         "--plugin",
-        metavar="FILE.py",
-        type=Path,
+        metavar="[LABEL=]FILE.py",
+        type=PluginFile.of,
         action="append",
         default=[],
-        help="load solvers or problems of your own from a file; may be repeated",
+        help="load solvers or problems of your own from a file; may be repeated; "
+        "solvers of LABEL=FILE.py are called LABEL:NAME",
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from harness.errors import some
 from harness.files.durable import full_disk_told
+from harness.suite.solver_options import given_options
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def run(registries: Registries, options: Namespace) -> int:
     """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)
+    changed = given_options(options.option)
 
     from mortarbench import results
     from mortarbench.progress import shown_on
@@ -37,6 +39,7 @@ def run(registries: Registries, options: Namespace) -> int:
             repeats=options.repeats,
             time_limit=options.time_limit,
             memory_limit=options.memory_limit,
+            options=changed,
             fresh=options.fresh,
             dask=options.dask,
             progress=progress,
