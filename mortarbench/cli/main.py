@@ -194,7 +194,15 @@ def _parser() -> argparse.ArgumentParser:
     _add_replay_options(
         add("replay", "repeat one stored measurement, and compare", "replay")
     )
-    _add_merge_options(add("merge", "make one result folder of several", "merge"))
+    _add_merge_options(
+        add(
+            "merge",
+            "make one result folder of several",
+            "merge",
+            "A measurement that several of them hold is taken once; environments stay "
+            "apart.",
+        )
+    )
     _add_test_options(
         add(
             "test-solver",
@@ -335,7 +343,13 @@ def _add_report_options(command: _Parser) -> None:
 
 
 def _add_merge_options(command: _Parser) -> None:
-    command.add_argument("folders", metavar="DIR", type=Path, nargs="+")
+    command.add_argument(
+        "folders",
+        metavar="DIR",
+        type=Path,
+        nargs="+",
+        help="result folders, each as `run` or `merge` writes it",
+    )
     command.add_argument(
         "--out",
         metavar="DIR",
