@@ -386,7 +386,9 @@ def _add_test_options(command: _Parser) -> None:
 
 
 def _add_new_options(command: _Parser) -> None:
-    command.add_argument("kind", choices=("solver", "problem", "suite"))
+    command.add_argument(
+        "kind", choices=("solver", "problem", "suite"), help="what to write"
+    )
     command.add_argument(
         "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
     )
