@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from harness.errors import InputError
+    from harness.files.qpfile import save_qp
     from harness.limits import memory_limit_mib, too_large
     from harness.mechanics import Friction, Grid, Mechanics
     from harness.plugin import (
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
         Solver,
         Value,
     )
-    from harness.qp import QP, Matrix, Structure, Vector, no_rows
+    from harness.qp import QP, Matrix, Structure, Vector, needs_matrices, no_rows
     from harness.record import Record, Verdict
     from harness.solution import Solution, Status
     from harness.verify.certificate import Certificate, UncertifiableError, certify
@@ -56,7 +57,9 @@ _MODULES = {
     "certify": "harness.verify.certificate",
     "kkt_residuals": "harness.verify.kkt",
     "memory_limit_mib": "harness.limits",
+    "needs_matrices": "harness.qp",
     "no_rows": "harness.qp",
+    "save_qp": "harness.files.qpfile",
     "too_large": "harness.limits",
     "verdict": "harness.verify.kkt",
 }
@@ -97,7 +100,9 @@ __all__ = [
     "certify",
     "kkt_residuals",
     "memory_limit_mib",
+    "needs_matrices",
     "no_rows",
+    "save_qp",
     "too_large",
     "verdict",
 ]

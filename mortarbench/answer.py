@@ -18,7 +18,7 @@ from harness.errors import InputError
 from harness.names import assemble
 from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite
-from harness.registry import SolverSpec, options_of, resolve
+from harness.registry import PluginFile, SolverSpec, options_of, resolve
 from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.arguments import (
@@ -194,9 +194,10 @@ def solve(
         registries = case.registries
     else:
         registries = case.registries
-        held = {file.resolve() for file in registries.files}
+        held = {file.resolved() for file in registries.files}
+        asked = map(PluginFile.of, plugins)
         registries = registries.with_files(
-            [file for file in plugins if Path(file).resolve() not in held]
+            [file for file in asked if file.resolved() not in held]
         )
     with answers_of(solver, registries, options) as answer:
         return answer(case, tol)

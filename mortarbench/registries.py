@@ -16,6 +16,7 @@ from harness.limits import ONE_THREAD
 from harness.plugin import Family, Reference, Solver
 from harness.registry import (
     Plugin,
+    PluginFile,
     SolverSpec,
     entry_point_plugins,
     load_plugin,
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     from harness.results.work_unit import Commands
     from harness.solution import Solution
 
-Plugins = Sequence[str | Path]  #: Python files that define SOLVERS or PROBLEMS
+#: Python files that define SOLVERS or PROBLEMS; a text may be LABEL=FILE.py
+Plugins = Sequence[str | Path | PluginFile]
 
 
 class Reporter(Protocol):
@@ -116,7 +118,9 @@ class Registries:
     #: those of them that did not come in a file
     own_operators: Mapping[str, Maker] = field(default_factory=dict)
     suites: Path = field(default_factory=suites_folder)
-    files: tuple[Path, ...] = ()  #: plug-ins that the processes of a run load, too
+    files: tuple[
+        PluginFile, ...
+    ] = ()  #: plug-ins that the processes of a run load, too
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)
     #: starts the command line, less the name of a process that runs need. -P: what lies
@@ -150,12 +154,12 @@ class Registries:
 
         """
         extended = self
-        for file in map(Path, files):
+        for file in map(PluginFile.of, files):
             plugin = load_plugin(file)
             try:
                 extended = extended.extended(plugin)
             except InputError as e:
-                raise InputError(f"{file}: {e}") from None
+                raise InputError(f"{file.path}: {e}") from None
             extended = replace(extended, files=(*extended.files, file))
         return extended
 
@@ -202,7 +206,7 @@ class Registries:
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
-        return [str(file.resolve()) for file in self.files]
+        return [str(file.resolved()) for file in self.files]
 
     def suite_path(self, text: str | Path) -> Path:
         """Find a suite by path, or by its bare name among those that come with us.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
-from harness.files.durable import replace_file
+from harness.files.durable import replace_file, replacing
+from harness.files.reading import opened
 from harness.plugin import ContactSide, Fields
 from harness.solution import History, Solution, Status, checked_history
 
@@ -139,9 +141,7 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     return _expected(path, npz.read, expected)
 
 
-def mapped_arrays(
-    path: Path, expected: tuple[str, ...], *, limited: bool = True
-) -> dict[str, NDArray[Any]]:
+def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
     """Do as `read_arrays`, but map what can be mapped; see `harness.files.npz`.
 
     limited : whether the size of a file that can be mapped has the limit, too
@@ -159,7 +159,7 @@ def mapped_arrays(
         except ValueError:  # an npz file of somebody else
             return npz.read(path)
 
-    return _expected(path, mapped, expected)
+    return _expected(path, mapped, ())
 
 
 def _expected(
@@ -228,6 +228,19 @@ def _as_stored(
 def is_stored(folder: Path, digest: str) -> bool:
     """Whether a folder has arrays of that digest."""
     return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
+
+
+def copy_stored(source: Path, folder: Path, digest: str) -> bool:
+    """Copy arrays to another folder, unless it has them; tell whether it has now."""
+    if is_stored(folder, digest):
+        return True
+    if not is_stored(source, digest):
+        return False
+    with opened(_path(source, digest), "stored arrays") as file:
+        (folder / "vectors").mkdir(parents=True, exist_ok=True)
+        with replacing(_path(folder, digest)) as copy:
+            shutil.copyfileobj(file, copy)
+    return True
 
 
 def _path(folder: Path, digest: str) -> Path:

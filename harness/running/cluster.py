@@ -26,6 +26,7 @@ from harness.environment.environment import packages_of
 from harness.environment.labels import in_words
 from harness.errors import InputError
 from harness.operators import Maker
+from harness.registry import PluginFile
 from harness.results.folder import differences
 from harness.results.work_unit import (
     Commands,
@@ -56,7 +57,7 @@ _CODE = ("source", "versions.mortarbench", "plugins")
 def on_cluster(
     address: str,
     *,
-    plugins: Sequence[Path],
+    plugins: Sequence[PluginFile],
     operators: Mapping[str, Maker],
     environment: Mapping[str, Any],
     keep: Keep,
@@ -99,7 +100,7 @@ def on_cluster(
             name = f"mortarbench-{client.id}"
             with ExitStack() as ends, _scheduler_there(client, address):
                 _forget_lost_runs(client)
-                files = [file.resolve() for file in plugins]
+                files = [file.resolved() for file in plugins]
                 sharing, packages = _sharing(client), packages_of(environment)
                 node = ExecutorPlugin(commands, files, operators, sharing, packages)
                 client.register_plugin(node, name=name)

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
-from mortarbench.arguments import FORMATS
+from harness.registry import PluginFile
+from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
@@ -186,12 +187,21 @@ def _parser() -> argparse.ArgumentParser:
     _add_report_options(
         add(
             "report",
-            "write the report on a result folder, or on what changed between two",
+            "write the report on a result folder, or on what changed between several",
             "report",
         )
     )
     _add_replay_options(
         add("replay", "repeat one stored measurement, and compare", "replay")
+    )
+    _add_merge_options(
+        add(
+            "merge",
+            "make one result folder of several",
+            "merge",
+            "A measurement that several of them hold is taken once; environments stay "
+            "apart.",
+        )
     )
     _add_test_options(
         add(
@@ -208,6 +218,14 @@ def _parser() -> argparse.ArgumentParser:
             "doctor",
             "say whether this machine is fit for measuring times, and what to change",
             "doctor",
+        )
+    )
+    _add_new_options(
+        add(
+            "new",
+            "write a solver, a problem or a suite to start from",
+            "new",
+            "The file passes its checks as it is. Nothing is written over.",
         )
     )
     return parser
@@ -236,6 +254,7 @@ def _add_solve_options(command: _Parser) -> None:
         default=1e-8,
         help="relative accuracy that the solver is asked for; default: 1e-8",
     )
+    _add_option(command, "an option of the solver, instead of its default")
     command.add_argument(
         "--plot",
         metavar="FILE.png|pdf|svg",
@@ -264,9 +283,9 @@ def _add_export_options(command: _Parser) -> None:
     command.add_argument("case", metavar="CASE", help=_CASE)
     command.add_argument(
         "file",
-        metavar="FILE.npz|mat|parquet",
+        metavar="FILE.npz|mat|parquet|qps",
         type=Path,
-        help="for NumPy, MATLAB and Octave, or qpbenchmark",
+        help="for NumPy, MATLAB and Octave, qpbenchmark, or what reads QPS",
     )
     _add_plugin(command)
 
@@ -288,11 +307,12 @@ def _add_validate_options(command: _Parser) -> None:
 def _add_report_options(command: _Parser) -> None:
     command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
     command.add_argument(
-        "other",
+        "others",
         metavar="DIR2",
         type=Path,
-        nargs="?",
-        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+        nargs="*",
+        help="what changed from DIR to DIR2, and to each further one, into "
+        "DIR2/report/against-DIR",
     )
     command.add_argument(
         "--format",
@@ -312,6 +332,30 @@ def _add_report_options(command: _Parser) -> None:
         action="store_true",
         help="compare solvers over the cases of all forms together (means, ranks and "
         "profiles); otherwise each form is compared apart",
+    )
+    command.add_argument(
+        "--fail-on",
+        metavar=",".join(GATES),
+        help="exit with 1 where a verdict became worse, or a solver slower beyond "
+        "chance, from DIR to DIR2",
+    )
+    _add_json(command)
+
+
+def _add_merge_options(command: _Parser) -> None:
+    command.add_argument(
+        "folders",
+        metavar="DIR",
+        type=Path,
+        nargs="+",
+        help="result folders, each as `run` or `merge` writes it",
+    )
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        type=_folder,
+        required=True,
+        help="a new folder, or one that was merged before, which is added to",
     )
 
 
@@ -339,6 +383,15 @@ def _add_test_options(command: _Parser) -> None:
         help="show only what equivalent formulations change, as docs/weaknesses.md",
     )
     _add_json(shown)
+
+
+def _add_new_options(command: _Parser) -> None:
+    command.add_argument(
+        "kind", choices=("solver", "problem", "suite"), help="what to write"
+    )
+    command.add_argument(
+        "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
+    )
 
 
 def _add_paper_options(command: _Parser) -> None:
@@ -378,6 +431,10 @@ def _add_run_options(command: _Parser) -> None:
         default=[],
         help="measure only these cases, e.g. '*/dual'; may be repeated",
     )
+    _add_option(
+        command,
+        "an option of every solver that has it; several values are measured each",
+    )
     _add_plugin(command)
     command.add_argument(
         "--repeats", metavar="N", type=int, help="instead of the suite's"
@@ -403,6 +460,12 @@ def _add_run_options(command: _Parser) -> None:
         help="measure on the workers of a Dask scheduler, or on several processes of "
         "this machine; see docs/cluster.md",
     )
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 where a claim is refuted or a solver failed",
+    )
+    _add_json(command)
 
 
 def _folder(text: str) -> Path:
@@ -411,14 +474,21 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _add_option(command: _Parser, what: str) -> None:
+    command.add_argument(
+        "--option", metavar="KEY=VALUE", action="append", default=[], help=what
+    )
+
+
 def _add_plugin(command: _Parser) -> None:
     command.add_argument(
         "--plugin",
-        metavar="FILE.py",
-        type=Path,
+        metavar="[LABEL=]FILE.py",
+        type=PluginFile.of,
         action="append",
         default=[],
-        help="load solvers or problems of your own from a file; may be repeated",
+        help="load solvers or problems of your own from a file; may be repeated; "
+        "solvers of LABEL=FILE.py are called LABEL:NAME",
     )
 
 

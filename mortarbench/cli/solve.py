@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from harness.errors import InputError, say
 from harness.names import parse
 from harness.registry import check_name
+from harness.suite.solver_options import options_for
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.registries import Registries
 
@@ -33,6 +34,7 @@ def run(registries: Registries, options: Namespace) -> int:
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
+    changed = options_for(options.solver, options.option, registries.solvers)
 
     from harness.record import Verdict
     from mortarbench.answer import answers_of
@@ -40,7 +42,7 @@ def run(registries: Registries, options: Namespace) -> int:
 
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     forks = registries.hold_own_code_only() and not _loads_from_here()
-    with answers_of(options.solver, registries, forks=forks) as solved:
+    with answers_of(options.solver, registries, changed, forks=forks) as solved:
         case = built_case(parsed, registries)  # after the fork, which has no use for it
         for remark in case.remarks:
             say(remark)

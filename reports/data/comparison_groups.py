@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from harness import Record, Verdict
+from harness.running.pairs import Block, ratio_of
 from reports.data.evidence import Evidence
 from reports.document.formatting import clean, listing, plural, tolerance
 
@@ -24,7 +26,13 @@ LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short ti
 _CELL = ["kind", "case", "solver"]
 
 Times = NDArray[np.float64]
+Pairs = NDArray[np.bool_]
+Seconds = Mapping[Block, float]
 Name = TypeVar("Name")
+
+
+def _no_pairs() -> Pairs:
+    return np.zeros((0, 0), dtype=bool)
 
 
 class Kind(NamedTuple):
@@ -71,6 +79,10 @@ class ComparisonGroup:
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases of each, if pooled
     incomplete: int = 0  #: cases left out, since some solver was not measured on them
+    apart: Pairs = field(default_factory=_no_pairs)
+    """(solvers, solvers) whether two share no block on some case; none: all share."""
+    told: Pairs = field(default_factory=_no_pairs)
+    """Of those, whether row is faster than column on every case, by its interval."""
 
     @property
     def title(self) -> str:
@@ -88,9 +100,8 @@ class ComparisonGroup:
             f"Forms together: {', '.join(counted)}. A form that a solver declines is "
             "unsolved by it.",
         )
-        return (
-            pooled * bool(self.forms) + refused * bool(self.refused) + self.unmeasured
-        )
+        said = pooled * bool(self.forms) + refused * bool(self.refused)
+        return said + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
@@ -100,6 +111,24 @@ class ComparisonGroup:
         return rare * bool(self.rare) + (
             f"Not measured by all, left out: {cases}.",
         ) * bool(self.incomplete)
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """Say who was measured in other sessions than whom."""
+        left = self.apart.copy()
+        pairs = []
+        while left.any():
+            late = int(left.sum(axis=1).argmax())
+            others = [self.solvers[i] for i in np.flatnonzero(left[late])]
+            pairs.append(f"{clean(self.solvers[late], 40)} with {listing(others, 4)}")
+            left[late] = left[:, late] = False
+        if not pairs:
+            return ()
+        return (
+            "Measured in different sessions, not within blocks, and told apart only "
+            "where the unpaired interval excludes 1 on every case: "
+            f"{'; '.join(pairs)}.",
+        )
 
     @property
     def comparable(self) -> bool:
@@ -174,6 +203,9 @@ def all_groups(
         _group(kind, group, [*cases], evidence.solvers, limit)
         for kind, (_, group) in zip(kinds, outcomes.groupby("kind"), strict=True)
     )
+    if len({r.session for r in records}) > 1:
+        blocks = _blocks(of, records)
+        found = tuple(_with_sessions(group, blocks) for group in found)
     if not pool_forms:
         return found
     form = {r.case: r.form for r in records}
@@ -181,6 +213,52 @@ def all_groups(
         replace(group, forms=Counter(form[case] for case in group.cases))
         for group in found
     )
+
+
+def _blocks(
+    of: Sequence[Kind], records: Sequence[Record]
+) -> dict[tuple[Kind, str, str], Seconds]:
+    """Seconds by block of each solver on each case; of a sweep, of its best answer."""
+    cells: dict[tuple[Kind, str, str], dict[float, list[Record]]] = {}
+    for kind, r in zip(of, records, strict=True):
+        by_tol = cells.setdefault((kind, r.case, r.solver), {})
+        by_tol.setdefault(r.tol, []).append(r)
+
+    def rank(answer: list[Record]) -> tuple[bool, float]:
+        failed = any(r.verdict is not Verdict.VERIFIED for r in answer)
+        return failed, float(np.median([r.total_seconds or np.inf for r in answer]))
+
+    return {
+        cell: {
+            (r.session, r.repeat): r.total_seconds
+            for r in min(by_tol.values(), key=rank)
+            if r.total_seconds
+        }
+        for cell, by_tol in cells.items()
+    }
+
+
+def _with_sessions(
+    group: ComparisonGroup, blocks: Mapping[tuple[Kind, str, str], Seconds]
+) -> ComparisonGroup:
+    """Mark the solvers that were not measured together on every case."""
+    n = len(group.solvers)
+    apart, told = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
+    for i, j in combinations(range(n), 2):
+        pairs = [
+            tuple(
+                blocks[group.kind, case, group.solvers[s]] if group.solved[k, s] else {}
+                for s in (i, j)
+            )
+            for k, case in enumerate(group.cases)
+        ]
+        if all(a.keys() & b.keys() for a, b in pairs if a and b):
+            continue
+        apart[i, j] = apart[j, i] = True
+        ratios = [ratio_of(a, b) if a and b else None for a, b in pairs]
+        told[i, j] = all(r is not None and r.high < 1 for r in ratios)
+        told[j, i] = all(r is not None and r.low > 1 for r in ratios)
+    return replace(group, apart=apart, told=told)
 
 
 def kind_of(r: Record) -> Kind:

@@ -180,9 +180,14 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
         return Cell(text=ABSENT, title=f"fewer than {CASES} cases that both solved")
     return Cell(
         text=bracketed(ratio.value, ratio.low, ratio.high),
-        after=f"n = {ratio.pairs}",
+        after=f"n = {ratio.pairs}{_session(group, i, leader)}",
         value=ratio.value,
     )
+
+
+def _session(group: ComparisonGroup, i: int, j: int) -> str:
+    """Mark two solvers that were not measured within the same blocks."""
+    return ", other session" if group.apart.any() and group.apart[i, j] else ""
 
 
 def _common(ranking: Ranking, i: int) -> Cell:

@@ -223,15 +223,16 @@ def test_report_pools_forms_of_one_folder_and_refuses_to_for_two(cli, tmp_path):
     assert "--pool-forms" in err
 
 
-def compare(before, after, formats, factor):
-    said = [f"{before.name} and {after.name} at {factor:g}", "nothing changed"]
-    return said, [after / f"{form}.{form}" for form in formats]
+def compare(first, others, formats, factor):
+    (after,) = others
+    said = [f"{first.name} and {after.name} at {factor:g}", "nothing changed"]
+    return [], said, [after / f"{form}.{form}" for form in formats]
 
 
 def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(
     cli, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr("reports.write_comparison", compare)
+    monkeypatch.setattr("reports.write_comparisons", compare)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
     argv = ["report", "one", "two", "--factor", "3"]

@@ -368,6 +368,18 @@ def test_a_check_catches_its_fault(kind, check):
     assert run_check(check, kind()).grade is Grade.FAIL
 
 
+def test_who_fails_on_an_operator_is_told_the_line_to_write():
+    """The line itself, put where the message says, makes the check pass."""
+    check = "takes or declines an operator"
+    message = run_check(check, TakesOperatorsForZero()).message
+    ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)
+    scope: dict = {}
+    exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
+    told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
+
+    assert run_check(check, told()) == (Grade.DECLINE, "needs explicit matrices", None)
+
+
 @pytest.mark.parametrize(
     ("kind", "check"),
     [

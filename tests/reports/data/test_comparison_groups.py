@@ -1,12 +1,15 @@
 """From records to the sections on means, ranks, profiles, ratios, growth and claims."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
 from harness import Record, Verdict
 from harness.results.journal import Journal
+from harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 from reports import write_report
 from reports.data.aggregation import ranking_of
 from reports.data.comparison_groups import comparison_groups
@@ -559,3 +562,70 @@ def test_the_sheet_of_means_holds_every_convention(record, evidence):
     assert usual["rank"].tolist() == [1, 2, 3]
     assert usual["tier"].tolist() == [1, 2, 3]
     assert (usual["ratio_low"] <= usual["ratio"]).all()
+
+
+# sessions
+
+
+def of_two_sessions(record, factor, scatter=0.002, cases=8):
+    """Measure b beside a, and c in another session; both take `factor` as long."""
+    rng = np.random.default_rng(577215)
+    return [
+        record(
+            s, k, 1e-3 * 2.0**k * time * rng.lognormal(0, scatter), i,
+            session="late" if s == "c" else "early",
+        )
+        for s, time in (("a", 1.0), ("b", factor), ("c", factor))
+        for k in range(cases)
+        for i in range(3)
+    ]  # fmt: skip
+
+
+def test_of_different_sessions_only_what_intervals_tell_on_every_case_is_ranked(
+    evidence, record
+):
+    for factor, told in ((1.1, True), (1.0015, False)):
+        (group,) = comparison_groups(evidence(of_two_sessions(record, factor)))
+        faster = ranking_of(group).faster
+        assert group.solvers == ("a", "b", "c")
+        assert group.apart.tolist() == [
+            [False, False, True], [False, False, True], [True, True, False],
+        ]  # fmt: skip
+        assert faster[0, 2] == told
+        assert not faster[2, 0]
+    together = [replace(r, session="") for r in of_two_sessions(record, 1.0015)]
+    (group,) = comparison_groups(evidence(together))
+    assert group.apart.size == 0
+
+
+def test_who_was_measured_in_another_session_is_named_and_marked(evidence, record):
+    said = markdown(compose(evidence(of_two_sessions(record, 1.1))))
+
+    assert (
+        "told apart only where the unpaired interval excludes 1 on every case: c"
+        in (" ".join(said.split()))
+    )
+    assert "n = 8, other session" in said
+    assert said.count("unpaired") >= 8
+
+
+def test_what_a_sequence_took_in_two_sessions_is_paired_with_nothing_else():
+    a, b = {("s", 0): 1.0, ("s", 1): 1.1}, {("s", 0): 2.0, ("s t", 1): 2.2}
+
+    assert paired_ratio(a, b) is None
+    assert not ratio_of(a, b).paired
+
+
+def test_an_unpaired_interval_is_welchs():
+    """Against scipy's, on samples of different scatter and number."""
+    rng = np.random.default_rng(16180)
+    a, b = rng.lognormal(0.2, 0.1, 5), rng.lognormal(0, 0.3, 9)
+    expected = ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.9)
+    found = unpaired_ratio(a, b, 0.9)
+
+    assert np.log([found.low, found.high]) == pytest.approx(
+        [expected.low, expected.high]
+    )
+    assert found.value == pytest.approx(np.exp(np.log(a).mean() - np.log(b).mean()))
+    assert unpaired_ratio(a[:1], b) is None
+    assert unpaired_ratio([1.0, 1.0], [2.0, 2.0]) == (0.5, 0.5, 0.5, 2, False)
