@@ -6,16 +6,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from harness import QP, Fields, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
-from problems.contact.sides import bodies_of, contact_sides
+from problems.contact.sides import ACTIVE, active, bodies_of, contact_sides, states
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
-
-ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
 
 def quantities(
@@ -41,7 +38,7 @@ def quantities(
         "dofs": bodies.mesh.dofs,
         "equality_rows": primal.b.size,
         "contact_rows": primal.h.size,
-        "active": int(_active(normal).sum()),
+        "active": int(active(normal).sum()),
         "energy": primal.objective(s.x) * F * l,
         "contact_force": forces[held].sum(axis=0).tolist(),
         "multiplier_sum": float(normal.sum() * F),
@@ -71,25 +68,6 @@ def frictional(
         "dissipation": float(friction.bound @ np.abs(slip))
         * bodies.force * bodies.length,
     }  # fmt: skip
-
-
-def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
-    """Tell of each friction row (k,) whether its contact is open, sticks or slips.
-
-    An active row sticks up to the slip that the rest of its bound would bring about on
-    the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
-    """
-    normal, tangential = np.split(s.z, [primal.h.size])
-    diagonal = csr_array(primal.P).diagonal()
-    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
-    slip = np.abs(friction.T @ s.x - friction.start)
-    sticks = (friction.bound - np.abs(tangential)) * softness >= slip
-    closed = _active(normal)[friction.row]
-    return np.where(closed, np.where(sticks, "stick", "slip"), "open")
-
-
-def _active(normal: Vector) -> NDArray[np.bool_]:
-    return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
 
 
 def pair_results(
