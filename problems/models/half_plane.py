@@ -32,7 +32,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 
 from harness import QP, Case, Matrix, Solution, Value, Vector, no_rows
-from problems.contact.results import ACTIVE
+from problems.contact.sides import ACTIVE
 from problems.models.hertz import MATERIAL, RADIUS, UNIT_LOAD
 from problems.models.line_contact import LineContact, TangentialContact
 
