@@ -194,7 +194,7 @@ def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
     states = np.array(["slip", "stick", "slip", "open"])
     rough = replace(pair, shear=pair.gap, friction=states)
     _, zoom = deformed_figure(replace(bodies, contacts=(rough,))).panels
-    stick, slip = zoom.marks[-2:]
+    slip, stick = zoom.marks[-2:]
 
     assert zoom.title.endswith("\nstick: blue (1), slip: red (2)")
     assert (len(stick.feet), len(slip.feet)) == (1, 2)
