@@ -195,7 +195,7 @@ def _compiled_loop(
     at: Iterate,
 ) -> Iterate:
     nu, g, mu, M, rho, done, status = solver.smalbe(
-        constants, tol, at, partial(infeasible, problem),
+        constants, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
     outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
@@ -308,9 +308,10 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
     qp = task.qp
     if task.solver is not None and task.eliminated is None:
-        bound: float = task.solver.residual_bound(
-            point.x, point.y, point.z_box, Fx, qp.lb, qp.ub, task.problem.rows.G, qp.b
-        )
+        bound = compiled.residual_bound(
+            qp.q, task.problem.diagonal, point.x, point.y, point.z_box, Fx,
+            qp.lb, qp.ub, qp.b, G=task.problem.rows.G,
+        )  # fmt: skip
         if bound <= enough:
             return bound
     task.problem.F.count += 1

@@ -156,7 +156,8 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     mismatch = np.abs(dense @ x_tilde - e) / size
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
 
-    multipliers = partial(compiled.multipliers, e.size, R, kept, size)
+    triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
+    multipliers = partial(compiled.multipliers, e.size, *triangle)
     consistent = bool((mismatch <= 1e-8 * scale).all())
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
     pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
@@ -184,13 +185,15 @@ def projected_problem(
 
 def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
-    start = random_start(qp.q.size)
-    F, orthonormal, triangle, ritz = compiled.prepare(
-        qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
-    )
-    found = Ritz(*ritz)
-    rows = Rows(*orthonormal, partial(compiled.multipliers, qp.b.size, *triangle))
-    return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
+    F, rows = Product(qp.P, qp.q.size), prepared_rows(qp)
+    ritz = Ritz(*compiled.lanczos(F, rows.C, random_start(qp.q.size), steps))
+    return _normalised(qp, F, rows, Spectrum(ritz.norm or 1.0, ritz))
+
+
+def prepared_rows(qp: QP) -> Rows:
+    """Do what `orthonormal_rows` does, compiled."""
+    rows, triangle = compiled.orthonormal(_dense(qp.A), np.ascontiguousarray(qp.b))
+    return Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
 
 
 def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:
@@ -201,7 +204,7 @@ def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
-    diagonal = np.asarray(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
+    diagonal = np.array(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
     return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
