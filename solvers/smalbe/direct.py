@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -32,11 +32,10 @@ from solvers.smalbe.faces import Faces
 from solvers.smalbe.outer_loop import infeasible
 from solvers.smalbe.projected import Rows, prepared_rows
 
-LARGEST = 1000  #: unknowns; with more, iterating is faster (docs/smalbe.md)
+LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
 RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
 MOST_RHO = 1e9  #: where ‖Cν‖ falls slowly, ρ grows to this
 DELTA = 1e-10  #: δ
-FLAT = 1e-12  #: of the mean of D: what is less curved is taken for as curved as that
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,8 @@ class Direct:
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
             "inequality rows are declined: dualise first",
-            f"declines more than {LARGEST} unknowns, where `smalbe` is the faster one",
+            f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is faster from "
+            "about 300 unknowns on",
         ),
     )  # fmt: skip
 
@@ -72,55 +72,57 @@ class Direct:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         P = qp.P if isinstance(qp.P, np.ndarray) else dense(qp.P)
+        P = P if P.flags.c_contiguous else P.T  # it is symmetric
         rows = prepared_rows(qp)
         if not rows.consistent:
             message = "the equality rows contradict each other"
             return partial(Solution.without_point, qp, Status.INFEASIBLE, message)
-        rho = RHO * (float(np.linalg.norm(P)) or 1.0)
-        diagonal = np.array(P.diagonal())
-        if (diagonal < 0).any():
-            return partial(_not_convex, qp)
-        D = _curvature(diagonal)
+        bounds = (qp.lb, qp.ub)
         try:
-            faces = Faces(
-                P, qp.q, rows.C, rows.x_tilde, (qp.lb, qp.ub), D, rho, DELTA,
-                np.zeros(qp.q.size),
-            )  # fmt: skip
+            faces = Faces(P, qp.q, rows.C, rows.x_tilde, bounds, RHO, DELTA)
         except ArithmeticError:
             return partial(_not_convex, qp)
-        task = _Task(qp, rows, diagonal, faces)
-        return partial(_solved, task, tol, self.max_solves)
+        return partial(_solved, _Task(qp, rows, faces), tol, self.max_solves)
+
+
+class _Point(NamedTuple):
+    x: Vector
+    y: Vector
+    z_box: Vector
+    residual: float  #: at least the worst on the QP as given
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
     qp: QP
     rows: Rows
-    diagonal: Vector  #: of P
     faces: Faces
 
-    def point(self, *, fitted: bool) -> tuple[Solution, float]:
-        """Return the present x with its multipliers, and how large its residuals are.
+    def point(self, *, fitted: bool) -> _Point:
+        """Return the present x with its multipliers.
 
         fitted : have a leave least of the gradient on the free components, where its
             own rounding, ρ times that of Cν, may be seen
         """
-        qp, a = self.qp, self.faces.a
-        x, Px, z_box = self.faces.at(a)
+        qp, faces, a = self.qp, self.faces, self.faces.a
+        x, Px, z_box = faces.at(a)
         if fitted:
             a = self._fitted(a, x, Px + qp.q)
-            x, Px, z_box = self.faces.at(a)
+            x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
         worst = residual_bound(
-            qp.q, self.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, G=self.rows.G
+            qp.q, faces.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, G=self.rows.G
         )
-        point = Solution(
+        if worst == np.inf:  # it tells nothing
+            worst = kkt_residuals(qp, self.solution(x, y, z_box)).worst
+        return _Point(x, y, z_box, worst)
+
+    def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
+        """Claim a point, before it has been checked."""
+        return Solution(
             status=Status.SOLVED, x=x, y=y, z=np.zeros(0), z_box=z_box,
             message="converged",
         )  # fmt: skip
-        if np.isinf(worst):  # the bound tells nothing
-            worst = kkt_residuals(qp, point).worst
-        return point, worst
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
         """Have Cᵀa leave least of the gradient g on the free components."""
@@ -132,19 +134,12 @@ class _Task:
         return np.asarray(np.linalg.lstsq(C.T[free], -g[free], rcond=FREE_RANK)[0])
 
 
-def _curvature(D: Vector) -> Vector:
-    """Take what is hardly curved for as curved as the mean."""
-    usual = float(D.mean()) if D.any() else 1.0
-    return np.where(usual * FLAT < D, D, usual)
-
-
 def _solved(task: _Task, tol: float, most: int) -> Solution:
     """Run the outer loop until the residuals are within `tol`, or get no smaller."""
     qp, rows, faces = task.qp, task.rows, task.faces
-    x_tilde = rows.x_tilde
-    bounds = (qp.lb - x_tilde, qp.ub - x_tilde)
-    best = Solution.without_point(qp, Status.FAILED)
-    least, error, outer, waited, settled = np.inf, np.inf, 0, 0, True
+    bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
+    best: _Point | None = None
+    error, outer, waited, settled = np.inf, 0, 0, True
     most_rho = MOST_RHO / RHO * faces.rho
     while settled and waited < PATIENCE:
         outer += 1
@@ -153,28 +148,53 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
         except ArithmeticError:
             return _not_convex(qp)
         before, error = error, faces.update()
-        point, worst = task.point(fitted=waited > 0)
-        gains = worst < least / 2 or error < before / 2
+        point = task.point(fitted=waited > 0)
+        gains = best is None or point.residual < best.residual / 2 or error < before / 2
         waited = 0 if gains else waited + 1
-        if worst <= least:
-            least, best = worst, point
-        if worst <= tol:
+        if best is None or point.residual <= best.residual:
+            best = point
+        if point.residual <= tol:
             break
-        if waited and infeasible(rows, bounds, point.x - x_tilde):
+        if not gains and infeasible(rows, bounds, point.x - rows.x_tilde):
             message = "no point within the bounds meets the equality rows"
             return Solution.without_point(qp, Status.INFEASIBLE, message)
         if error > before / 10 and faces.rho < most_rho:
-            faces.penalise(100 * faces.rho)
-    checked = least > CLAIM * tol
-    if checked and not kkt_residuals(qp, best).worst <= CLAIM * tol:
-        message = "no further progress: rounding, or the cost is unbounded"
-        message = message if settled else "step limit"
-        best = replace(best, status=Status.ITERATION_LIMIT, message=message)
+            most_rho = _penalised(faces, most_rho)
+    message = "no further progress: rounding, or the cost is unbounded"
+    return _claimed(task, best, tol, message if settled else "step limit", outer)
+
+
+def _penalised(faces: Faces, most: float) -> float:
+    """Raise ρ a hundredfold where rounding allows; return the most that it does."""
+    rho = faces.rho
+    try:
+        faces.penalise(100 * rho)
+    except ArithmeticError:
+        faces.penalise(rho)
+        return rho
+    return most
+
+
+def _claimed(
+    task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
+) -> Solution:
+    """Claim a point that is within 5·tol, by its residuals where a bound is not."""
+    faces, checked = task.faces, False
+    if point is None:
+        return Solution.without_point(task.qp, Status.ITERATION_LIMIT, otherwise)
+    s = task.solution(point.x, point.y, point.z_box)
+    status, message = s.status, s.message
+    if not point.residual <= CLAIM * tol:
+        checked = True
+        if not kkt_residuals(task.qp, s).worst <= CLAIM * tol:
+            status, message = Status.ITERATION_LIMIT, otherwise
     counts = {
         "P_products": faces.products + checked, "outer": outer,
         "solves": faces.solves, "set_changes": faces.joined + faces.left,
     }  # fmt: skip
-    return replace(best, iterations=faces.solves, counts=counts)
+    return replace(
+        s, status=status, message=message, iterations=faces.solves, counts=counts
+    )
 
 
 def _not_convex(qp: QP) -> Solution:

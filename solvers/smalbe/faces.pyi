@@ -9,6 +9,7 @@ class Faces:
     joined: int
     left: int
     rho: float
+    diagonal: Vector
     def __init__(
         self,
         P: NDArray[np.float64],
@@ -16,10 +17,8 @@ class Faces:
         C: NDArray[np.float64],
         x_tilde: Vector,
         bounds: tuple[Vector, Vector],
-        D: Vector,
         rho: float,
         delta: float,
-        start: Vector,
     ) -> None: ...
     @property
     def a(self) -> Vector: ...

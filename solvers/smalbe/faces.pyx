@@ -19,6 +19,7 @@ import numpy as np
 
 cdef double ROUNDING = 8 * 2.0 ** -52  # of a sum of terms, relative to their sizes
 cdef double NEARLY = 0.9  # of the largest inward gradient: freed with it at first
+cdef double FLAT = 1e-12  # of the mean of D: as good as not curved
 cdef int GIVENS = 6  # a row taken out by rotations, in steps of a factorisation
 
 
@@ -29,47 +30,60 @@ def _whole(a):
 cdef class Faces:
     """½xᵀPx + qᵀx + aᵀCν + ρ/2 ‖Cν‖² + δ/2 ‖x − x_k‖²_D over l ≤ x ≤ u, ν = x − x̃.
 
-    P (n, n) is positive semidefinite, C is (r, n), D > 0 a vector (n,), the curvature
-    or what to take for it; a and x_k are 0 and the start at first. L (k, k) is the
-    factor of P + ρCᵀC + δD in the order in which components became free. It is stored
-    by rows, which LAPACK reads as the columns of Lᵀ; `among` holds the columns of C in
-    that order, as rows. Nearer to a bound than the rounding of qᵢ/Dᵢ is on it.
+    P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, or its mean
+    where that is nearly zero. a and x_k begin with zeros. L (k, k) is the factor of
+    P + ρCᵀC + δD in the order in which components became free. It is stored by rows,
+    which LAPACK reads as the columns of Lᵀ; `among` holds the columns of C in that
+    order, as rows. Nearer to a bound than the rounding of qᵢ/Dᵢ is on it.
     """
 
     cdef Py_ssize_t n, k
     cdef int r
     cdef readonly long products, solves, joined, left
     cdef readonly double rho
-    cdef double delta
-    cdef double share
+    cdef double delta, share
     cdef const double[:, ::1] P, C
     cdef double[:, ::1] L, among
-    cdef const double[::1] q, x_tilde, lower, upper, D
-    cdef double[::1] mu, off, centre, near, noise, size, x, g, y, gy, step, cosine, sine
+    cdef const double[::1] q, x_tilde, lower, upper
+    cdef readonly object diagonal
+    cdef double[::1] d, D, mu, off, centre, near, noise, size, x, g, y, gy, step
+    cdef double[::1] cosine, sine
     cdef signed char[::1] free, wanted, face
     cdef int[::1] order, place
 
-    def __init__(self, P, q, C, x_tilde, bounds, D, double rho,
-                 double delta, start):
-        """Begin at `start`, moved into the box; factorise where it is on no bound.
+    def __init__(self, P, q, C, x_tilde, bounds, double rho, double delta):
+        """Begin at zero, moved into the box; factorise where it is on no bound.
 
-        Raises ArithmeticError where P is not positive semidefinite there.
+        rho is relative to ‖P‖ (Frobenius). Raises ArithmeticError where P is not
+        positive semidefinite.
         """
-        cdef Py_ssize_t i, n = len(q)
-        self.n, self.r, self.rho, self.delta = n, len(C), rho, delta
-        self.L = np.empty((n, n))
-        self.P, self.q, self.C, self.x_tilde, self.D, self.lower, self.upper = map(
-            _whole, (P, q, C, x_tilde, D, *bounds)
+        cdef Py_ssize_t i, n = q.size
+        cdef double square = 0.0, mean = 0.0
+        self.n, self.r, self.delta = n, len(C), delta
+        self.L, self.among = np.empty((n, n)), np.empty((n, max(self.r, 1)))
+        self.P, self.q, self.C, self.x_tilde, self.lower, self.upper = map(
+            _whole, (P, q, C, x_tilde, *bounds)
         )
-        self.among = np.empty((n, max(self.r, 1)))
         self.mu, self.off = np.zeros((2, self.r))
-        self.x = np.clip(start, *bounds)
-        self.g, self.y, self.gy, self.step, self.cosine, self.sine = np.zeros((6, n))
-        self.centre, self.size = np.array(self.x), np.sqrt(np.diag(P) + delta * D)
-        self.noise, self.near = np.zeros(n), ROUNDING * np.abs(q) / D
+        self.diagonal = np.empty(n)
+        self.d = self.diagonal
+        (self.D, self.centre, self.near, self.noise, self.size, self.x, self.g, self.y,
+         self.gy, self.step, self.cosine, self.sine) = np.zeros((12, n))
         self.free, self.wanted, self.face = np.zeros((3, n), dtype=np.int8)
         self.order, self.place = np.full((2, n), -1, dtype=np.int32)
         for i in range(n):
+            self.d[i] = self.P[i, i]
+            if self.d[i] < 0:
+                raise ArithmeticError("P is not positive semidefinite")
+            mean += self.d[i] / n
+        for i in range(n * n):
+            square += (&self.P[0, 0])[i] * (&self.P[0, 0])[i]
+        self.rho = rho * (sqrt(square) or 1.0)
+        for i in range(n):
+            self.D[i] = self.d[i] if self.d[i] > FLAT * mean else mean or 1.0
+            self.size[i] = sqrt(self.d[i] + delta * self.D[i])
+            self.near[i] = ROUNDING * fabs(self.q[i]) / self.D[i]
+            self.x[i] = fmin(fmax(0.0, self.lower[i]), self.upper[i])
             self.wanted[i] = self.lower[i] < self.x[i] < self.upper[i]
         self.enter()
 

@@ -99,23 +99,20 @@ def test_a_smaller_gradient_waits_for_the_larger_one():
 
 @pytest.mark.parametrize("gone", [1, 2, 40, 79])
 def test_rows_leave_the_factor_by_rotations_or_a_new_one(gone):
-    """The free minimum of the first `gone` components is below their bound, at 0."""
+    """The free minimum of the first `gone` components is below their bound, at −1."""
     n = 80
     rng = np.random.default_rng(gone)
     W = rng.standard_normal((n, n)) / np.sqrt(n)
     P = np.eye(n) + 0.01 * (W @ W.T)
     wish = np.where(np.arange(n) < gone, -5.0, 5.0)
-    start = np.ones(n)
-    bounds = np.zeros(n), np.full(n, np.inf)
-    faces = Faces(
-        P, -(P @ wish), np.zeros((0, n)), np.zeros(n), bounds, np.ones(n), 1.0,
-        1e-13, start,
-    )  # fmt: skip
+    bounds = np.where(wish < 0, -1.0, -np.inf), np.full(n, np.inf)
+    no_rows = np.zeros((0, n))
+    faces = Faces(P, -(P @ wish), no_rows, np.zeros(n), bounds, 1.0, 1e-13)
 
     assert faces.minimise(100)
     x, Px, z = faces.at(np.zeros(0))
     assert faces.left >= gone
-    assert np.flatnonzero(x == 0).tolist() == list(range(gone))
+    assert np.flatnonzero(x == -1).tolist() == list(range(gone))
     assert Px - P @ wish + z == pytest.approx(np.zeros(n), abs=1e-11)
     assert (z[:gone] < 0).all()
 
