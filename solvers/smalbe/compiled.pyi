@@ -25,6 +25,7 @@ class Solver:
         alpha: float,
         preconditioned: bool,
     ) -> None: ...
+    def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
     def smalbe(
         self,
         constants: Constants,
@@ -54,4 +55,13 @@ def orthonormal(
 def lanczos(
     F: Product, C: Array, start: Vector, steps: int
 ) -> tuple[Vector, Vector, Array, float]: ...
+def homogenised(
+    F: Product,
+    C: Array,
+    x_tilde: Vector,
+    q: Vector,
+    lb: Vector,
+    ub: Vector,
+    norm: float,
+) -> tuple[Vector, tuple[Vector, Vector]]: ...
 def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...

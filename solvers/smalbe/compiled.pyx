@@ -278,6 +278,31 @@ def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int step
     return np.asarray(theta)[::-1].copy(), residuals, vectors, at_start
 
 
+def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q, lb, ub,
+                double norm):
+    """Return b (n,) and the bounds of ν = x − x̃, as `_normalised` finds them."""
+    cdef Py_ssize_t i, n = x_tilde.shape[0], r = C.shape[0]
+    cdef double[:, ::1] found = np.zeros((3, n))
+    cdef double[::1] b = found[0], Cb = np.empty(r)
+    cdef const double[::1] cost = _whole(q), low = _whole(lb), high = _whole(ub)
+    cdef double square = 0.0
+    cdef bint moved = False
+    for i in range(n):
+        found[1, i], found[2, i] = low[i] - x_tilde[i], high[i] - x_tilde[i]
+        moved = moved or x_tilde[i] != 0
+    if moved:
+        F.apply(&x_tilde[0], &b[0])
+    for i in range(n):
+        b[i] = -cost[i] - b[i]
+        square += b[i] * b[i]
+    without(first(C), r, pointer(b), pointer(Cb), n)
+    if dot(pointer(b), pointer(b), n) <= 1e-28 * square:
+        b[:] = 0.0  # nothing but rounding errors is left of d
+    scale(1 / norm, pointer(b), n)
+    whole = np.asarray(found)
+    return whole[0], (whole[1], whole[2])
+
+
 # --- MPRGP and the outer loop -------------------------------------------------------
 
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
@@ -391,7 +416,7 @@ cdef class Solver:
     cdef double inverse_norm, norm, e_size, x_tilde_size, alpha, Gamma_square, rho
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef int expansion
-    cdef double[:, ::1] C, GC, vectors, room
+    cdef double[:, ::1] C, GC, vectors
     cdef const double[::1] q, diagonal
     cdef double[::1] x_tilde, b, lower, upper, above, rhs
     cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
@@ -404,6 +429,7 @@ cdef class Solver:
     cdef double[:, ::1] core, inverse
 
     def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
+        cdef Py_ssize_t i, k
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
         self.C, self.GC, self.x_tilde = map(_whole, (rows.C, rows.GC, rows.x_tilde))
@@ -421,19 +447,28 @@ cdef class Solver:
         k = 0
         if spectrum.ritz is not None:
             above, vectors, self.tail = problem.upper_end()
-            self.above = np.append(above, np.zeros(self.r)) - self.tail
-            self.vectors = np.vstack([vectors, rows.C])
-            k = self.above.shape[0]
+            k = len(above) + self.r
+            self.above, self.vectors = np.zeros(k), np.concatenate((vectors, rows.C))
+            for i in range(k):
+                self.above[i] = (above[i] if i < k - self.r else 0.0) - self.tail
         n = self.n
-        self.room = np.empty((14, n))
-        (self.x, self.g, self.p, self.Hp, self.phi, self.free, self.z, self.s, self.Hs,
-         self.t, self.x2, self.g2, self.box_lower, self.box_upper) = self.room
-        self.rhs, self.piece, self.piece2 = np.empty((3, n))
-        self.Cv, self.Cw = np.empty((2, self.r))
+        cdef double[:, ::1] room = np.empty((17, n)), small = np.empty((7, k))
+        cdef double[:, ::1] cores = np.empty((2 * k, k)), tiny = np.empty((2, self.r))
+        self.x, self.g, self.p, self.Hp, self.phi = (
+            room[0], room[1], room[2], room[3], room[4]
+        )
+        self.free, self.z, self.s, self.Hs, self.t = (
+            room[5], room[6], room[7], room[8], room[9]
+        )
+        self.x2, self.g2, self.box_lower, self.box_upper = (
+            room[10], room[11], room[12], room[13]
+        )
+        self.rhs, self.piece, self.piece2 = room[14], room[15], room[16]
+        self.Cv, self.Cw = tiny[0], tiny[1]
         self.Ge, self.told = np.empty(self.m), np.empty(4)
-        (self.y, self.dy, self.y2, self.slope, self.slope2, self.c,
-         self.c2) = np.empty((7, k))
-        self.core, self.inverse = np.empty((2, k, k))
+        self.y, self.dy, self.y2, self.slope = small[0], small[1], small[2], small[3]
+        self.slope2, self.c, self.c2 = small[4], small[5], small[6]
+        self.core, self.inverse = cores[:k], cores[k:]
 
     # the operator
 
@@ -890,6 +925,20 @@ cdef class Solver:
         return sqrt(total / fabs(energy)) if energy else 0.0
 
     # the outer loop
+
+    def begin(self, const double[::1] x, const double[::1] mu, double rho):
+        """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
+        cdef Py_ssize_t i, n = self.n
+        start, gradient = np.empty(n), np.empty(n)
+        cdef double[::1] nu = start, g = gradient
+        self.rho = rho
+        for i in range(n):
+            nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
+        self.H(pointer(nu), pointer(g))
+        add(-1.0, pointer(self.b), pointer(g), n)
+        for i in range(self.r):
+            add(mu[i], &self.C[i, 0], pointer(g), n)
+        return start, gradient
 
     def smalbe(self, constants, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.

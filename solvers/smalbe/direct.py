@@ -55,8 +55,8 @@ class Direct:
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
             "inequality rows are declined: dualise first",
-            f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is faster from "
-            "about 300 unknowns on",
+            f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is the "
+            "faster one from about 300 on",
         ),
     )  # fmt: skip
 

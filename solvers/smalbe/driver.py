@@ -95,7 +95,7 @@ def prepared(
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
         solve=solve, solver=solver, history=history,
-        start=_start(problem, options, carry, tol),
+        start=_start(problem, options, carry, tol, solver),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -136,14 +136,21 @@ def _lanczos_steps(options: Options, n: int) -> int:
 
 
 def _start(
-    problem: Projected, options: Options, carry: Carry | None, tol: float
+    problem: Projected,
+    options: Options,
+    carry: Carry | None,
+    tol: float,
+    solver: compiled.Solver | None,
 ) -> Iterate:
     """Start from zero, or from where the problem before ended."""
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), np.zeros(len(C))
     if carry is not None:
         x, mu = carry.x, C @ carry.force / problem.spectrum.norm
-    return first_iterate(problem, x, mu, M=options.M, rho=_penalty(options, tol))
+    rho = _penalty(options, tol)
+    if solver is None:
+        return first_iterate(problem, x, mu, M=options.M, rho=rho)
+    return Iterate(*solver.begin(x, mu, rho), mu, options.M, rho)
 
 
 def _penalty(options: Options, tol: float) -> float:

@@ -67,8 +67,10 @@ cdef class Faces:
         self.mu, self.off = np.zeros((2, self.r))
         self.diagonal = np.empty(n)
         self.d = self.diagonal
-        (self.D, self.centre, self.near, self.noise, self.size, self.x, self.g, self.y,
-         self.gy, self.step, self.cosine, self.sine) = np.zeros((12, n))
+        cdef double[:, ::1] room = np.zeros((12, n))
+        self.D, self.centre, self.near, self.noise = room[0], room[1], room[2], room[3]
+        self.size, self.x, self.g, self.y = room[4], room[5], room[6], room[7]
+        self.gy, self.step, self.cosine, self.sine = room[8], room[9], room[10], room[11]
         self.free, self.wanted, self.face = np.zeros((3, n), dtype=np.int8)
         self.order, self.place = np.full((2, n), -1, dtype=np.int32)
         for i in range(n):

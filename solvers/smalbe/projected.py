@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
-from scipy.sparse import issparse
 
 from harness import QP, Matrix, Vector
 from solvers.smalbe import compiled
@@ -187,7 +186,12 @@ def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
     F, rows = Product(qp.P, qp.q.size), prepared_rows(qp)
     ritz = Ritz(*compiled.lanczos(F, rows.C, random_start(qp.q.size), steps))
-    return _normalised(qp, F, rows, Spectrum(ritz.norm or 1.0, ritz))
+    diagonal = _diagonal(qp)
+    spectrum = _not_vanishing(Spectrum(ritz.norm or 1.0, ritz), diagonal)
+    b, bounds = compiled.homogenised(
+        F, rows.C, rows.x_tilde, qp.q, qp.lb, qp.ub, spectrum.norm
+    )
+    return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
 def prepared_rows(qp: QP) -> Rows:
@@ -197,21 +201,27 @@ def prepared_rows(qp: QP) -> Rows:
 
 
 def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:
-    if spectrum.norm <= NOTHING * (size := _mean_eigenvalue(qp.P)):
-        spectrum = spectrum._replace(norm=size or 1.0)  # 𝒫F𝒫 is zero, or rounding
+    diagonal = _diagonal(qp)
+    spectrum = _not_vanishing(spectrum, diagonal)
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
-    diagonal = np.array(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
     return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
-def _mean_eigenvalue(P: Matrix) -> float:
-    """Return the trace of an explicit P by its size, 0 for an operator."""
-    explicit = isinstance(P, np.ndarray) or issparse(P)
-    return float(P.diagonal().mean()) if explicit and P.shape[0] else 0.0
+def _diagonal(qp: QP) -> Vector:
+    """Copy the diagonal of an explicit P; empty for an operator."""
+    return np.array(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
+
+
+def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
+    """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
+    mean = float(diagonal.mean()) if diagonal.size else 0.0
+    if spectrum.norm > NOTHING * mean:
+        return spectrum
+    return spectrum._replace(norm=mean or 1.0)
 
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
