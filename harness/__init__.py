@@ -9,19 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from harness.errors import InputError
+    from harness.files.qpfile import save_qp
     from harness.limits import memory_limit_mib, too_large
     from harness.mechanics import Grid, Mechanics
     from harness.plugin import (
         About,
         Case,
         Chained,
+        ContactSide,
         Family,
         Fields,
         Reference,
         Solver,
         Value,
     )
-    from harness.qp import QP, Matrix, Structure, Vector, no_rows
+    from harness.qp import QP, Matrix, Structure, Vector, needs_matrices, no_rows
     from harness.record import Record, Verdict
     from harness.solution import Solution, Status
     from harness.verify.certificate import Certificate, UncertifiableError, certify
@@ -33,6 +35,7 @@ _MODULES = {
     "Certificate": "harness.verify.certificate",
     "Chained": "harness.plugin",
     "Family": "harness.plugin",
+    "ContactSide": "harness.plugin",
     "Fields": "harness.plugin",
     "Grid": "harness.mechanics",
     "InputError": "harness.errors",
@@ -53,7 +56,9 @@ _MODULES = {
     "certify": "harness.verify.certificate",
     "kkt_residuals": "harness.verify.kkt",
     "memory_limit_mib": "harness.limits",
+    "needs_matrices": "harness.qp",
     "no_rows": "harness.qp",
+    "save_qp": "harness.files.qpfile",
     "too_large": "harness.limits",
     "verdict": "harness.verify.kkt",
 }
@@ -72,6 +77,7 @@ __all__ = [
     "Case",
     "Certificate",
     "Chained",
+    "ContactSide",
     "Family",
     "Fields",
     "Grid",
@@ -92,7 +98,9 @@ __all__ = [
     "certify",
     "kkt_residuals",
     "memory_limit_mib",
+    "needs_matrices",
     "no_rows",
+    "save_qp",
     "too_large",
     "verdict",
 ]

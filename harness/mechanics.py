@@ -77,7 +77,8 @@ class Grid(NamedTuple):
     """The mesh behind the unknowns, which are numbered node by node."""
 
     points: NDArray[np.float64]  #: (N, d)
-    cells: NDArray[np.int64]  #: (E, 2) segments or (E, 4) quadrilaterals, in turn
+    #: (E, 2) segments, or (E, 4) corners in turn; a triangle repeats its last one
+    cells: NDArray[np.int64]
     bodies: NDArray[np.int64]  #: (E,) body of each cell
     lift: Vector  #: (n,) physical unknown − u, where boundary values are not zero
 

@@ -11,6 +11,7 @@ part that ends so; or ``FAMILY:PATH`` if the suffix is empty and there is one fo
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
@@ -24,6 +25,7 @@ from harness.plugin import Case, Family, Reference, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_FILE = re.compile(r"[^=:]*\.[A-Za-z]\w*(/|$)")  #: a path that ends in a suffix
 _TOO_LARGE = 2**63  #: integers from here on fit into no array
 _CALLED = {
     int: "an integer, such as 4",
@@ -74,6 +76,10 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     """
     head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
+        if (named := _as_file(text, families)) is not None:
+            raise InputError(
+                f"unknown family {shown(head)}; did you mean {shown(named)}, a file?"
+            )
         raise unknown("family", head, families, more=PLUGINS)
     family = families[head]
     if (suffix := family.path_suffix) is None:
@@ -98,6 +104,22 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
             raise InputError(f"{head}: key {shown(key)} is set twice; set it once")
         given[key] = value
     return assemble(family, given, parts[-1], texts=True)
+
+
+def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
+    """Say how the case of a bare path is called; None where it looks like no path."""
+    if not _FILE.match(text) and not (text and os.path.isfile(text)):
+        return None
+    takers = [
+        (f.path_suffix, f) for f in families.values() if f.path_suffix is not None
+    ]
+    for suffix, family in sorted(takers, key=lambda taker: -len(taker[0])):
+        if suffix and (end := f"{text}/".find(f"{suffix}/")) >= 0:
+            path, rest = text[: end + len(suffix)], text[end + len(suffix) :]
+            return f"{family.name}:{path}{rest or f'/{family.forms[0]}'}"
+        if not suffix:
+            return f"{family.name}:{text}"
+    return None
 
 
 def assemble(

@@ -74,16 +74,30 @@ class About:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ContactSide:
+    """What a contact does along its slave side, node by node; SI units."""
+
+    name: str  #: of the pair of bodies, such as "disc on plate"
+    nodes: NDArray[Any]  #: (s,) along the side
+    length: Vector  #: (s,) of the undeformed side that belongs to each node, m
+    force: NDArray[Any]  #: (s, 2) on each node by this contact, N/m
+    pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
+    gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fields:
     """A deformed state of bodies, for pictures and files; SI units."""
 
     points: NDArray[Any]  #: (N, 2) reference positions, m
-    cells: NDArray[Any]  #: (E, 4) node numbers, counter-clockwise
+    #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
+    cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, 2) m
     nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     contact_forces: NDArray[Any] | None = None  #: (c, 2) force on each slave node, N/m
+    contacts: tuple[ContactSide, ...] = ()  #: each pair on its own
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,6 +119,7 @@ class Case:
         None  #: what a dual form took to come by, factor too
     )
     mechanics: Mechanics | None = None  #: to certify errors with, where there are any
+    remarks: tuple[str, ...] = ()  #: what may be wrong with the input, a line each
 
 
 class Family(ABC):

@@ -102,6 +102,14 @@ def no_rows(n: int) -> Matrix:
     return csr_array((0, n))
 
 
+def needs_matrices(qp: QP) -> str | None:
+    """Give the reason to decline a `qp` whose P is an operator, else None.
+
+    For `declines` of a solver that reads entries of P, and does not only multiply.
+    """
+    return None if qp.is_explicit else "needs explicit matrices"
+
+
 def _freeze(M: Matrix) -> None:
     """Forbid writing to the buffers of a dense or sparse matrix."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]

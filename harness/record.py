@@ -29,7 +29,10 @@ MOST_LEVELS = 20  #: of what is nested in a field
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
 #: fields that many lines share
-_TEXTS = ("case", "family", "form", "solver", "claimed", "mode", "qp", "environment")
+_TEXTS = (
+    "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
+    "session",
+)  # fmt: skip
 _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
@@ -131,6 +134,7 @@ class Record(Measurement):
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
     started: str = ""  #: UTC, ISO 8601
+    session: str = ""  #: of one command; empty in journals from before there were any
 
     def but(self, **changes: Any) -> Self:
         """Copy with some fields changed."""
@@ -143,9 +147,13 @@ class Record(Measurement):
     def to_json(self) -> str:
         """Serialise to one line of strict JSON.
 
-        NaN, inf and integers that no reader can hold become null.
+        NaN, inf and integers that no reader can hold become null. A line from before
+        there were sessions is written as it was read.
         """
-        return json.dumps(finite(self.to_dict()), allow_nan=False)
+        row = finite(self.to_dict())
+        if not self.session:
+            del row["session"]
+        return json.dumps(row, allow_nan=False)
 
     @staticmethod
     def from_json(line: str | bytes, shared: dict[Any, Any] | None = None) -> Record:

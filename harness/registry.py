@@ -1,24 +1,41 @@
 """From the name of a solver to a configured solver; plug-ins from files and packages.
 
 A registry is a plain mapping from names to solvers. Its entry ``"PREFIX:*"`` stands for
-all backends of one generic adapter: the text after the colon goes into the adapter's
-field ``backend``, and ``backends()``, where the adapter has it, lists what is there.
+all backends of one generic adapter: the text after the last colon goes into the
+adapter's field ``backend``, and ``backends()``, where the adapter has it, lists what is
+there.
+
+A plug-in in a file is loaded as a Python package of its own, whose path is the folder
+of the file. So it may import the modules and packages beside it (its neighbours), and
+two plug-ins have neighbours of their own, even of the same names.
 """
 
 from __future__ import annotations
 
+import ast
+import builtins
+import importlib
 import importlib.util
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from importlib import import_module
+from importlib.machinery import (
+    EXTENSION_SUFFIXES,
+    SOURCE_SUFFIXES,
+    ModuleSpec,
+    PathFinder,
+    SourceFileLoader,
+)
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from harness.digest import hex_digest
+from harness.digest import hex_digest, pieces
 from harness.errors import PLUGINS, InputError, unknown
 from harness.plugin import Family, Solver, as_family
 
@@ -29,6 +46,11 @@ T = TypeVar("T")
 
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
+_LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
+#: that a plug-in finds where everybody does, whatever lies beside it
+_NEVER_BESIDE = sys.stdlib_module_names | {
+    "harness", "problems", "solvers", "reports", "mortarbench",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +63,60 @@ class SolverSpec:
         default_factory=dict
     )  #: that differ from defaults
     role: str = ""  #: "null": one that the suite has already, to show the noise
+
+
+@dataclass(frozen=True)
+class PluginFile:
+    """A plug-in in a file, as ``FILE.py`` or ``LABEL=FILE.py`` asks for it.
+
+    A label goes before the names of its solvers, ``LABEL:NAME``, so that two versions
+    of a plug-in can be measured in one run. Families keep their names.
+    """
+
+    path: Path
+    label: str = ""
+
+    @classmethod
+    def of(cls, text: str | Path | PluginFile) -> PluginFile:
+        """Read what a user writes; a path that holds ``=`` needs a ``/`` before it."""
+        if isinstance(text, PluginFile):
+            return text
+        if isinstance(text, str) and (found := _LABELLED.fullmatch(text)):
+            return cls(Path(found[2]), found[1])
+        return cls(Path(text))
+
+    def __str__(self) -> str:
+        return f"{self.label}={self.path}" if self.label else str(self.path)
+
+    @property
+    def name(self) -> str:
+        """The label, and the name of the file without its folder."""
+        return str(replace(self, path=Path(self.path.name)))
+
+    def resolved(self) -> PluginFile:
+        """Give the same with an absolute path."""
+        return replace(self, path=self.path.resolve())
+
+    def content(self) -> Iterator[bytes]:
+        """Read the code: the file, then its neighbours, in the order of their paths.
+
+        Neighbours are found by reading: whatever an import statement names, on
+        whichever level of the code and however indirectly.
+
+        Raises
+        ------
+        InputError
+            When there is no such file.
+
+        """
+        path = self.path.resolve()
+        if not path.is_file():
+            raise _no_file(self)
+        for file in (path, *sorted(_neighbours(path))):
+            if file != path:
+                yield f"\0{file.relative_to(path.parent)}\0".encode()
+            with file.open("rb") as code:
+                yield from pieces(code)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +181,7 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
         the wrong type or that the solver refuses.
 
     """
-    prefix, colon, backend = spec.name.partition(":")
+    prefix, colon, backend = spec.name.rpartition(":")
     wildcard = f"{prefix}:*"
     if colon and wildcard in solvers and (backend == "*" or spec.name not in solvers):
         solver = _with_options(spec, solvers[wildcard], reserved={"backend"})
@@ -123,7 +199,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
         For an unknown solver. The backends of an adapter are not looked up.
 
     """
-    prefix, colon, _ = name.partition(":")
+    prefix, colon, _ = name.rpartition(":")
     if name not in solvers and not (colon and f"{prefix}:*" in solvers):
         raise unknown("solver", name, solvers, more=PLUGINS)
 
@@ -135,7 +211,7 @@ def options_of(solver: Solver) -> dict[str, Any]:
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
 
 
-def load_plugin(path: Path) -> Plugin:
+def load_plugin(file: str | Path | PluginFile) -> Plugin:
     """Import a file that defines ``SOLVERS`` and/or ``PROBLEMS``.
 
     Where families of it make operators, ``OPERATORS`` has what puts them together.
@@ -146,20 +222,23 @@ def load_plugin(path: Path) -> Plugin:
         When the file is missing, fails to import, or defines neither or nonsense.
 
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a Python file")
-    module = _imported(path)
+    asked = PluginFile.of(file)
+    if not asked.path.is_file():
+        raise _no_file(asked)
+    module = _imported(asked.path)
     if not hasattr(module, "SOLVERS") and not hasattr(module, "PROBLEMS"):
-        raise InputError(f"{path}: defines neither SOLVERS nor PROBLEMS")
+        raise InputError(f"{asked.path}: defines neither SOLVERS nor PROBLEMS")
     operators = getattr(module, "OPERATORS", {})
     if not isinstance(operators, Mapping) or not all(
         isinstance(name, str) and callable(make) for name, make in operators.items()
     ):
-        raise InputError(f"{path}: OPERATORS is no dict from names to functions")
+        raise InputError(f"{asked.path}: OPERATORS is no dict from names to functions")
     found = _checked(
-        str(path), getattr(module, "SOLVERS", {}), getattr(module, "PROBLEMS", {})
+        str(asked.path), getattr(module, "SOLVERS", {}), getattr(module, "PROBLEMS", {})
     )
-    return replace(found, operators=dict(operators))
+    prefix = f"{asked.label}:" if asked.label else ""
+    solvers = {f"{prefix}{name}": solver for name, solver in found.solvers.items()}
+    return replace(found, solvers=solvers, operators=dict(operators))
 
 
 def entry_point_plugins() -> Plugin:
@@ -192,9 +271,12 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
 
     """
     if both := sorted(known.keys() & new.keys()):
-        raise InputError(
-            f"{what} {both[0]!r} of the plug-in exists; rename the new one"
+        remedy = (
+            "rename the new one, or tell its plug-in apart by --plugin LABEL=FILE.py"
+            if what == "solver"
+            else "rename the new one, or load one of the two"
         )
+        raise InputError(f"{what} {both[0]!r} of the plug-in exists; {remedy}")
     if isinstance(known, Registry):
         return Registry({**known.entries, **new}) if new else known
     return {**known, **new}
@@ -249,21 +331,141 @@ def _option(where: str, value: Any, current: Any) -> Any:
     raise InputError(f"{where} = {value!r} is of type {got}; expected {expected}")
 
 
+def _no_file(asked: PluginFile) -> InputError:
+    return InputError(
+        f"{asked.path}: no such file; expected a Python file, or LABEL=FILE.py"
+    )
+
+
 def _imported(path: Path) -> ModuleType:
-    """Import by path under a name of its own; dataclasses need it in sys.modules."""
-    name = f"plugin_{path.stem}_{hex_digest([bytes(path.resolve())])}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    """Import a plug-in as a package of its own; see the head of this module."""
+    whole = path.resolve()
+    stem = re.sub(r"\W", "_", whole.stem)
+    name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"
+    spec = importlib.util.spec_from_file_location(
+        name,
+        whole,
+        loader=_PluginLoader(name, str(whole)) if path.suffix == ".py" else None,
+        submodule_search_locations=[str(whole.parent)],
+    )
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: no Python file; its name must end in .py")
+    _forget(name)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[name] = module  # dataclasses look there
     try:
         with redirect_stdout(sys.stderr):
             spec.loader.exec_module(module)
     except (Exception, SystemExit) as e:  # somebody else's code
-        del sys.modules[name]
+        _forget(name)
         raise _import_error(str(path), e) from None
     return module
+
+
+def _forget(package: str) -> None:
+    """Have a package and its modules imported anew; their files may have changed."""
+    for name in [n for n in sys.modules if f"{n}.".startswith(f"{package}.")]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+
+
+class _PluginLoader(SourceFileLoader):
+    """Runs a module of a plug-in such that its imports find its neighbours first."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        package, folder = _package_of(module.__name__)
+        found = partial(_import_beside, package, folder)
+        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": found}
+        super().exec_module(module)
+
+
+class _NeighbourFinder:
+    """Finds the modules of the packages that plug-ins are."""
+
+    @staticmethod
+    def find_spec(
+        name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if not re.match(r"plugin_\w+_[0-9a-f]{12}\.", name):
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        if spec is not None and type(spec.loader) is SourceFileLoader:
+            spec.loader = _PluginLoader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+sys.meta_path.insert(0, _NeighbourFinder)
+
+
+def _package_of(name: str) -> tuple[str, str]:
+    """Name the package of a module of a plug-in, and its folder."""
+    package = name.partition(".")[0]
+    return package, sys.modules[package].__path__[0]
+
+
+def _import_beside(
+    package: str,
+    folder: str,
+    name: str,
+    globals: Mapping[str, object] | None = None,  # noqa: A002  # as Python has it
+    locals: Mapping[str, object] | None = None,  # noqa: A002
+    fromlist: Sequence[str] | None = (),
+    level: int = 0,
+) -> ModuleType:
+    """Do what an import statement in a plug-in says."""
+    first = name.partition(".")[0]
+    if level or _neighbour(first, folder) is None:
+        return importlib.__import__(name, globals, locals, fromlist or (), level)
+    own = importlib.__import__(f"{package}.{name}", globals, locals, fromlist or (), 0)
+    return own if fromlist else sys.modules[f"{package}.{first}"]
+
+
+def _neighbour(name: str, folder: str) -> ModuleSpec | None:
+    """Find a module or a package with an ``__init__`` in the folder of a plug-in."""
+    if name in _NEVER_BESIDE:
+        return None
+    spec = PathFinder.find_spec(name, [folder])
+    return None if spec is None or spec.origin is None else spec
+
+
+def _neighbours(path: Path) -> set[Path]:
+    """List the files that a plug-in imports from its folder, without importing any."""
+    found: set[Path] = set()
+    unread = [path]
+    while unread:
+        file = unread.pop()
+        for name in _imported_names(file):
+            spec = _neighbour(name, str(path.parent))
+            if spec is None or spec.origin is None:
+                continue
+            files = {Path(spec.origin)}
+            for folder in spec.submodule_search_locations or ():
+                for ending in (*SOURCE_SUFFIXES, *EXTENSION_SUFFIXES):
+                    files |= {*Path(folder).rglob(f"*{ending}")}
+            new = files - found - {path}
+            found |= new
+            unread += [f for f in new if f.suffix in SOURCE_SUFFIXES]
+    return found
+
+
+def _imported_names(file: Path) -> set[str]:
+    """List the first parts of the names that the import statements of a file have.
+
+    Those of relative imports, too: ``from .helper import f`` of a plug-in finds its
+    neighbour. A file that is no Python has none; who imports it will say so.
+    """
+    names: set[str] = set()
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError, RecursionError):
+        return names
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=aliases) | ast.ImportFrom(module=None, names=aliases):
+                names |= {alias.name.partition(".")[0] for alias in aliases}
+            case ast.ImportFrom(module=str(module)):
+                names.add(module.partition(".")[0])
+    return names
 
 
 def _checked(where: str, solvers: Any, problems: Any) -> Plugin:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mortarbench.listing import Listing, problems, solvers, suites
     from mortarbench.progress import Event
     from mortarbench.reporting import Report, report
-    from mortarbench.results import Results, load, run
+    from mortarbench.results import Results, load, merge, run
     from mortarbench.validation import Validation, validate
 
 _MODULES = {
@@ -34,6 +34,7 @@ _MODULES = {
     "Validation": "mortarbench.validation",
     "build": "mortarbench.case",
     "load": "mortarbench.results",
+    "merge": "mortarbench.results",
     "problems": "mortarbench.listing",
     "report": "mortarbench.reporting",
     "run": "mortarbench.results",
@@ -54,6 +55,7 @@ __all__ = [
     "Validation",
     "build",
     "load",
+    "merge",
     "problems",
     "report",
     "run",

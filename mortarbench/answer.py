@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from sys import stderr
@@ -15,14 +16,20 @@ from harness import Fields, Record, Residuals, Solution, Verdict
 from harness.environment.environment import digest
 from harness.errors import InputError
 from harness.names import assemble
-from harness.processes.measurement import measured_once
+from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite
-from harness.registry import SolverSpec, options_of, resolve
+from harness.registry import PluginFile, SolverSpec, options_of, resolve
 from harness.solution import History
 from harness.verify.verdicts import has_point, new_record, plain
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from mortarbench.arguments import (
+    GRIDS,
+    PICTURES,
+    drawn_scale,
+    tolerance,
+    writable,
+)
 from mortarbench.case import Case, build, built_case
-from mortarbench.registries import Plugins, one_thread
+from mortarbench.registries import Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
@@ -37,6 +44,7 @@ class Answer:
     record: Record  #: the measurement, as a line of a journal
     solution: Solution | None  #: point and claim; None where the process ended
     spec: SolverSpec
+    defaults: Mapping[str, Any]  #: options that the solver has if none are given
 
     @property
     def verdict(self) -> Verdict:
@@ -91,19 +99,22 @@ class Answer:
             raise InputError(f"no picture: {self.record.solver} returned no point")
         return self.case.fields(self.solution)
 
-    def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw the deformed bodies with their stresses; into a file, too, if given.
+    def plot(self, path: str | Path | None = None, *, scale: float = 1.0) -> Figure:
+        """Draw the deformed bodies with their stresses, and each contact enlarged.
+
+        path : of a file to write, too: .png, .pdf or .svg
+        scale : of the displacement, as drawn
 
         Raises
         ------
         InputError
-            As `fields`; when the file cannot be written.
+            As `fields`; when the file cannot be written, or the scale is no number.
 
         """
         from reports.figures.deformed import deformed_figure
         from reports.render.saving import draw, save
 
-        figure = deformed_figure(self.fields())
+        figure = deformed_figure(self.fields(), drawn_scale(scale))
         if path is not None:
             save(figure, writable(Path(path), PICTURES))
         return draw(figure)
@@ -141,13 +152,13 @@ class Answer:
         return path
 
     def __repr__(self) -> str:
-        return outcome(self.record)
+        return outcome(self.record, self.defaults)
 
     def _repr_html_(self) -> str:
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in outcome_rows(self.record)
+            for name, value in outcome_rows(self.record, self.defaults)
         )
         return f"<table>{''.join(rows)}</table>"
 
@@ -183,28 +194,69 @@ def solve(
         registries = case.registries
     else:
         registries = case.registries
-        held = {file.resolve() for file in registries.files}
+        held = {file.resolved() for file in registries.files}
+        asked = map(PluginFile.of, plugins)
         registries = registries.with_files(
-            [file for file in plugins if Path(file).resolve() not in held]
+            [file for file in asked if file.resolved() not in held]
         )
+    with answers_of(solver, registries, options) as answer:
+        return answer(case, tol)
+
+
+@contextmanager
+def answers_of(
+    solver: str,
+    registries: Registries,
+    options: Mapping[str, Any] | None = None,
+    *,
+    forks: bool = False,
+) -> Iterator[Callable[[Case, float], Answer]]:
+    """Give what has a solver solve a case to a tolerance, in a process of its own.
+
+    solver, options : as of `solve`
+    forks : whether that process may be a fork of this one, made now, if that is safe;
+        see `harness.processes.forking`
+
+    Raises
+    ------
+    InputError
+        When there is no such solver or option.
+
+    """
     given = dict(options or {})
     spec = SolverSpec(name=solver, label=solver, options=given)
     configured = resolve(spec, registries.solvers)
+    plainly = SolverSpec(name=solver, label=solver)
+    defaults = options_of(resolve(plainly, registries.solvers))
     if options_of(configured).get("history") is False and "history" not in given:
         # what telling costs is not at stake where nothing is compared
+        defaults = {**defaults, "history": True}
         spec = replace(spec, options={**given, "history": True})
         configured = resolve(spec, registries.solvers)
-    record = new_record(
-        case.id,
-        spec,
-        options=options_of(configured),
-        tol=tol,
-        repeat=0,
-        environment=digest(registries.environment()),
-    )
-    command = registries.worker_command(spec)
-    with one_thread(), redirect_stdout(stderr):  # whatever the family prints
-        record, solution = measured_once(
-            command, case.made, record, registries.reference
+    environment = digest(registries.environment())
+
+    def answer(case: Case, tol: float) -> Answer:
+        record = new_record(
+            case.id,
+            spec,
+            options=options_of(configured),
+            tol=tol,
+            repeat=0,
+            environment=environment,
         )
-    return Answer(case=case, record=record, solution=solution, spec=spec)
+        with one_thread(), redirect_stdout(stderr):  # whatever the family prints
+            record, solution = measured_once(
+                worker, case.made, record, registries.reference
+            )
+        return Answer(
+            case=case, record=record, solution=solution, spec=spec, defaults=defaults
+        )
+
+    command = registries.worker_command(spec)
+    work = None
+    if forks:
+        from harness.processes.worker import serve  # late: few need it here
+
+        work = partial(serve, configured)
+    with single_worker(command, work) as worker:
+        yield answer

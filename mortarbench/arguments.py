@@ -7,9 +7,11 @@ from pathlib import Path
 
 from harness.errors import InputError, unknown
 
-EXPORTS = (".npz", ".mat", ".parquet")  #: files that a QP is written to
+EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
+GATES = ("worse", "slower")  #: what a comparison may fail on
+MOST_SCALE = 1e9  #: of displacements in pictures
 GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
 
 
@@ -62,6 +64,22 @@ def tolerance(tol: float, where: str = "tol") -> float:
     return tol
 
 
+def drawn_scale(scale: float, where: str = "scale") -> float:
+    """Take a factor of displacements in pictures.
+
+    Raises
+    ------
+    InputError
+        When it is no finite number of a usual size.
+
+    """
+    if not abs(scale) <= MOST_SCALE:  # a NaN, too
+        raise InputError(
+            f"{where} = {scale:g}; expected a number, at most {MOST_SCALE:g}"
+        )
+    return scale
+
+
 def budget(seconds: float, where: str = "budget") -> float:
     """Take a number of seconds, 0 or more.
 
@@ -88,3 +106,17 @@ def check_formats(formats: Sequence[str], where: str) -> None:
     for form in formats:
         if form not in FORMATS:
             raise unknown("format", form, FORMATS, where=where)
+
+
+def check_gates(gates: Sequence[str], where: str) -> None:
+    """Refuse what a comparison cannot fail on.
+
+    Raises
+    ------
+    InputError
+        With what would be right.
+
+    """
+    for gate in gates:
+        if gate not in GATES:
+            raise unknown("gate", gate, GATES, where=where)

@@ -43,6 +43,11 @@ class Case:
         """Which of the equivalent QPs of the problem this is: primal, dual, …."""
         return self.id.form
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What may be wrong with the input, a line each: moduli of odd sizes."""
+        return self.made.remarks
+
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
         return dict(plain(self.made.quantities(solution)))
@@ -61,12 +66,13 @@ class Case:
         return self.made.fields(solution)
 
     def save(self, path: str | Path) -> Path:
-        """Write the QP for other people's solvers: .npz, .mat or .parquet.
+        """Write the QP for other people's solvers: .npz, .mat, .parquet or .qps.
 
         Raises
         ------
         InputError
-            When the ending is none of these, or the file cannot be written.
+            When the ending is none of these, the format has no place for the numbers,
+            or the file cannot be written.
 
         """
         path = writable(Path(path), EXPORTS)
@@ -90,6 +96,10 @@ class Case:
                 from harness.files.parquetfile import save_parquet
 
                 save_parquet(path, self.qp, meta)
+            case ".qps":
+                from problems.files.qps import save_qps
+
+                save_qps(path, self.qp, meta)
             case _:
                 from harness.files.qpfile import save_qp
 

@@ -19,6 +19,7 @@ from harness.record import Record, Verdict
 from harness.running.progress import Progress
 
 _REASON = 120  #: characters of why a solver declined
+_WIDE = 60  #: columns of a terminal that has room for a bar beside its numbers
 _BETWEEN = 0.2  #: s, between two pictures of a bar in a notebook
 
 
@@ -40,7 +41,7 @@ class _State:
     """Counts what a run has done, for those who show it."""
 
     def __init__(self) -> None:
-        self.done = self.total = 0
+        self.done = self.total = self.measured = 0  # the last: by this run alone
         self.began = monotonic()
         self.now = ""
 
@@ -56,8 +57,18 @@ class _State:
         """Show what went wrong, in a line that stays."""
 
     def advance(self, record: Record | None) -> None:
-        self.done += 1
+        self.count(record)
         self.changed()
+
+    def count(self, record: Record | None) -> None:
+        """Count what was done, and apart what was measured for it."""
+        self.done += 1
+        self.measured += record is not None
+
+    def left(self) -> str:
+        """Say how long the rest may take; empty before the first measurement."""
+        seconds = monotonic() - self.began
+        return remaining(self.measured, self.total - self.done, seconds)
 
     def changed(self) -> None:
         """Show the new state."""
@@ -86,7 +97,7 @@ class _Told(_State):
         self._tell(warning=text)
 
     def advance(self, record: Record | None) -> None:
-        self.done += 1
+        self.count(record)
         self._tell(record=record)
 
 
@@ -131,7 +142,7 @@ class _Bar(_State):
     def __init__(self, bar: Any) -> None:
         super().__init__()
         self._bar = bar
-        self._task = bar.add_task("starting", total=None)
+        self._task = bar.add_task("starting", total=None, left=self.left)
 
     def start(self, total: int) -> None:
         super().start(total)
@@ -179,11 +190,11 @@ class _Notebook(_State):
             return
         self._shown = monotonic()
         above = "".join(f"<div>{html_escape(line)}</div>" for line in self._lines)
-        left = remaining(self.done, self.total, monotonic() - self.began)
         self._handle.update(
             _Html(
                 f"{above}<progress value='{self.done}' max='{self.total or 1}'>"
-                f"</progress> {self.done}/{self.total} {left} {html_escape(self.now)}"
+                f"</progress> {self.done}/{self.total} {self.left()} "
+                f"{html_escape(self.now)}"
             )
         )
 
@@ -196,12 +207,15 @@ class _Html:
         return self._text
 
 
-def remaining(done: int, total: int, seconds: float) -> str:
-    """Say how long the rest will take if it goes on as before; empty if unknown."""
-    if not 0 < done < total:
+def remaining(measured: int, to_do: int, seconds: float) -> str:
+    """Say how long what is to do takes if it goes on as before; empty if unknown.
+
+    measured : how many measurements took the `seconds`; those of an earlier run, which
+        took none, do not count
+    """
+    if measured <= 0 or to_do <= 0:
         return ""
-    left = round(seconds / done * (total - done))
-    minutes, rest = divmod(left, 60)
+    minutes, rest = divmod(round(seconds / measured * to_do), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02} left"
 
@@ -222,22 +236,30 @@ def shown_on(stream: TextIO) -> Iterator[Progress]:
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
+        ProgressColumn,
+        Task,
         TextColumn,
-        TimeRemainingColumn,
     )
     from rich.progress import Progress as Bars
     from rich.table import Column
+    from rich.text import Text
 
-    columns = (
-        BarColumn(bar_width=20),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(compact=True),
-        TextColumn(
-            "{task.description}",
-            table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1),
-        ),
-    )
-    with Bars(*columns, console=Console(file=stream), expand=True) as bar:
+    class TimeLeft(ProgressColumn):
+        """rich's own looks back half a minute: a long measurement leaves it nothing."""
+
+        def render(self, task: Task) -> Text:
+            return Text(task.fields["left"](), style="progress.remaining")
+
+    now = Column(no_wrap=True, overflow="ellipsis", ratio=1)
+    columns: list[ProgressColumn] = [
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeLeft(table_column=Column(no_wrap=True)),
+        TextColumn("{task.description}", table_column=now),
+    ]
+    console = Console(file=stream)
+    if console.width >= _WIDE:
+        columns.insert(0, BarColumn(bar_width=20))
+    with Bars(*columns, console=console, expand=True) as bar:
         yield _Bar(bar)
 
 

@@ -16,6 +16,7 @@ from harness.limits import ONE_THREAD
 from harness.plugin import Family, Reference, Solver
 from harness.registry import (
     Plugin,
+    PluginFile,
     SolverSpec,
     entry_point_plugins,
     load_plugin,
@@ -31,16 +32,22 @@ if TYPE_CHECKING:
     from harness.results.work_unit import Commands
     from harness.solution import Solution
 
-Plugins = Sequence[str | Path]  #: Python files that define SOLVERS or PROBLEMS
+#: Python files that define SOLVERS or PROBLEMS; a text may be LABEL=FILE.py
+Plugins = Sequence[str | Path | PluginFile]
 
 
 class Reporter(Protocol):
     """Writes the report on a result folder, and returns the files."""
 
     def __call__(
-        self, folder: Path, formats: Sequence[str], *, factor: float = ...
+        self,
+        folder: Path,
+        formats: Sequence[str],
+        *,
+        factor: float = ...,
+        pool_forms: bool = ...,
     ) -> list[Path]:
-        """Report; verdicts are those at factor·tol."""
+        """Report; verdicts are those at factor·tol, forms are compared together."""
 
 
 def suites_folder() -> Path:
@@ -72,12 +79,17 @@ def reference(qp: QP) -> Solution:
 
 
 def _report(
-    folder: Path, formats: Sequence[str], *, factor: float | None = None
+    folder: Path,
+    formats: Sequence[str],
+    *,
+    factor: float | None = None,
+    pool_forms: bool = False,
 ) -> list[Path]:
     from harness.record import VERIFIED_FACTOR
     from reports import write_report
 
-    return write_report(folder, formats, VERIFIED_FACTOR if factor is None else factor)
+    factor = VERIFIED_FACTOR if factor is None else factor
+    return write_report(folder, formats, factor, pool_forms=pool_forms)
 
 
 ValidationPage: TypeAlias = (
@@ -106,7 +118,9 @@ class Registries:
     #: those of them that did not come in a file
     own_operators: Mapping[str, Maker] = field(default_factory=dict)
     suites: Path = field(default_factory=suites_folder)
-    files: tuple[Path, ...] = ()  #: plug-ins that the processes of a run load, too
+    files: tuple[
+        PluginFile, ...
+    ] = ()  #: plug-ins that the processes of a run load, too
     #: which plug-in a family came in, for those that did
     origins: Mapping[str, str] = field(default_factory=dict)
     #: starts the command line, less the name of a process that runs need. -P: what lies
@@ -140,14 +154,23 @@ class Registries:
 
         """
         extended = self
-        for file in map(Path, files):
+        for file in map(PluginFile.of, files):
             plugin = load_plugin(file)
             try:
                 extended = extended.extended(plugin)
             except InputError as e:
-                raise InputError(f"{file}: {e}") from None
+                raise InputError(f"{file.path}: {e}") from None
             extended = replace(extended, files=(*extended.files, file))
         return extended
+
+    def hold_own_code_only(self) -> bool:
+        """Whether nothing of a plug-in has been loaded."""
+        return (
+            self.families is PROBLEMS
+            and self.solvers is SOLVERS
+            and not self.operators
+            and not self.files
+        )
 
     def worker_command(self, spec: SolverSpec) -> list[str]:
         """Make the command that starts the worker of a solver, less its two pipes."""
@@ -183,7 +206,7 @@ class Registries:
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
-        return [str(file.resolve()) for file in self.files]
+        return [str(file.resolved()) for file in self.files]
 
     def suite_path(self, text: str | Path) -> Path:
         """Find a suite by path, or by its bare name among those that come with us.

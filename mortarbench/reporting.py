@@ -1,17 +1,25 @@
-"""The report on a result folder, or on what changed between two."""
+"""The report on a result folder, or on what changed between several."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from harness.checked import positive
+from harness.errors import InputError
 from harness.files.durable import full_disk_told
 from harness.record import VERIFIED_FACTOR
-from mortarbench.arguments import FORMATS, check_formats
+from mortarbench.arguments import FORMATS, check_formats, check_gates
 from mortarbench.registries import Registries
+
+if TYPE_CHECKING:
+    from harness.running.pairs import Ratio
+    from reports.compare.changes import Comparison, Pair
+    from reports.compare.regressions import Slower
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,12 +27,24 @@ class Report:
     """The files of a report."""
 
     files: tuple[Path, ...]
-    said: tuple[str, ...] = ()  #: the answer in a few lines, where two are compared
+    said: tuple[str, ...] = ()  #: the answer in a few lines
+    #: what changed from the first folder to each of the others, as plain data
+    changes: tuple[dict[str, Any], ...] = ()
+    failed_on: tuple[str, ...] = ()  #: of what was asked to fail on, what happened
 
     @property
     def page(self) -> Path | None:
         """The HTML page, if it was asked for."""
         return next((file for file in self.files if file.suffix == ".html"), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give all of it as plain data, as ``report --json`` prints it."""
+        return {
+            "said": [*self.said],
+            "changes": [*self.changes],
+            "failed_on": [*self.failed_on],
+            "files": [*map(str, self.files)],
+        }
 
     def __repr__(self) -> str:
         return "\n".join([*self.said, str(self.page or f"{len(self.files)} files")])
@@ -39,36 +59,129 @@ class Report:
 
 def report(
     folder: str | Path,
-    other: str | Path | None = None,
-    *,
+    *others: str | Path | None,
     formats: Sequence[str] = FORMATS,
     factor: float = VERIFIED_FACTOR,
+    fail_on: Sequence[str] = (),
+    pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
-    """Write DIR/report, or what changed from `folder` to `other` into the latter.
+    """Write DIR/report, or what changed from `folder` to each other into the latter.
 
     Parameters
     ----------
     formats : of html, md, tex, csv, parquet
     factor : verified means every residual within factor·tol
+    fail_on : what `Report.failed_on` tells of: ``worse``, a verdict became worse;
+        ``slower``, an interval lies wholly above 1, see docs/statistics.md
+    pool_forms : means, ranks and profiles compare the cases of all forms together, not
+        form by form; a form that a solver declines is unsolved by it
     registries : whose way to report is used, instead of ours
 
     Raises
     ------
     InputError
-        When a folder holds no measurements, or a format or the factor is none.
+        When a folder holds no measurements, a format or the factor is none, forms are
+        to be pooled in a comparison, or what to fail on cannot be judged.
 
     """
     check_formats(formats, "formats")
+    check_gates(fail_on, "fail_on")
     factor = positive("factor", factor)
-    before = Path(folder)
-    if other is None:
+    first, after = Path(folder), [Path(other) for other in others if other is not None]
+    if fail_on and not after:
+        raise InputError("fail_on needs a second folder; expected report DIR DIR2")
+    if not after:
         write = (registries or Registries()).report
-        with full_disk_told(before):
-            return Report(files=tuple(write(before, formats, factor=factor)))
-    from reports import write_comparison
+        with full_disk_told(first):
+            files = write(first, formats, factor=factor, pool_forms=pool_forms)
+            return Report(files=tuple(files))
+    if pool_forms:
+        raise InputError(
+            "forms are pooled in the report on one folder (--pool-forms), not in a "
+            "comparison of two, which pairs equal cases; leave one of them out"
+        )
+    from reports import write_comparisons
 
-    after = Path(other)
-    with full_disk_told(after):
-        said, files = write_comparison(before, after, formats, factor)
-    return Report(files=tuple(files), said=tuple(said))
+    with ExitStack() as told:
+        for one in after:
+            told.enter_context(full_disk_told(one))
+        found, said, pages = write_comparisons(first, after, formats, factor)
+    changes = tuple(map(_change, found))
+    if fail_on:
+        _refuse_unjudged(changes, fail_on)
+    failed = [what for what in fail_on if any(change[what] for change in changes)]
+    return Report(
+        files=tuple(pages),
+        said=tuple(said),
+        changes=changes,
+        failed_on=tuple(dict.fromkeys(failed)),
+    )
+
+
+def _refuse_unjudged(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> None:
+    """Refuse to say that nothing is worse where nothing could be compared."""
+    for change in changes:
+        between = f"{change['before']} and {change['after']}"
+        if not change["cells"]:
+            raise InputError(
+                f"fail-on {','.join(fail_on)}: no cell (a solver on a case at a "
+                f"tolerance) is in both {between}; expected two runs of one suite"
+            )
+        if "slower" in fail_on and (why := change["slower_not_judged"]):
+            raise InputError(f"fail-on slower: {between}: {why}")
+
+
+def _change(c: Comparison) -> dict[str, Any]:
+    """Say what changed between two folders as plain data."""
+    from reports.compare.changes import mean_ratio
+    from reports.compare.regressions import regressions
+
+    judged = regressions(c)
+    means = {s: mean for s in c.solvers if (mean := mean_ratio(c.of(s)))}
+    return {
+        "before": str(c.before.directory),
+        "after": str(c.after.directory),
+        "cells": len(c.pairs),
+        "only_before": len(c.only_before),
+        "only_after": len(c.only_after),
+        "same_machine": all(p.same_machine for p in c.pairs),
+        "worse": [_verdicts(p) for p in c.worse],
+        "better": [_verdicts(p) for p in c.pairs if p.turn < 0],
+        "other_answers": [_cell(p) for p in c.pairs if p.other_answer],
+        "slower": [_slower(one) for one in judged.slower],
+        "slower_judged": {"solvers": judged.solvers, "cells": judged.cells},
+        "slower_not_judged": judged.why_not or None,
+        "ratios": {
+            s: _interval(mean) | {"cells": mean.cells} for s, mean in means.items()
+        },
+    }
+
+
+def _cell(p: Pair) -> dict[str, Any]:
+    return {"case": p.after.case, "solver": p.after.solver, "tol": p.after.tol}
+
+
+def _verdicts(p: Pair) -> dict[str, Any]:
+    turned = {"before": p.before.verdict.value, "after": p.after.verdict.value}
+    return _cell(p) | turned
+
+
+def _slower(one: Slower) -> dict[str, Any]:
+    return {
+        "solver": one.solver,
+        "case": one.case or None,
+        "tol": one.tol,
+        "ratio": _interval(one.ratio),
+        "relative": _interval(one.relative),
+    }
+
+
+def _interval(ratio: Ratio | Any) -> dict[str, float | None]:
+    """Give a ratio and its interval, whose ends are None where it has none."""
+    bounded = 0 < ratio.low <= ratio.high < float("inf")
+    return {
+        "value": ratio.value,
+        "low": ratio.low if bounded else None,
+        "high": ratio.high if bounded else None,
+    }

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness.environment.doctor import load_advice
 from harness.environment.environment import digest
 from harness.errors import InputError, some
-from harness.record import Record
+from harness.record import Record, Verdict
 from harness.registry import resolve
 from harness.results.faults import in_words
 from harness.results.folder import keep_environment
 from harness.results.journal import read_journal
+from harness.results.merge import merge as merge_folders
 from harness.running.executor import one_by_one
 from harness.running.progress import Progress
 from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
+from harness.suite.solver_options import as_given
 from harness.suite.suite import load_suite
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import Plugins, Registries, known
@@ -36,6 +40,10 @@ if TYPE_CHECKING:
     from harness.results.work_unit import Opens
 
 
+#: the solver said something of its answer that is not so
+REFUTED = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
+
+
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Results:
     """The measurements of a result folder."""
@@ -43,6 +51,7 @@ class Results:
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
     solvers: tuple[str, ...] = ()  #: of the suite, in its order
+    cases: frozenset[str] = frozenset()  #: that were asked for; all where none is named
     #: what was not measured; the same call tries it again
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
@@ -52,6 +61,43 @@ class Results:
         from pandas import DataFrame
 
         return DataFrame([record.to_dict() for record in self.records])
+
+    @property
+    def refuted(self) -> tuple[Record, ...]:
+        """Of what was asked for, the answers whose claim is refuted."""
+        return tuple(r for r in self._asked if r.verdict in REFUTED)
+
+    @property
+    def failed(self) -> tuple[Record, ...]:
+        """Of what was asked for, measurements that ended without an answer.
+
+        A limit that was met is among them; what a solver declined is not.
+        """
+        answered = (*REFUTED, Verdict.VERIFIED, Verdict.DECLINED)
+        return tuple(r for r in self._asked if r.verdict not in answered)
+
+    @property
+    def _asked(self) -> tuple[Record, ...]:
+        return tuple(
+            r
+            for r in self.records
+            if (not self.solvers or r.solver in self.solvers)
+            and (not self.cases or r.case in self.cases)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give counts and failures as plain data, as ``run --json`` prints them."""
+        counts: dict[str, Counter[str]] = {}
+        for r in self._asked:
+            counts.setdefault(r.solver, Counter())[r.verdict.value] += 1
+        return {
+            "folder": str(self.folder),
+            "measurements": len(self.records),
+            "solvers": {solver: dict(count) for solver, count in counts.items()},
+            "refuted": [_named(r) for r in self.refuted],
+            "failed": [_named(r) for r in self.failed],
+            "not_measured": self.shortfall,
+        }
 
     @property
     def shortfall(self) -> list[str]:
@@ -91,6 +137,20 @@ class Results:
         return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>{notes}"
 
 
+def _named(r: Record) -> dict[str, Any]:
+    """Say which measurement it is and how it ended."""
+    return {
+        "run_id": r.run_id,
+        "case": r.case,
+        "solver": r.solver,
+        "tol": r.tol,
+        "repeat": r.repeat,
+        "status": r.verdict.value,
+        "claimed": r.claimed,
+        "message": r.message,
+    }
+
+
 def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:
     """Read the measurements of a result folder.
 
@@ -109,6 +169,30 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     return Results(folder=path, records=tuple(records))
 
 
+def merge(
+    *folders: str | Path, out: str | Path, tell: Callable[[str], None] = ignore
+) -> Results:
+    """Make one result folder of several, or add them to one that was made so.
+
+    Every measurement is there once. What was measured in different environments stays
+    apart: records keep theirs, and reports mark it.
+
+    out : a new folder, or one of an earlier merge
+    tell : is told, in a line each, what was there before, or is missing
+
+    Raises
+    ------
+    InputError
+        When a folder holds no measurements, or two suites differ in their limits,
+        their accuracy or in what a label means; `out` is then as it was.
+
+    """
+    if not folders:
+        raise InputError("no folder to merge; expected result folders of `run`")
+    records = merge_folders([*map(Path, folders)], Path(out), tell)
+    return Results(folder=Path(out), records=tuple(records))
+
+
 def run(
     suite: str | Path,
     *,
@@ -118,6 +202,7 @@ def run(
     repeats: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    options: Mapping[str, Any] | None = None,
     fresh: bool = False,
     dask: str | None = None,
     plugins: Plugins = (),
@@ -133,6 +218,7 @@ def run(
     solvers : only these; names that the suite has not are added
     cases : only these, patterns or names
     repeats, time_limit, memory_limit : instead of the suite's; s, MiB
+    options : of every solver that has them; a list of values sweeps
     fresh : forget first what the folder holds
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families
@@ -158,10 +244,11 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
+        options=as_given(options or {}),
     )
     folder = Path("out") / asked.name if out is None else Path(out)
     environment = registries.environment()
-    with shown(progress) as display:
+    with shown(progress) as display, ExitStack() as stack:
         if load_advice(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
@@ -173,13 +260,15 @@ def run(
         else:
             from harness.running.cluster import on_cluster
 
-            engine = on_cluster(
-                dask,
-                plugins=registries.files,
-                operators=registries.own_operators,
-                environment=environment,
-                keep=lambda name, there: keep_environment(folder, name, there),
-                warn=display.warn,
+            engine = stack.enter_context(
+                on_cluster(
+                    dask,
+                    plugins=registries.files,
+                    operators=registries.own_operators,
+                    environment=environment,
+                    keep=lambda name, there: keep_environment(folder, name, there),
+                    warn=display.warn,
+                )
             )
         missing = run_suite(
             asked,
@@ -197,5 +286,6 @@ def run(
         folder=folder,
         records=tuple(records),
         solvers=tuple(s.label for s in asked.solvers),
+        cases=frozenset(case.name for case in asked.names),
         missing=missing,
     )

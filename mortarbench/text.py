@@ -25,6 +25,12 @@ UNITS = {
     "max_von_mises": "Pa",
     "stress_error": "(dimensionless)",
 }
+_CONTACTS = "contacts"  #: the quantity that has a table per pair of sides
+_OF_A_CONTACT = {
+    "largest_pressure": "Pa",
+    "smallest_gap": "m",
+    "half_width": "m",
+}
 
 
 _HEADS = {
@@ -32,11 +38,15 @@ _HEADS = {
     "active": "at bound", "cost": "own cost",
 }  # fmt: skip
 _LEGEND = {
-    "step": "steps: c cg, e expansion, f fallback, p proportioning",
-    "free_gradient": "‖φ‖: free gradient",
-    "chopped_gradient": "‖β‖: chopped gradient",
+    "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
+    "outer": "outer: number of the outer iteration",
+    "products": "products: of the QP's matrix P with a vector, so far",
+    "free_gradient": "‖φ‖: free gradient, of the variables off their bounds",
+    "chopped_gradient": "‖β‖: chopped gradient, of those that should leave theirs",
+    "infeasibility": "‖Ax−b‖: how far the equality rows are from holding, relative",
     "active": "at bound: variables that meet one",
-    "cost": "own cost: what it minimises inside",
+    "cost": "own cost: the function that the solver itself minimises, in its own "
+    "scaling;\n          neither a time nor the objective above",
 }
 _UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
 CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED`, in a record
@@ -111,14 +121,21 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
     return rows
 
 
-def outcome(r: Record) -> str:
-    """Lay out one measurement, in SI units."""
-    return aligned(outcome_rows(r))
+def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
+    """Lay out `outcome_rows`."""
+    return aligned(outcome_rows(r, defaults))
 
 
-def outcome_rows(r: Record) -> list[tuple[str, str]]:
-    """Name and value of what there is to say of one measurement, in SI units."""
-    options = ", ".join(f"{key}={value}" for key, value in r.options.items())
+def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Name and value of what there is to say of one measurement, in SI units.
+
+    defaults : options of the solver that go without saying
+    """
+    options = ", ".join(
+        f"{key}={value}"
+        for key, value in r.options.items()
+        if key not in defaults or value != defaults[key]
+    )
     units = UNITS if "dofs" in r.quantities else {}
     rows = [
         ("case", r.case),
@@ -143,9 +160,27 @@ def outcome_rows(r: Record) -> list[tuple[str, str]]:
         *(
             (name.replace("_", " "), _text(value, units.get(name, "")))
             for name, value in r.quantities.items()
+            if name != _CONTACTS
         ),
+        *_contacts(r.quantities.get(_CONTACTS)),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def _contacts(pairs: object) -> list[tuple[str, str]]:
+    """Lay out what elastic bodies tell of each pair of sides that may touch."""
+    if not isinstance(pairs, Mapping):
+        return []
+    rows = []
+    for name, found in pairs.items():
+        parts = (
+            f"{what.replace('_', ' ')} {_text(found.get(what), unit, digits=4)}"
+            for what, unit in _OF_A_CONTACT.items()
+            if found.get(what) is not None
+        )
+        rows.append((f"contact {name}", ", ".join(parts)))
+        rows.append(("  force on", _text(found.get("force"), "N/m", digits=6)))
+    return rows
 
 
 def _bound(r: Record) -> str:
@@ -179,9 +214,9 @@ def convergence(history: History) -> str:
 
 
 def legend(history: History) -> str:
-    """Explain in a line what `convergence` shows; empty where that needs no words."""
+    """Explain what `convergence` shows, a column a line; empty without a history."""
     told = (text for k, text in _LEGEND.items() if k in history and history[k].size)
-    return "; ".join(told)
+    return "\n".join(told)
 
 
 def _milestones(history: History) -> list[int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from harness.errors import unknown
 from harness.record import VERIFIED_FACTOR
 from reports.data.aggregation import ranking_of
-from reports.data.comparison_groups import all_groups
+from reports.data.comparison_groups import ComparisonGroup, all_groups
 from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
 from reports.data.fastest import answers_of, fastest_solvers
@@ -27,7 +27,7 @@ from reports.sections.cases import cases
 from reports.sections.convergence import convergence
 from reports.sections.performance import profiles
 from reports.sections.physics import agreement, deformed, physics
-from reports.sections.ranking import means, ranking
+from reports.sections.ranking import left_out, means, ranking
 from reports.sections.results import claim_counts, claims, errors, iterations
 from reports.sections.scaling import growth, scaling
 from reports.sections.settings import definitions, environment
@@ -39,9 +39,43 @@ from reports.sections.value_of_accuracy import value_of_accuracy
 MOST_SERIES = 6  #: that are drawn; all are tabulated
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 
+# What sections that may be missing are called, and what they need.
+_RATIOS = (
+    "Ratios within blocks: every solver was measured once. repeats = 3 in the suite, "
+    "or --repeats 3, gives pairs of times to compare."
+)
+_PRECISION = (
+    "How well the times are known: the records hold no time of the canary, a fixed "
+    "computation before each measurement, and the suite has no null_arm."
+)
+_ACCURACY = (
+    "Time to accuracy: it takes the key accuracy in the suite, or answers with a "
+    "certified error at three tolerances or more (see suites/accuracy.toml)."
+)
+_WORTH = (
+    "How much accuracy was worth paying for: the errors of the meshes are not known. "
+    '"mortarbench validate DIR" finds them, and a later report shows them.'
+)
+_CONVERGENCE = (
+    "Convergence: no solver kept a history of its iterations. Those with an option "
+    "history do where a suite sets it to true."
+)
+_AGREEMENT = "Agreement of energies: no verified answer has an energy."
+_SCALING = (
+    "Scaling: no cases differ in size alone, in three sizes or more (see "
+    "suites/scaling.toml)."
+)
+_GROWTH = "Do iterations grow?: cases of four sizes or more are needed."
+_PHYSICS = "Physical results: no verified answer has physical quantities."
+_DEFORMED = "Deformed bodies: no verified answer has bodies to draw."
+
 
 def write_report(
-    directory: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
+    directory: Path,
+    formats: Sequence[str],
+    factor: float = VERIFIED_FACTOR,
+    *,
+    pool_forms: bool = False,
 ) -> list[Path]:
     """Write DIR/report from DIR's journal; the same journal gives the same bytes.
 
@@ -49,6 +83,7 @@ def write_report(
     figures/ along with html, md or tex. parquet: records.parquet, the journal.
 
     factor : verdicts are those at factor·tol; the journal's are those at 10·tol
+    pool_forms : means, ranks and profiles are over the cases of all forms together
 
     Raises
     ------
@@ -62,11 +97,14 @@ def write_report(
     evidence = read_evidence(directory, factor)
     target = directory / "report"
     rendered = RENDERED & set(formats)
-    written = write_page(compose(evidence), target, formats) if rendered else []
+    written: list[Path] = []
+    if rendered:
+        page = compose(evidence, pool_forms=pool_forms)
+        written += write_page(page, target, formats)
     if "csv" in formats:
         written += [
             write_text(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
-            for name, frame in csv_tables(evidence).items()
+            for name, frame in csv_tables(evidence, pool_forms=pool_forms).items()
         ]
     if "parquet" in formats:
         written.append(write_records(target / "records.parquet", evidence.journal))
@@ -95,45 +133,73 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
     return [line for statement in told for line in statement.lines]
 
 
-def compose(evidence: Evidence) -> Page:
-    """Put the report together: who was fastest, then what that rests on."""
+def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
+    """Put the report together: who was fastest, then what that rests on.
+
+    Who was fastest is told of each form apart, whatever `pool_forms`.
+    """
     found = size_series(evidence)
     groups = all_groups(evidence)
     rankings = [ranking_of(group) for group in groups if group.comparable]
     answers = answers_of(evidence)
     fastest = fastest_solvers(answers, groups, rankings)
-    sections = (
-        fastest_section(evidence, fastest, answers, certified_sweeps(evidence)),
-        summary(evidence),
-        cases(evidence),
-        claim_counts(evidence),
-        claims(evidence),
-        replace(times(evidence), pictures=_accuracy(evidence)),
-        ratios(evidence),
-        precision(evidence),
-        means(rankings),
-        ranking(rankings),
-        profiles(rankings, evidence.solvers),
-        accuracy(evidence),
-        value_of_accuracy(evidence),
-        iterations(evidence),
-        convergence(evidence),
-        errors(evidence),
-        agreement(evidence),
-        _grown(found, evidence),
-        growth(found),
-        physics(evidence),
-        deformed(evidence),
-        environment(evidence),
-        definitions(evidence.factor),
+    shown = all_groups(evidence, pool_forms=True) if pool_forms else groups
+    left = left_out(shown, poolable=not pool_forms and _poolable(evidence, groups))
+    if pool_forms:
+        rankings = [ranking_of(group) for group in shown if group.comparable]
+    parts = (
+        (fastest_section(evidence, fastest, answers, certified_sweeps(evidence)), ""),
+        (summary(evidence), ""),
+        (cases(evidence), ""),
+        (claim_counts(evidence), ""),
+        (claims(evidence), ""),
+        (replace(times(evidence), pictures=_accuracy(evidence)), ""),
+        (ratios(evidence), _RATIOS),
+        (precision(evidence), _PRECISION),
+        (means(rankings, left), ""),
+        (ranking(rankings, left), ""),
+        (profiles(rankings, evidence.solvers, left), ""),
+        (accuracy(evidence), _ACCURACY),
+        (value_of_accuracy(evidence), _WORTH),
+        (iterations(evidence), ""),
+        (convergence(evidence), _CONVERGENCE),
+        (errors(evidence), ""),
+        (agreement(evidence), _AGREEMENT),
+        (_grown(found, evidence), _SCALING),
+        (growth(found), _GROWTH),
+        (physics(evidence), _PHYSICS),
+        (deformed(evidence), _DEFORMED),
+        (environment(evidence), ""),
+        (definitions(evidence.factor), ""),
     )
+    sections = [section for section, _ in parts if section is not None]
+    missing = [needs for section, needs in parts if section is None]
+    sections[-2:-2] = [_absent(missing)] * bool(missing)
     return Page(
         title=clean(evidence.name),
         dateline=dateline(evidence),
-        sections=tuple(s for s in sections if s is not None),
+        sections=tuple(sections),
         records=evidence.records,
         solvers=evidence.solvers,
     )
+
+
+def _absent(missing: Sequence[str]) -> Section:
+    """List the sections that the report lacks, each with what it needs."""
+    return Section(
+        name="absent",
+        title="Not in this report",
+        prose=("Sections for which there are no measurements, and what they need.",),
+        points=tuple(missing),
+    )
+
+
+def _poolable(evidence: Evidence, groups: Sequence[ComparisonGroup]) -> bool:
+    """Whether some group says nothing, and all forms together would say something."""
+    if all(group.comparable for group in groups):
+        return False
+    pooled = all_groups(evidence, pool_forms=True)
+    return len(pooled) < len(groups) and any(group.comparable for group in pooled)
 
 
 def _accuracy(evidence: Evidence) -> tuple[Picture, ...]:
@@ -154,7 +220,7 @@ def _grown(found: Sequence[SizeSeries], evidence: Evidence) -> Section | None:
         return None
     drawn = sorted(found, key=lambda series: -series.answers)[:MOST_SERIES]
     rest = (
-        f" Of {len(found)} ladders, the {MOST_SERIES} with most answers are drawn."
+        f" Of {len(found)} series, the {MOST_SERIES} with most answers are drawn."
         * (len(found) > MOST_SERIES)
     )
     pictures = tuple(

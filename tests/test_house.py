@@ -66,6 +66,7 @@ def test_one_thing_is_done_in_one_place(name, homes):
 COLLECTIONS = {
     "solvers/adapters": "a library each",
     "problems/families": "a family each",
+    "mortarbench/cli": "a command each",
 }
 
 

@@ -24,6 +24,7 @@ from typing import Any
 from threadpoolctl import threadpool_info
 
 from harness.digest import hex_digest
+from harness.registry import PluginFile
 
 #: that measurements rest on, whichever solvers there are
 PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
@@ -53,7 +54,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def capture(
-    plugins: Iterable[Path] = (), packages: Iterable[str] = ()
+    plugins: Iterable[str | Path | PluginFile] = (), packages: Iterable[str] = ()
 ) -> dict[str, Any]:
     """Describe this process: nested plain data, None where something is unreadable.
 
@@ -77,7 +78,7 @@ def capture(
         "versions": {"python": platform.python_version()}
         | {name: _version(name) for name in (*PACKAGES, *packages)},
         "source": source(Path(__file__).resolve().parents[2]),
-        "plugins": _plugins(plugins),
+        "plugins": _plugins(map(PluginFile.of, plugins)),
         "threads": {
             "variables": {
                 k: os.environ[k] for k in THREAD_VARIABLES if k in os.environ
@@ -98,7 +99,7 @@ def capture(
 
 def capture_in(
     variables: Mapping[str, str],
-    plugins: Iterable[Path] = (),
+    plugins: Iterable[str | Path | PluginFile] = (),
     packages: Iterable[str] = (),
 ) -> dict[str, Any]:
     """Describe a process that is started with some variables set, as workers are.
@@ -106,9 +107,9 @@ def capture_in(
     Libraries read their thread variables only once, when they are loaded.
     """
     program = (
-        "import json, pathlib, sys, harness.environment.environment as e; "
+        "import json, sys, harness.environment.environment as e; "
         "plugins, packages = map(json.loads, sys.argv[1:]); "
-        "print(json.dumps(e.capture(map(pathlib.Path, plugins), packages)))"
+        "print(json.dumps(e.capture(plugins, packages)))"
     )
     given = ([*map(str, plugins)], [*packages])
     done = subprocess.run(
@@ -251,11 +252,11 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _plugins(files: Iterable[Path]) -> dict[str, str]:
-    """Name the content of files by 12 hex digits; those of one name are as one."""
+def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
+    """Name the code of plug-ins by 12 hex digits; those of one name are as one."""
     contents: dict[str, list[bytes]] = defaultdict(list)
     for file in files:
-        contents[file.name].append(file.read_bytes())
+        contents[file.name].extend(file.content())
     return {name: hex_digest(content) for name, content in contents.items()}
 
 

@@ -8,10 +8,12 @@ the environment variable ``MORTARBENCH_MOST_MIB``, in MiB, 2048 unless it is set
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import resource
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +26,7 @@ VARIABLE = "MORTARBENCH_MOST_MIB"
 MOST_MIB = 2048
 MIB = 2**20
 
+_PIECE = 2**20  #: bytes that are expanded at once
 _LEAST_ROOM = 256 * MIB  #: of a parser, for what it imports and keeps
 
 
@@ -82,6 +85,43 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
         if limited:
             check_size(f"{path}: the file", os.fstat(file.fileno()).st_size)
         yield file
+
+
+def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
+    """Read a file whole; what is compressed by gzip, its name ends in .gz, expanded.
+
+    expected : what would be right, for messages
+    copies : of the content that its parser may hold, for the limit
+
+    Raises
+    ------
+    InputError
+        As `opened`; when the content would exceed the limit, or cannot be expanded.
+
+    """
+    with opened(path, expected) as file:
+        if path.suffix.lower() != ".gz":
+            check_size(
+                f"{path}: what it says", copies * os.fstat(file.fileno()).st_size
+            )
+            return file.read()
+        try:
+            most, size = most_bytes() // copies, 0
+            with gzip.GzipFile(fileobj=file) as pieces:
+                while piece := pieces.read(_PIECE):  # first count: it costs no memory
+                    if (size := size + len(piece)) > most:
+                        raise InputError(
+                            f"{path}: what it expands to would take more than "
+                            f"{most_bytes() // MIB} MiB of memory with its parser; "
+                            f"expected less (set {VARIABLE} to allow more)"
+                        )
+            file.seek(0)
+            with gzip.GzipFile(fileobj=file) as whole:
+                return whole.read(size)
+        except (OSError, EOFError, zlib.error):  # no gzip, damaged, cut off
+            raise InputError(
+                f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
+            ) from None
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array, issparse
 
 from harness.errors import InputError, shortened
-from harness.files.datafile import check_size, json_object, opened, parsing
+from harness.files.datafile import check_size, content, json_object, parsing
 from harness.files.durable import replacing
 from harness.files.qpfile import (
     canonical,
@@ -82,8 +82,7 @@ def read_mat(path: Path) -> dict[str, Any]:
         than `harness.files.datafile` allows.
 
     """
-    with opened(path, _EXPECTED) as file:
-        data = file.read()
+    data = content(path, _EXPECTED)
     if b"MATLAB 7.3" in data[:_HEADER] or data.startswith(b"\x89HDF"):
         raise InputError(f"{path}: a .mat file of version 7.3; save it with -v7")
     with parsing(path, _WRONG, _COPIES * len(data)):

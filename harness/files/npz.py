@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from harness.errors import shortened
+from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, opened
 from harness.files.durable import replacing
 
@@ -31,6 +31,10 @@ _ENCRYPTED = 1  #: among the flags of a member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _KINDS = "biufcSU"  #: of types: neither objects, which are pickles, nor structures
 _PIECE = 2**20  #: bytes that are decompressed at once
+
+
+class _PickledError(ValueError):
+    """An array of Python objects, as numpy saves a sparse matrix of scipy."""
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -77,7 +81,8 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        As `harness.files.datafile.opened`, and when the arrays would exceed its limit.
+        As `harness.files.datafile.opened`, when the arrays would exceed its limit, and
+        when one is pickled.
     ValueError, BadZipFile
         When the file holds something else.
 
@@ -85,7 +90,17 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
         members = _members(archive)
         check_size(f"{path}: what it holds", sum(m.file_size for m in members.values()))
-        return {name: _read_array(archive, m) for name, m in members.items()}
+        arrays = {}
+        for name, member in members.items():
+            try:
+                arrays[name] = _read_array(archive, member)
+            except _PickledError:
+                raise InputError(
+                    f"{path}: {shortened(name)} is a pickled Python object, which is "
+                    "never read; expected an array of numbers (of a sparse matrix "
+                    "toarray(), or its parts as in docs/plugins.md)"
+                ) from None
+        return arrays
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -148,6 +163,8 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if version not in readers:
         raise ValueError(f"an npy header of version {version}; expected 1.0 or 2.0")
     shape, fortran, dtype = readers[version](file)
+    if dtype.hasobject:
+        raise _PickledError
     if dtype.kind not in _KINDS or not dtype.itemsize:
         raise ValueError("no plain array of numbers or text")
     return shape, fortran, dtype

@@ -9,6 +9,9 @@ holds the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
 a triangle); and ``meta``, a JSON object. Absent constraints have zero rows, absent
 bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense. The structure of
 a dual, where there is one, follows as matrices ``K, B`` and the vector ``fixed``.
+
+What ``np.savez(path, P=P, q=q, G=G, h=h)`` writes is read, too: any matrix as a dense
+array or in CSC parts, pairs ``G, h`` and ``A, b`` and bounds where there are any.
 """
 
 from __future__ import annotations
@@ -18,18 +21,19 @@ from collections.abc import Mapping
 from dataclasses import replace
 from math import prod
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, issparse
 
-from harness.errors import InputError, shortened
+from harness.errors import InputError, shortened, unknown
 from harness.files.datafile import check_size, json_object
 from harness.files.npz import write_mappable
 from harness.files.store import digest_of, mapped_arrays
 from harness.operators import Maker, SerialisableOperator
-from harness.qp import QP, Matrix, Structure, Vector
+from harness.qp import QP, Matrix, Structure, Vector, no_rows
 
 SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
 _STRIP = 256  #: rows of a dense matrix that are compared at once
@@ -39,6 +43,7 @@ _MATRICES = ("P", "G", "A")
 _STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
 _INGREDIENT = "P_from_"  #: of a P that is a serialised operator
+_PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in _PARTS}
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
@@ -49,7 +54,11 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
 
 
 def save_qp(
-    path: Path, qp: QP, meta: Mapping[str, Any], *, serialised: bool = False
+    path: Path,
+    qp: QP,
+    meta: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    serialised: bool = False,
 ) -> str:
     """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
 
@@ -125,7 +134,12 @@ def load_qp(
     """
     parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
     own = operators is not None
-    arrays = mapped_arrays(path, (*_VECTORS, *parts, "meta"), limited=not own)
+    arrays = mapped_arrays(path, limited=not own)
+    lacking = [name for name in (*_VECTORS, *parts, "meta") if name not in arrays]
+    if lacking and not own and "meta" not in arrays:
+        return _plain_qp(path, arrays), {}
+    if lacking:
+        raise InputError(f"{path}: {', '.join(lacking)} missing")
     try:
         meta = _meta(arrays["meta"])
         vectors = {name: _vector(arrays, name) for name in _VECTORS}
@@ -149,6 +163,58 @@ def load_qp(
     except InputError as e:
         raise InputError(f"{path}: {e}") from None
     return qp, meta
+
+
+def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
+    """Make a QP of the arrays that somebody saved under their names."""
+    try:
+        for name in arrays:
+            if name not in _PLAIN:
+                raise unknown("array", name, (*_VECTORS, *_MATRICES))
+        matrices = {name: _plain_matrix(arrays, name) for name in _MATRICES}
+        vectors = {name: _plain_vector(arrays, name) for name in _VECTORS}
+        P, q = matrices["P"], vectors["q"]
+        if P is None or q is None:
+            raise ValueError(f"{'P' if P is None else 'q'} is missing")
+        for M, side in (("G", "h"), ("A", "b")):
+            if (matrices[M] is None) != (vectors[side] is None):
+                here, gone = (side, M) if matrices[M] is None else (M, side)
+                raise ValueError(f"{gone} is missing beside {here}")
+        n = q.size
+        free = {"lb": np.full(n, -np.inf), "ub": np.full(n, np.inf)}
+        none = {"G": no_rows(n), "A": no_rows(n), "h": np.zeros(0), "b": np.zeros(0)}
+        given = {k: v for k, v in (matrices | vectors).items() if v is not None}
+        qp = QP(**(free | none | given))
+        check_symmetric(qp.P)
+    except (ValueError, TypeError, OverflowError) as e:
+        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
+    except InputError as e:
+        raise InputError(f"{path}: {e}") from None
+    return qp
+
+
+def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | None:
+    if name not in arrays:
+        parts = [f"{name}_{part}" for part in _PARTS]
+        there = [part for part in parts if part in arrays]
+        if there and len(there) < len(parts):
+            lacking = ", ".join(part for part in parts if part not in arrays)
+            raise ValueError(f"{lacking} missing beside {there[0]}")
+        return _matrix(arrays, name) if there else None
+    M = _vector(arrays, name)
+    if M.ndim != 2:
+        raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
+    if not np.isfinite(M).all():
+        raise ValueError(f"{name} holds NaN or inf; expected finite numbers")
+    return M
+
+
+def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | None:
+    """Take a vector, also one that is saved as a matrix of one row or column."""
+    if name not in arrays:
+        return None
+    v = _vector(arrays, name)
+    return v.ravel() if v.ndim == 2 and 1 in v.shape else v
 
 
 def listed_dense(meta: Mapping[str, Any]) -> set[str]:

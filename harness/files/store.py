@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from harness.digest import hex_digest
 from harness.errors import InputError, shortened
 from harness.files import npz
-from harness.files.durable import replace_file
-from harness.plugin import Fields
+from harness.files.durable import replace_file, replacing
+from harness.files.reading import opened
+from harness.plugin import ContactSide, Fields
 from harness.solution import History, Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -27,6 +29,8 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces")
 _NODAL = "nodal_"
+_SIDE = "side_{}_"  #: of the contact of that number
+_ALONG = ("nodes", "length", "force", "pressure", "gap")
 _HISTORY = "history_"
 
 
@@ -71,6 +75,10 @@ def field_arrays(fields: Fields) -> Arrays:
     """List the arrays of a deformed state by name."""
     arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
+    for i, side in enumerate(fields.contacts):
+        arrays |= {
+            _SIDE.format(i) + name: getattr(side, name) for name in ("name", *_ALONG)
+        }
     return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
 
@@ -87,7 +95,18 @@ def load_fields(folder: Path, digest: str) -> Fields:
         _, arrays = _as_stored(folder, digest, _ALWAYS)
     nodal = _with_prefix(_NODAL, arrays)
     known = {k: arrays[k] for k in _ALWAYS + _OPTIONAL if k in arrays}
-    return Fields(nodal=nodal, **known)
+    return Fields(nodal=nodal, contacts=tuple(_sides(arrays)), **known)
+
+
+def _sides(arrays: Arrays) -> Iterator[ContactSide]:
+    """Find the contacts of a deformed state; none in files of old."""
+    for i in range(len(arrays)):
+        side = _with_prefix(_SIDE.format(i), arrays)
+        if not set(side) >= {"name", *_ALONG}:
+            return
+        yield ContactSide(
+            name=str(side["name"]), **{name: side[name] for name in _ALONG}
+        )
 
 
 def write_point(path: Path, solution: Solution) -> None:
@@ -122,9 +141,7 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     return _expected(path, npz.read, expected)
 
 
-def mapped_arrays(
-    path: Path, expected: tuple[str, ...], *, limited: bool = True
-) -> dict[str, NDArray[Any]]:
+def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
     """Do as `read_arrays`, but map what can be mapped; see `harness.files.npz`.
 
     limited : whether the size of a file that can be mapped has the limit, too
@@ -142,7 +159,7 @@ def mapped_arrays(
         except ValueError:  # an npz file of somebody else
             return npz.read(path)
 
-    return _expected(path, mapped, expected)
+    return _expected(path, mapped, ())
 
 
 def _expected(
@@ -211,6 +228,19 @@ def _as_stored(
 def is_stored(folder: Path, digest: str) -> bool:
     """Whether a folder has arrays of that digest."""
     return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
+
+
+def copy_stored(source: Path, folder: Path, digest: str) -> bool:
+    """Copy arrays to another folder, unless it has them; tell whether it has now."""
+    if is_stored(folder, digest):
+        return True
+    if not is_stored(source, digest):
+        return False
+    with opened(_path(source, digest), "stored arrays") as file:
+        (folder / "vectors").mkdir(parents=True, exist_ok=True)
+        with replacing(_path(folder, digest)) as copy:
+            shutil.copyfileobj(file, copy)
+    return True
 
 
 def _path(folder: Path, digest: str) -> Path:

@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 from collections.abc import Hashable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -26,6 +26,7 @@ from harness.files.qpfile import save_qp
 from harness.files.store import write_point
 from harness.plugin import Case, Reference
 from harness.processes.case_folder import content_digest
+from harness.processes.forking import Serve
 from harness.processes.protocol import MOST_ECHOED
 from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from harness.qp import QP
@@ -280,12 +281,31 @@ def _within(limit: float, record: Record) -> Record:
     return record
 
 
-def measured_once(
-    command: list[str], case: Case, record: Record, reference: Reference
-) -> tuple[Record, Solution | None]:
-    """Do as `measured`, with a worker for this one measurement and without limits.
+@contextmanager
+def single_worker(
+    command: list[str], serve: Serve | None = None
+) -> Iterator[WorkerProcess]:
+    """Give a worker for one measurement, which ends with the context.
 
     command : starts the worker; two file descriptors are appended to it
+    serve : what a fork of this process does in its place, if that is safe; now, before
+        anything is in memory that it has no use for
+    """
+    with scratch_folder() as scratch:
+        worker = WorkerProcess(command, scratch / "worker.log")
+        try:
+            if serve is not None:
+                worker.fork(serve)
+            yield worker
+        finally:
+            worker.close()
+
+
+def measured_once(
+    worker: WorkerProcess, case: Case, record: Record, reference: Reference
+) -> tuple[Record, Solution | None]:
+    """Do as `measured`, without limits.
+
     reference : solves the QP where residuals cannot decide
 
     Raises
@@ -294,10 +314,7 @@ def measured_once(
         As `measured`, after a second try.
 
     """
-    with ExitStack() as stack:
-        scratch = stack.enter_context(scratch_folder())
-        worker = WorkerProcess(command, scratch / "worker.log")
-        stack.callback(worker.close)
+    with scratch_folder() as scratch:
         qp_file = scratch / "qp.npz"
         digest = save_qp(qp_file, case.qp, {"name": record.case}, serialised=True)
         record = record.but(qp=digest)

@@ -24,13 +24,15 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
+from functools import partial
 
 MARK = "MORTARBENCH_TREE"  #: environment variable that names the tree to its processes
 END_SECONDS = 5.0  #: within which processes that were sent SIGKILL are gone
 
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # prctl(2)
+PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+_PR_SET_PDEATHSIG = 1
 _NOT_STARTED = 127  #: exit code, as of a shell that finds no command
 
 
@@ -127,9 +129,18 @@ def _reap() -> dict[int, int]:
 def main(arguments: list[str]) -> None:
     """Start the command, see that nothing is left of it, and end as it ended."""
     cpu, requests, replies, *command = arguments
-    pipes = (int(requests), int(replies))
+    begin = partial(_execute, [*command, requests, replies])
+    supervise(begin, int(cpu), (int(requests), int(replies)))
+
+
+def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> None:
+    """Be the sub-reaper above a worker; this process ends as the worker ends.
+
+    begin : what the worker, a fork of this process, does; it does not return
+    pipes : the worker's, which it has to itself
+    """
     prctl = ctypes.CDLL(None).prctl
-    prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
@@ -139,10 +150,15 @@ def main(arguments: list[str]) -> None:
         prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != reaper:
             os._exit(_NOT_STARTED)
-        _become([*command, *map(str, pipes)], int(cpu))
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.close(woken)
+        os.close(wakes)
+        _detach(cpu)
+        begin()
     for fd in pipes:
         os.close(fd)
-    others = os.sched_getaffinity(0) - {int(cpu)}
+    others = os.sched_getaffinity(0) - {cpu}
     if others:
         os.sched_setaffinity(0, others)  # not in the way of what is measured
     events = select.poll()
@@ -160,11 +176,15 @@ def main(arguments: list[str]) -> None:
     _end_as(status)
 
 
-def _become(command: list[str], cpu: int) -> None:
+def _detach(cpu: int) -> None:
     os.setsid()
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
+    os.close(null)
     os.sched_setaffinity(0, {cpu})
+
+
+def _execute(command: list[str]) -> None:
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by this interpreter
         signal.signal(ignored, signal.SIG_DFL)
     try:

@@ -24,6 +24,7 @@ import time
 from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from select import select
 from threading import Lock
@@ -34,6 +35,7 @@ from harness import limits
 from harness.limits import ONE_THREAD
 from harness.processes import reaper
 from harness.processes.footprint import Footprint
+from harness.processes.forking import Fork, Serve, fork, is_safe
 from harness.processes.protocol import (
     LONGEST_REPLY,
     ForeignReplyError,
@@ -112,7 +114,7 @@ class WorkerProcess:
         self.first_seconds = {}
         self._command = command
         self._log = log
-        self._process: subprocess.Popen[bytes] | None = None  # the sub-reaper
+        self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
         self._worker = 0  # its child
         self._mark = ""
         self._cpu = -1
@@ -120,6 +122,7 @@ class WorkerProcess:
         self._unread = bytearray()
         self._looked = 0.0  # when nothing had come yet, by our clock
         self._warms_up = True
+        self._is_warm = False
         self._is_stopped = self._was_busy = False
         self._idle_since: tuple[float, float] | None = None  # our clock, its CPU time
         self._facts: dict[str, Any] = {}  # what it told of its warm-up
@@ -127,6 +130,20 @@ class WorkerProcess:
         self._peak_mib = 0.0
         with self._listing:
             self._all.add(self)
+
+    def fork(self, serve: Serve) -> None:
+        """Start at once, as a fork of this process that calls `serve`.
+
+        It does what the command would do, and has loaded already what we have, see
+        `harness.processes.forking`. Where that is not safe, or comes to nothing, the
+        command starts the worker when it is asked; and always if it is to be replaced.
+        """
+        if not is_safe():
+            return
+        try:
+            self._spawn(inf, serve)
+        except (_EndedError, OSError):
+            self._kill()
 
     def ask(
         self, request: Mapping[str, Any], *, time_limit: float, memory_limit: float
@@ -145,10 +162,11 @@ class WorkerProcess:
         was_busy = self._resume()
         notes = [REPLACED] if was_busy else []
         while True:
-            is_new = self._process is None
+            is_new = not self._is_warm
             try:
                 if is_new:
                     self._start(memory_limit)
+                    self._is_warm = True
                 answer, clock = self._asked(request, time_limit, memory_limit)
                 break
             except _EndedError as end:
@@ -254,7 +272,8 @@ class WorkerProcess:
 
         Who is killed from outside meanwhile is warmed up once more.
         """
-        self._spawn(memory_limit)
+        if self._process is None:
+            self._spawn(memory_limit)
         for is_last in (False, True):
             if not self._warms_up:
                 return
@@ -271,31 +290,40 @@ class WorkerProcess:
                 self._kill()
                 self._spawn(memory_limit)
 
-    def _spawn(self, memory_limit: float) -> None:
+    def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
+        """Start; `serve` is what a fork does, and without one, the command is run."""
         usable = os.sched_getaffinity(0)
         self._cpu, self._mark = max(usable), secrets.token_hex(16)
         self._footprint = Footprint()
         self._unread = bytearray()
         their_requests, self._requests = os.pipe()
         self._replies, their_replies = os.pipe()
+        pipes = (their_requests, their_replies)
+        environment = ONE_THREAD | {
+            limits.VARIABLE: str(memory_limit), reaper.MARK: self._mark,
+        }  # fmt: skip
         try:
             self._log.write_bytes(b"")
             # appending: it survives our truncating it
             with self._log.open("ab") as log:
-                self._process = subprocess.Popen(
-                    [
-                        sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
-                        str(their_requests), str(their_replies), *self._command,
-                    ],
-                    stdin=subprocess.PIPE,  # closed when we die: the tree dies, too
-                    stdout=log,
-                    stderr=log,
-                    env=os.environ
-                    | ONE_THREAD
-                    | {limits.VARIABLE: str(memory_limit), reaper.MARK: self._mark},
-                    pass_fds=(their_requests, their_replies),
-                    start_new_session=True,
-                )  # fmt: skip
+                if serve is not None:
+                    self._process = fork(
+                        serve, cpu=self._cpu, pipes=pipes, log=log.fileno(),
+                        environment=environment,
+                    )  # fmt: skip
+                else:
+                    self._process = subprocess.Popen(
+                        [
+                            sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
+                            *map(str, pipes), *self._command,
+                        ],
+                        stdin=subprocess.PIPE,  # closed when we die: the tree dies, too
+                        stdout=log,
+                        stderr=log,
+                        env=os.environ | environment,
+                        pass_fds=pipes,
+                        start_new_session=True,
+                    )  # fmt: skip
         finally:
             os.close(their_requests)
             os.close(their_replies)
@@ -493,6 +521,8 @@ class WorkerProcess:
         """End all processes, and remove what they left in shared memory."""
         if self._process is not None:
             reaper.end_all(self._process.pid, mark=self._mark)
+            if isinstance(self._process, Fork):
+                self._process.end_orphans()
             if self._process.stdin is not None:
                 self._process.stdin.close()  # the sub-reaper collects the dead and ends
             try:
@@ -502,6 +532,7 @@ class WorkerProcess:
                 self._process.wait()
             self._footprint.remove_files()
         self._process = None
+        self._is_warm = False
         self._worker, self._is_stopped, self._was_busy = 0, False, False
         self._idle_since = None
         for fd in (self._replies, self._requests):

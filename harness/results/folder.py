@@ -13,16 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from harness.environment.environment import VOLATILE
+from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
 from harness.files.reading import MOST_TOML, read_json, read_text, read_toml, toml
 from harness.results.faults import FAULTS
+from harness.suite.growth import refused
 from harness.suite.suite import Suite
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
 _CONCLUDED = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+REMEDY = "choose another --out or use --fresh"
 _LOCK = ".lock"
 _MARK = b"held by runs of mortarbench\n"  #: what is in it
 _DIGEST = re.compile(r"[\w.-]{1,64}")
@@ -232,24 +235,16 @@ def scratch_in(folder: Path) -> Iterator[Path]:
 def claim(
     out: Path, suite: Suite, environment: Mapping[str, Any], *, fresh: bool
 ) -> None:
-    """Make a locked folder that of this suite in this environment, or refuse to mix.
+    """Make a locked folder that of this suite in this environment.
 
     environment : with its digest under the key ``digest``
-    fresh : forget first what the folder holds
-
-    Raises
-    ------
-    InputError
-        When the folder holds another suite or another environment.
-
+    fresh : forget first what the folder holds; see `refuse_other` if not
     """
     if fresh:
         for name in _FOLDERS:
             shutil.rmtree(out / name, ignore_errors=True)
         for name in _CONCLUDED:
             (out / name).unlink(missing_ok=True)
-    else:
-        _check_same(out, suite, environment)
     describe(out, suite, environment)
 
 
@@ -260,22 +255,42 @@ def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
     replace_file(out / "environment.json", text.encode())
 
 
-def _check_same(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
-    remedy = "choose another --out or use --fresh"
+def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
+    """Refuse a folder of another suite or environment; tell whether the suite grew.
+
+    environment : as for `claim`
+
+    Raises
+    ------
+    InputError
+        With what differs, and what to do.
+
+    """
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
-    if suite_file.exists() and _toml(suite_file) != toml(suite.text):
-        raise InputError(
-            f"{out} holds another suite ({suite_file} is not {suite.name!r} as it is "
-            f"now); {remedy}"
-        )
+    now, then = toml(suite.text), None
+    if suite_file.exists():
+        then = _toml(suite_file)
+        if then is not None and then != now and (changed := _refused(then, now)):
+            raise InputError(f"{out} holds another suite ({changed}); {REMEDY}")
+        if then is None:
+            raise InputError(f"{suite_file} is no suite; restore it, or use --fresh")
     if environment_file.exists():
         then = _environment(environment_file)
         if then["digest"] != environment["digest"]:
-            keys = some(key for key, *_ in differences(then, environment))
+            what = in_words(differences(then, environment), "then", "now")
             raise InputError(
                 f"{out} was measured in another environment ({then['digest']}, now "
-                f"{environment['digest']}{keys and f': {keys} changed'}); {remedy}"
+                f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
+    return then is not None and then != now
+
+
+def _refused(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Say what makes the suite another one; nobody has checked the older one."""
+    try:
+        return refused(then, now)
+    except (TypeError, ValueError, AttributeError):
+        return "its suite.toml is none that a run wrote"
 
 
 def suite_text(folder: Path) -> str:

@@ -16,7 +16,8 @@ from harness.registry import SolverSpec, options_of, resolve
 from harness.results.folder import environment_of, suite_text
 from harness.results.journal import read_journal
 from harness.results.work_unit import WorkUnit
-from harness.suite.suite import asked_solvers, limits, steps_up_to
+from harness.suite.solver_options import without_options
+from harness.suite.suite import NULL, asked_solvers, limits, steps_up_to
 from harness.verify.verdicts import new_record, plain
 
 
@@ -53,9 +54,7 @@ def open_stored_run(
     records = read_journal(folder)
     record = _found(folder, run_id, records)
     environment, text = environment_of(folder, record.environment), suite_text(folder)
-    spec = asked_solvers(text).get(
-        record.solver, SolverSpec(name=record.solver, label=record.solver)
-    )
+    spec = _asked(record, asked_solvers(text))
     try:
         name = assemble(_family(record, families), record.params, record.form)
         in_sequence = record.mode == "sequence"
@@ -127,6 +126,15 @@ def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
     raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
 
 
+def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
+    """Find the solver of a label: of the suite, or of the command line."""
+    name = record.solver
+    for name in without_options(record.solver.removesuffix(NULL)):
+        if name in known:
+            return replace(known[name], label=record.solver, role=record.role)
+    return SolverSpec(name=name, label=record.solver, role=record.role)
+
+
 def _family(record: Record, families: Mapping[str, Family]) -> Family:
     if record.family not in families:
         raise InputError(f"unknown family {record.family!r}")
@@ -138,7 +146,7 @@ def _with_options(
 ) -> SolverSpec:
     """Ask for those stored options that are not today's defaults."""
     asked = replace(spec, options={})
-    if spec.name not in solvers and f"{spec.name.partition(':')[0]}:*" not in solvers:
+    if spec.name not in solvers and f"{spec.name.rpartition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")
     today = plain(options_of(resolve(asked, solvers)))
     options = {k: v for k, v in record.options.items() if today.get(k, ...) != v}

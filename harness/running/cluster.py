@@ -10,18 +10,23 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from harness.environment.environment import packages_of
-from harness.errors import InputError, some
+from harness.environment.labels import in_words
+from harness.errors import InputError
 from harness.operators import Maker
+from harness.registry import PluginFile
 from harness.results.folder import differences
 from harness.results.work_unit import (
     Commands,
@@ -48,16 +53,19 @@ Keep = Callable[[str, Mapping[str, Any]], None]
 _CODE = ("source", "versions.mortarbench", "plugins")
 
 
+@contextmanager
 def on_cluster(
     address: str,
     *,
-    plugins: Sequence[Path],
+    plugins: Sequence[PluginFile],
     operators: Mapping[str, Maker],
     environment: Mapping[str, Any],
     keep: Keep,
     warn: Callable[[str], None],
-) -> Opens:
-    """Make what opens the engine of a run on a Dask cluster.
+) -> Iterator[Opens]:
+    """Connect to a Dask cluster, and give what opens the engine of a run on it.
+
+    So an address that is wrong is refused before there is a result folder.
 
     address : of a scheduler, or "local" for one with a worker for each CPU of this
         machine
@@ -70,8 +78,8 @@ def on_cluster(
     Raises
     ------
     InputError
-        When Dask is not installed; on opening, when there is no such scheduler; while
-        blocks are carried out, when a node is not fit to measure on.
+        When Dask is not installed, or there is no such scheduler; while blocks are
+        carried out, when a node is not fit to measure on.
 
     """
     try:
@@ -82,24 +90,25 @@ def on_cluster(
             "pip install -c constraints.txt -e '.[cluster]'"
         ) from None
 
-    @contextmanager
-    def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
-        from harness.running.dask_worker import ExecutorPlugin
+    with ExitStack() as stack:
+        client = _connected(address, stack)
 
-        with ExitStack() as stack:
-            client = _connected(address, stack)
+        @contextmanager
+        def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
+            from harness.running.dask_worker import ExecutorPlugin
+
             name = f"mortarbench-{client.id}"
-            _forget_lost_runs(client)
-            files = [file.resolve() for file in plugins]
-            sharing, packages = _sharing(client), packages_of(environment)
-            node = ExecutorPlugin(commands, files, operators, sharing, packages)
-            client.register_plugin(node, name=name)
-            stack.callback(_end, client, name)
-            nodes = Nodes(environment, keep, warn)
-            with _scheduler_there(client, address):
+            with ExitStack() as ends, _scheduler_there(client, address):
+                _forget_lost_runs(client)
+                files = [file.resolved() for file in plugins]
+                sharing, packages = _sharing(client), packages_of(environment)
+                node = ExecutorPlugin(commands, files, operators, sharing, packages)
+                client.register_plugin(node, name=name)
+                ends.callback(_end, client, name)
+                nodes = Nodes(environment, keep, warn)
                 yield _Cluster(client, name, nodes, address, warn)
 
-    return opened
+        yield opened
 
 
 class Nodes:
@@ -130,15 +139,19 @@ class Nodes:
         changed = list(differences(self._here, environment))
         for key, here, there in changed:
             if key.startswith(_CODE):
+                what = in_words([(key, here, there)], "here", "there")
                 raise InputError(
-                    f"{node} runs other code than this machine: {key} is {there} "
-                    f"there, {here} here; install the same on every node"
+                    f"{node} runs other code than this machine ({what}); install the "
+                    "same on every node"
                 )
         self._seen.add(digest)
         self._keep(digest, environment)
         if changed:
-            keys = some(key for key, *_ in changed)
-            self._warn(f"{node} is another environment ({digest}): other {keys}")
+            what = in_words(changed, "here", "there")
+            self._warn(
+                f"{node} measures under other conditions than this machine ({what}); "
+                f"its times are marked as those of environment {digest}"
+            )
 
 
 @dataclass(eq=False, kw_only=True)
@@ -340,14 +353,15 @@ def _connected(address: str, stack: ExitStack) -> Any:
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we tell ourselves
     if address == LOCAL:
-        cluster = LocalCluster(
-            n_workers=len(os.sched_getaffinity(0)),
-            threads_per_worker=1,
-            memory_limit=0,  # the supervisor's business
-            dashboard_address=None,
-            silence_logs=logging.CRITICAL,
-        )
-        return stack.enter_context(Client(stack.enter_context(cluster)))
+        with _interrupted_later():
+            cluster = LocalCluster(
+                n_workers=len(os.sched_getaffinity(0)),
+                threads_per_worker=1,
+                memory_limit=0,  # the supervisor's business
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            )
+            return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
     except TypeError as e:
@@ -364,6 +378,36 @@ def _connected(address: str, stack: ExitStack) -> Any:
             f"--dask {address}: no scheduler answers ({why}); expected 'local', or the "
             "address that `dask scheduler` prints, such as tcp://HOST:8786"
         ) from None
+
+
+@contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Keep Ctrl-C from what is started here, and put it off until that is done.
+
+    A terminal sends SIGINT to all processes at once. Dask's would print a traceback
+    each; they inherit the mask of this thread, and end with the cluster, which this
+    process closes. A second Ctrl-C is not put off.
+    """
+    if current_thread() is not main_thread():  # which alone is interrupted
+        yield
+        return
+    before = signal.getsignal(signal.SIGINT)
+    late = []
+
+    def put_off(*_: object) -> None:  # the signal came to another thread of ours
+        late.append(signal.SIGINT)
+        signal.signal(signal.SIGINT, before)
+
+    resource_tracker.ensure_running()  # else it is started later, and lifts the mask
+    signal.signal(signal.SIGINT, put_off)
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, before)
+    if late:
+        raise KeyboardInterrupt
 
 
 @contextmanager

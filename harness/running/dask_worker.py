@@ -26,7 +26,7 @@ from harness.environment.environment import capture_in, digest
 from harness.errors import InputError
 from harness.limits import ONE_THREAD
 from harness.operators import Maker
-from harness.registry import load_plugin, merged
+from harness.registry import PluginFile, load_plugin, merged
 from harness.results.work_unit import Commands, Outcome, WorkUnit
 from harness.running.executor import Executor
 
@@ -57,7 +57,7 @@ class ExecutorPlugin(WorkerPlugin):
     def __init__(
         self,
         commands: Commands,
-        plugins: Sequence[Path],
+        plugins: Sequence[PluginFile],
         operators: Mapping[str, Maker],
         sharing: int,
         packages: Sequence[str],
@@ -160,10 +160,10 @@ class ExecutorPlugin(WorkerPlugin):
         return delivery
 
     def _opened(self) -> _Open:
-        for path in self._plugins:
-            if not path.is_file():
+        for file in self._plugins:
+            if not file.path.is_file():
                 raise InputError(
-                    f"{platform.node()}: no plug-in {path}; "
+                    f"{platform.node()}: no plug-in {file.path}; "
                     "expected the same files under the same paths on every node"
                 )
         environment = capture_in(ONE_THREAD, self._plugins, self._packages)
@@ -174,8 +174,8 @@ class ExecutorPlugin(WorkerPlugin):
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
             operators: Mapping[str, Maker] = self._operators
-            for path in self._plugins:
-                operators = merged("operator", operators, load_plugin(path).operators)
+            for file in self._plugins:
+                operators = merged("operator", operators, load_plugin(file).operators)
             commands = self._here(self._commands)
             executor = Executor(commands, scratch, scratch / "cases", operators)
             stack.enter_context(executor)

@@ -13,22 +13,25 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from secrets import token_hex
 from threading import current_thread, main_thread
 from typing import Any
 
-from harness.errors import InputError
+from harness.errors import InputError, shown
 from harness.files.durable import Lines, full_disk_told
 from harness.files.store import save
 from harness.plugin import Solver
-from harness.record import Record
+from harness.record import Record, finite
 from harness.registry import SolverSpec, options_of
 from harness.results.faults import FAULTS, Fault
 from harness.results.folder import (
+    REMEDY,
     Held,
     claim,
     describe,
     locked,
     refuse_foreign,
+    refuse_other,
     scratch_in,
 )
 from harness.results.journal import Journal, read_journal
@@ -37,6 +40,7 @@ from harness.running.executor import one_by_one
 from harness.running.progress import Progress
 from harness.running.schedule import Schedule
 from harness.suite.suite import Suite
+from harness.verify.verdicts import plain
 
 _log = logging.getLogger(__name__)
 
@@ -81,17 +85,24 @@ def run(
     refuse_foreign(out)
     environment = {"digest": digest, **environment}
     with _ended_by_sigterm(progress), full_disk_told(out), locked(out) as held:
+        options = {s.label: options_of(resolve(s)) for s in suite.solvers}
+        past: list[Record] = []
+        if not fresh:
+            grown = refuse_other(out, suite, environment)
+            past = _measured(out)
+            _check_same(out, past, suite, options)
+            if grown:
+                _check_steps(out, past, suite)
         claim(out, suite, environment, fresh=fresh)
         with (
             scratch_in(out) as scratch,
             Journal(out, digest, progress.warn) as journal,
         ):
-            past = read_journal(out)
-            _check_same(out, past, suite)
             schedule = Schedule(
                 suite=suite,
-                options={s.label: options_of(resolve(s)) for s in suite.solvers},
+                options=options,
                 environment=digest,
+                session=token_hex(6),
                 progress=progress,
             )
             for record in past:
@@ -222,14 +233,60 @@ def _ended_by_sigterm(progress: Progress) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def _check_same(out: Path, past: list[Record], suite: Suite) -> None:
-    """Refuse to go on where a name now means another case: its file has changed."""
+def _measured(out: Path) -> list[Record]:
+    """Read what a folder holds; nothing where no run came so far."""
+    there = next((out / "journal").glob("*.jsonl"), None) is not None
+    return read_journal(out) if there else []
+
+
+def _check_same(
+    out: Path,
+    past: list[Record],
+    suite: Suite,
+    options: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Refuse to go on where a name now means another thing, or none.
+
+    A label has other options, a case is in the suite no longer, or its file has
+    changed.
+    """
     now = {case.name: case.params for case in suite.names}
+    asked = {label: finite(plain(given)) for label, given in options.items()}
     for record in past:
+        if suite.every and record.case not in suite.every:
+            raise InputError(
+                f"{out} holds {record.case}, which the suite has no longer; cases may "
+                f"be added, and --case narrows a run; {REMEDY}"
+            )
+        given = asked.get(record.solver, record.options)
+        for key in given.keys() | record.options.keys():
+            then, at_present = record.options.get(key), given.get(key)
+            if then != at_present:
+                raise InputError(
+                    f"{out} holds {record.solver} with {key} = {shown(then)}, now "
+                    f"{shown(at_present)}; give other options another label"
+                )
         params = now.get(record.case, record.params)
         for key in params.keys() & record.params.keys():
             if record.params[key] != params[key]:
                 raise InputError(
                     f"{out} holds {record.case} with {key} = {record.params[key]}, "
-                    f"now {params[key]}; choose another --out or use --fresh"
+                    f"now {params[key]}; {REMEDY}"
+                )
+
+
+def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
+    """Refuse a sequence that has new steps before some that were driven."""
+    driven: dict[tuple[str, float, int], list[str]] = {}
+    for r in past:
+        if r.mode == "sequence":
+            driven.setdefault((r.solver, r.tol, r.repeat), []).append(r.case)
+    for sequence in suite.sequences:
+        steps = [case.name for case in sequence]
+        for cases in driven.values():
+            known = [case for case in cases if case in steps]
+            if known != steps[: len(known)]:
+                raise InputError(
+                    f"{out} holds a sequence that came to {known[-1]} by other steps; "
+                    f"steps may be added at its end; {REMEDY}"
                 )

@@ -12,14 +12,14 @@ where an undisturbed one does.
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from harness.names import CaseId
 from harness.record import Record, Verdict
 from harness.results.work_unit import WorkUnit
-from harness.running.pairs import widest
+from harness.running.pairs import Block, widest
 from harness.running.progress import Progress
 from harness.suite.suite import Suite
 from harness.verify.verdicts import new_record
@@ -35,6 +35,7 @@ class Schedule:
     suite: Suite
     options: Mapping[str, Mapping[str, Any]]  #: of each solver, defaults resolved
     environment: str  #: digest
+    session: str = ""  #: of the run, see `harness.record.Record`
     progress: Progress
     unbuilt: list[str] = field(default_factory=list)  #: names of cases
     _seen: dict[Cell, list[Record]] = field(default_factory=dict)  # for `_enough`
@@ -91,7 +92,9 @@ class Schedule:
                     block = self._block(group, tol, repeat)
                     if block is not None:
                         first = block.turns[0][0]
-                        self.progress.say(f"{first.case}, tol {tol:g}, {repeat + 1}")
+                        self.progress.say(
+                            f"{first.case}, tol {tol:g}, repeat {repeat + 1}"
+                        )
                         yield block
 
     @property
@@ -110,11 +113,10 @@ class Schedule:
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
         failed = {r.solver for r in records if r.verdict is not Verdict.VERIFIED}
-        times: dict[str, dict[int, float]] = {}
-        for r in records:
-            if r.solver not in failed and r.total_seconds:
-                of = times.setdefault(r.solver, {})
-                of[r.repeat] = of.get(r.repeat, 0.0) + r.total_seconds
+        times: dict[str, dict[Block, float]] = {}
+        for solver in {r.solver for r in records} - failed:
+            mine = [r for r in records if r.solver == solver and r.total_seconds]
+            times[solver] = _by_block(mine)
         width = widest(times)
         return width is None or width <= self.suite.precision
 
@@ -131,6 +133,7 @@ class Schedule:
                     repeat=repeat,
                     block=self._next,
                     environment=self.environment,
+                    session=self.session,
                     mode=_mode(group),
                     accuracy=self.suite.accuracy,
                 )
@@ -160,6 +163,23 @@ class Schedule:
     def _skip(self, cells: int) -> None:
         for _ in range(cells):
             self.progress.advance(None)
+
+
+def _by_block(records: Iterable[Record]) -> dict[Block, float]:
+    """Add the seconds of the steps of each repeat.
+
+    A sequence that was cut off and driven again is of several sessions, and is paired
+    with nothing but such.
+    """
+    repeats: dict[int, list[Record]] = {}
+    for r in records:
+        repeats.setdefault(r.repeat, []).append(r)
+    return {
+        (" ".join(sorted({r.session for r in steps})), repeat): sum(
+            r.total_seconds or 0.0 for r in steps
+        )
+        for repeat, steps in repeats.items()
+    }
 
 
 def _mode(group: Group) -> str:

@@ -13,6 +13,7 @@ from harness.files.reading import toml
 from harness.names import CaseId, match, parse
 from harness.plugin import Family, Solver
 from harness.registry import SolverSpec, resolve
+from harness.suite.solver_options import swept
 from harness.suite.suite import NULL, Suite
 
 
@@ -26,11 +27,13 @@ def with_overrides(
     repeats: int | None = None,
     time_limit: float | None = None,
     memory_limit: float | None = None,
+    options: Mapping[str, Sequence[str]] | None = None,
 ) -> Suite:
     """Narrow a suite as the options of the command line say.
 
     solvers : labels of the suite to keep, or names of the registry to add
     cases : what to keep: shell globs over canonical names, or names
+    options : of the solvers, as texts; several values sweep
 
     Raises
     ------
@@ -41,6 +44,9 @@ def with_overrides(
     changes: dict[str, Any] = {}
     if solvers:
         changes["solvers"] = _chosen_solvers(suite, solvers, registry)
+    if options:
+        asked = changes.get("solvers", suite.solvers)
+        changes["solvers"] = swept(asked, options, registry)
     if cases:
         changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from glob import escape, glob
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -71,6 +72,8 @@ def _blocks(
                     raise unknown("key", key, family.defaults, where=name)
             along = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
+            if family.path_suffix is not None and "path" in params:
+                params = {**params, "path": _expanded(params["path"], folder)}
             axes = _axes(params, table.get("zip", []))
             spanned += prod(map(len, axes)) * len(forms)
             if spanned > most:
@@ -84,6 +87,37 @@ def _blocks(
                 for form in forms
             ]
             yield _Block(cases=cases, along=along)
+
+
+def _expanded(paths: object, folder: Path) -> object:
+    """Write out the shell patterns among paths: the files that match, sorted."""
+    listed = paths if isinstance(paths, list) else [paths]
+    if not any(_is_pattern(path, folder) for path in listed):
+        return paths
+    found: list[object] = []
+    for path in listed:
+        found += _matching(str(path), folder) if _is_pattern(path, folder) else [path]
+    return found
+
+
+def _is_pattern(path: object, folder: Path) -> bool:
+    """Whether a path has the signs of a pattern, and is no file's name as it is."""
+    if not isinstance(path, str) or not set("*?[") & set(path):
+        return False
+    return not os.path.exists(path) and not (folder / path).exists()
+
+
+def _matching(pattern: str, folder: Path) -> list[str]:
+    """List the files that match from here, or else from the folder of the suite."""
+    if found := sorted(filter(os.path.isfile, glob(pattern))):
+        return found
+    beside = glob(os.path.join(escape(str(folder)), pattern))
+    if found := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
+        return found
+    raise InputError(
+        f"params.path = {shown(pattern)} matches no file; expected a pattern of files, "
+        "from here or from the folder of the suite"
+    )
 
 
 def _located(point: dict[str, object], folder: Path) -> dict[str, object]:

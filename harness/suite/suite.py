@@ -51,6 +51,7 @@ class Suite:
     max_repeats: int = 30  #: where there is a precision to reach
     budget: float = 600.0  #: s of measured time per case and tolerance, likewise
     accuracy: float | None = None  #: judge answers at this, whatever was asked for
+    every: frozenset[str] = frozenset()  #: names of the cases, where these are some
 
     @property
     def groups(self) -> tuple[tuple[CaseId, ...], ...]:
@@ -101,6 +102,9 @@ def load_suite(
             solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
             cases=cases,
             sequences=sequences,
+            every=frozenset(
+                case.name for group in ((cases, *sequences)) for case in group
+            ),
             precision=_between("precision", table["precision"]),
             max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
             budget=checked.positive("budget", table["budget"]),

@@ -38,12 +38,13 @@ def new_record(
     block: int = 0,
     mode: str = "cold",
     accuracy: float | None = None,
+    session: str = "",
 ) -> Record:
     """Make the record of a measurement before it is made.
 
     options : every option of the solver, defaults resolved
     environment : digest
-    mode, accuracy : see `Record`
+    mode, accuracy, session : see `Record`
     """
     options = plain(options)
     identity = [IDENTITY, case.name, spec.label, spec.name, options, tol, repeat]
@@ -68,6 +69,7 @@ def new_record(
         accuracy=accuracy,
         role=spec.role,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
+        session=session,
     )
 
 

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
-from mortarbench.arguments import FORMATS
+from harness.registry import PluginFile
+from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
@@ -28,7 +29,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         usage = " ".join(self.format_usage().split())
-        raise InputError(f"{message}; {usage}")
+        raise InputError(f"{message}; {usage}; {self.prog} --help tells more")
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End after a help text, while a reader that has gone is no surprise."""
@@ -112,40 +113,128 @@ def _print_no_more() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+_CASE = "FAMILY/key=value/…/FORM, as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md"
+_RESULTS = "a result folder, as `run` writes it"
+
+
+class _Version(argparse.Action):
+    """Prints the version that is installed, which only then is looked up."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"mortarbench {version('mortarbench')}")
+        parser.exit()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="mortarbench",
-        description="Compare QP solvers on elastic contact problems.",
+        description="Compare QP solvers on elastic contact problems. To begin with: "
+        "mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver smalbe; then "
+        "mortarbench run demo.",
+        epilog="mortarbench COMMAND --help tells the options of a command.",
         allow_abbrev=False,
+    )
+    parser.add_argument(
+        "--version", action=_Version, nargs=0, help="print the version, and end"
     )
     found = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_Parser
     )
 
-    def add(name: str, what: str, module: str) -> _Parser:
-        command: _Parser = found.add_parser(name, help=what, allow_abbrev=False)
+    def add(name: str, what: str, module: str, more: str = "") -> _Parser:
+        command: _Parser = found.add_parser(
+            name,
+            help=what,
+            description=f"{what[0].upper()}{what[1:]}.{more and f' {more}'}",
+            allow_abbrev=False,
+        )
         command.set_defaults(module=f"mortarbench.cli.{module}", parser=command)
         return command
 
-    _add_list_options(add("list", "what there is", "list_"))
-    _add_run_options(add("run", "measure a suite; continues a run", "run"))
-    _add_solve_options(add("solve", "one solver on one case, once", "solve"))
-    _add_export_options(add("export", "one QP as a file", "export"))
+    _add_list_options(
+        add("list", "show which problems, solvers or suites there are", "list_")
+    )
+    _add_run_options(
+        add(
+            "run",
+            "measure what a suite asks for, and write a report on it",
+            "run",
+            "Results go to a folder. The same command continues a run that was "
+            "interrupted, and measures nothing twice.",
+        )
+    )
+    _add_solve_options(
+        add(
+            "solve",
+            "run one solver on one case once, and judge its answer",
+            "solve",
+            "Exit code 1: the answer was not verified.",
+        )
+    )
+    _add_export_options(
+        add("export", "write the QP of a case to a file for other programs", "export")
+    )
     _add_validate_options(
-        add("validate", "do all answers of a folder agree", "validate")
+        add(
+            "validate",
+            "check the answers in a result folder against each other and the truth",
+            "validate",
+            "Exit code 1: a claim was refuted, or answers contradict each other.",
+        )
     )
-    _add_report_options(add("report", "report on a result folder", "report"))
-    _add_replay_options(add("replay", "one measurement again", "replay"))
+    _add_report_options(
+        add(
+            "report",
+            "write the report on a result folder, or on what changed between several",
+            "report",
+        )
+    )
+    _add_replay_options(
+        add("replay", "repeat one stored measurement, and compare", "replay")
+    )
+    _add_merge_options(
+        add(
+            "merge",
+            "make one result folder of several",
+            "merge",
+            "A measurement that several of them hold is taken once; environments stay "
+            "apart.",
+        )
+    )
     _add_test_options(
-        add("test-solver", "the conformance suite, on solvers", "test_solver")
+        add(
+            "test-solver",
+            "check whether a solver keeps the contract, on QPs with known solutions",
+            "test_solver",
+        )
     )
-    _add_paper_options(add("paper", "every figure of the paper", "paper"))
-    _add_json(add("doctor", "is this machine fit to measure", "doctor"))
+    _add_paper_options(
+        add("paper", "make every figure and table of the paper again", "paper")
+    )
+    _add_json(
+        add(
+            "doctor",
+            "say whether this machine is fit for measuring times, and what to change",
+            "doctor",
+        )
+    )
+    _add_new_options(
+        add(
+            "new",
+            "write a solver, a problem or a suite to start from",
+            "new",
+            "The file passes its checks as it is. Nothing is written over.",
+        )
+    )
     return parser
 
 
 def _add_list_options(command: _Parser) -> None:
-    command.add_argument("what", choices=("problems", "solvers", "suites"))
+    command.add_argument(
+        "what", choices=("problems", "solvers", "suites"), help="what to show"
+    )
     command.add_argument(
         "--markdown", action="store_true", help="solvers: all about them, as in docs/"
     )
@@ -154,112 +243,229 @@ def _add_list_options(command: _Parser) -> None:
 
 
 def _add_solve_options(command: _Parser) -> None:
-    command.add_argument("case", metavar="CASE", help="FAMILY/key=value/…/FORM")
-    command.add_argument("--solver", metavar="NAME", required=True)
-    command.add_argument("--tol", metavar="T", type=float, default=1e-8)
+    command.add_argument("case", metavar="CASE", help=_CASE)
     command.add_argument(
-        "--plot", metavar="FILE.png", type=Path, help="the deformed bodies"
+        "--solver", metavar="NAME", required=True, help="a name of `list solvers`"
+    )
+    command.add_argument(
+        "--tol",
+        metavar="T",
+        type=float,
+        default=1e-8,
+        help="relative accuracy that the solver is asked for; default: 1e-8",
+    )
+    _add_option(command, "an option of the solver, instead of its default")
+    command.add_argument(
+        "--plot",
+        metavar="FILE.png|pdf|svg",
+        type=Path,
+        help="draw the deformed bodies with their stresses, and each contact enlarged",
+    )
+    command.add_argument(
+        "--scale",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="multiply the displacement in the picture; default: 1",
     )
     command.add_argument(
         "--vtu",
         metavar="FILE.vtu",
         type=Path,
-        help="the same for ParaView; FILE.pvd: all load steps up to this one",
+        help="write them for ParaView, and a CSV along each contact; FILE.pvd: all "
+        "load steps up to this one",
     )
     _add_plugin(command)
     _add_json(command)
 
 
 def _add_export_options(command: _Parser) -> None:
-    command.add_argument("case", metavar="CASE")
-    command.add_argument("file", metavar="FILE.npz|mat|parquet", type=Path)
+    command.add_argument("case", metavar="CASE", help=_CASE)
+    command.add_argument(
+        "file",
+        metavar="FILE.npz|mat|parquet|qps",
+        type=Path,
+        help="for NumPy, MATLAB and Octave, qpbenchmark, or what reads QPS",
+    )
     _add_plugin(command)
 
 
 def _add_validate_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
     command.add_argument(
         "--budget",
         metavar="SECONDS",
         type=float,
         default=300.0,
-        help="for finer meshes, that tell discretisation errors; default: 300",
+        help="time to spend on finer meshes, which tell how large the errors of the "
+        "meshes are; default: 300",
     )
     _add_plugin(command)
     _add_json(command)
 
 
 def _add_report_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
     command.add_argument(
-        "other",
+        "others",
         metavar="DIR2",
         type=Path,
-        nargs="?",
-        help="what changed from DIR to DIR2, into DIR2/report/against-DIR",
+        nargs="*",
+        help="what changed from DIR to DIR2, and to each further one, into "
+        "DIR2/report/against-DIR",
     )
     command.add_argument(
-        "--format", metavar=",".join(FORMATS), default=",".join(FORMATS)
+        "--format",
+        metavar=",".join(FORMATS),
+        default=",".join(FORMATS),
+        help="what to write; default: all",
     )
     command.add_argument(
         "--factor",
         metavar="F",
         type=float,
-        help="verified: every residual within F times the tolerance; default: 10",
+        help="call an answer verified if every residual is within F times the "
+        "tolerance; default: 10",
+    )
+    command.add_argument(
+        "--pool-forms",
+        action="store_true",
+        help="compare solvers over the cases of all forms together (means, ranks and "
+        "profiles); otherwise each form is compared apart",
+    )
+    command.add_argument(
+        "--fail-on",
+        metavar=",".join(GATES),
+        help="exit with 1 where a verdict became worse, or a solver slower beyond "
+        "chance, from DIR to DIR2",
+    )
+    _add_json(command)
+
+
+def _add_merge_options(command: _Parser) -> None:
+    command.add_argument(
+        "folders",
+        metavar="DIR",
+        type=Path,
+        nargs="+",
+        help="result folders, each as `run` or `merge` writes it",
+    )
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        type=_folder,
+        required=True,
+        help="a new folder, or one that was merged before, which is added to",
     )
 
 
 def _add_replay_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path)
+    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
     command.add_argument(
-        "run_id", metavar="RUN_ID", help="of a journal line, or its first digits"
+        "run_id",
+        metavar="RUN_ID",
+        help="which measurement: the run_id of a journal line, or its first digits; a "
+        "report shows it where one points at a number",
     )
     _add_plugin(command)
     _add_json(command)
 
 
 def _add_test_options(command: _Parser) -> None:
-    command.add_argument("solver", metavar="NAME", nargs="+", help="or a pattern")
+    command.add_argument(
+        "solver", metavar="NAME", nargs="+", help="a solver, or a pattern such as 'p*'"
+    )
     _add_plugin(command)
     shown = command.add_mutually_exclusive_group()
     shown.add_argument(
         "--markdown",
         action="store_true",
-        help="only what equivalent formulations change, as in docs/weaknesses.md",
+        help="show only what equivalent formulations change, as docs/weaknesses.md",
     )
     _add_json(shown)
 
 
+def _add_new_options(command: _Parser) -> None:
+    command.add_argument(
+        "kind", choices=("solver", "problem", "suite"), help="what to write"
+    )
+    command.add_argument(
+        "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
+    )
+
+
 def _add_paper_options(command: _Parser) -> None:
-    command.add_argument("--out", metavar="DIR", type=Path, default=Path("out/paper"))
+    command.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        default=Path("out/paper"),
+        help="where to write them; default: out/paper",
+    )
     command.add_argument(
         "--quick", action="store_true", help="fewer sizes and repeats: a minute or so"
     )
 
 
 def _add_run_options(command: _Parser) -> None:
-    command.add_argument("suite", metavar="SUITE.toml", help="or the name of a suite")
     command.add_argument(
-        "--out", metavar="DIR", type=_folder, help="default: out/NAME-OF-SUITE"
+        "suite", metavar="SUITE.toml", help="a file, or a name of `list suites`"
     )
     command.add_argument(
-        "--solver", metavar="NAME", action="append", default=[], help="only this one"
+        "--out",
+        metavar="DIR",
+        type=_folder,
+        help="result folder; default: out/NAME-OF-SUITE",
     )
     command.add_argument(
-        "--case", metavar="PATTERN", action="append", default=[], help="only these"
+        "--solver",
+        metavar="NAME",
+        action="append",
+        default=[],
+        help="measure only this solver; may be repeated",
+    )
+    command.add_argument(
+        "--case",
+        metavar="PATTERN",
+        action="append",
+        default=[],
+        help="measure only these cases, e.g. '*/dual'; may be repeated",
+    )
+    _add_option(
+        command,
+        "an option of every solver that has it; several values are measured each",
     )
     _add_plugin(command)
-    command.add_argument("--repeats", metavar="N", type=int)
-    command.add_argument("--time-limit", metavar="SECONDS", type=float)
-    command.add_argument("--memory-limit", metavar="MIB", type=float)
     command.add_argument(
-        "--fresh", action="store_true", help="forget what the folder holds"
+        "--repeats", metavar="N", type=int, help="instead of the suite's"
+    )
+    command.add_argument(
+        "--time-limit",
+        metavar="SECONDS",
+        type=float,
+        help="for each measurement, instead of the suite's",
+    )
+    command.add_argument(
+        "--memory-limit",
+        metavar="MIB",
+        type=float,
+        help="for each measurement, instead of the suite's",
+    )
+    command.add_argument(
+        "--fresh", action="store_true", help="delete first what the folder holds"
     )
     command.add_argument(
         "--dask",
         metavar="ADDRESS|local",
-        help="measure on the workers of a Dask scheduler, see docs/cluster.md",
+        help="measure on the workers of a Dask scheduler, or on several processes of "
+        "this machine; see docs/cluster.md",
     )
+    command.add_argument(
+        "--strict",
+        action="store_true",
+        help="exit with 1 where a claim is refuted or a solver failed",
+    )
+    _add_json(command)
 
 
 def _folder(text: str) -> Path:
@@ -268,16 +474,23 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _add_option(command: _Parser, what: str) -> None:
+    command.add_argument(
+        "--option", metavar="KEY=VALUE", action="append", default=[], help=what
+    )
+
+
 def _add_plugin(command: _Parser) -> None:
     command.add_argument(
         "--plugin",
-        metavar="FILE.py",
-        type=Path,
+        metavar="[LABEL=]FILE.py",
+        type=PluginFile.of,
         action="append",
         default=[],
-        help="more solvers or problems",
+        help="load solvers or problems of your own from a file; may be repeated; "
+        "solvers of LABEL=FILE.py are called LABEL:NAME",
     )
 
 
 def _add_json(command: argparse._ActionsContainer) -> None:
-    command.add_argument("--json", action="store_true", help="for machines")
+    command.add_argument("--json", action="store_true", help="print JSON")

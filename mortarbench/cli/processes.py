@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 
 from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
@@ -17,7 +16,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Be the worker that `Registries.worker_command` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
-    registries = registries.with_files([Path(file) for file in request["plugins"]])
+    registries = registries.with_files(request["plugins"])
     spec = SolverSpec(
         name=request["name"], label=request["name"], options=request["options"]
     )
@@ -29,8 +28,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Be the case worker that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
-    files = [Path(file) for file in json.loads(text)["plugins"]]
-    registries = registries.with_files(files)
+    registries = registries.with_files(json.loads(text)["plugins"])
     serve_cases(
         CaseWorker(registries.families, registries.reference, registries.operators),
         int(request_fd),

@@ -1,33 +1,45 @@
-"""The command `report`: on a result folder, or on what changed between two."""
+"""The command `report`: on a result folder, or on what changed between several."""
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
 
 from harness.checked import positive
-from mortarbench.arguments import check_formats, existing
+from harness.errors import InputError
+from mortarbench.arguments import check_formats, check_gates, existing
 from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Write the report on a result folder, or what changed between two."""
+    """Write the report on a result folder, or what changed; 1 if it failed on that."""
     formats = options.format.split(",")
     check_formats(formats, "--format")
+    gates = options.fail_on.split(",") if options.fail_on is not None else []
+    check_gates(gates, "--fail-on")
+    if gates and not options.others:
+        raise InputError("--fail-on needs a second folder; expected report DIR DIR2")
     if options.factor is not None:
         positive("--factor", options.factor)
-    for folder in filter(None, (options.folder, options.other)):
+    for folder in (options.folder, *options.others):
         existing(folder)
     from harness.record import VERIFIED_FACTOR
     from mortarbench.reporting import report
 
     found = report(
         options.folder,
-        options.other,
+        *options.others,
         formats=formats,
         factor=VERIFIED_FACTOR if options.factor is None else options.factor,
+        fail_on=gates,
+        pool_forms=options.pool_forms,
         registries=registries,
     )
-    pages = [file for file in found.files if file.suffix == ".html"]
-    shown = found.files if options.other is None else pages or found.files
-    print(*found.said, *shown, sep="\n")
-    return 0
+    if options.json:
+        print(json.dumps(found.to_dict(), allow_nan=False))
+    else:
+        pages = [file for file in found.files if file.suffix == ".html"]
+        shown = pages or found.files if options.others else found.files
+        failed = [f"failed on {', '.join(found.failed_on)}"] * bool(found.failed_on)
+        print(*found.said, *shown, *failed, sep="\n")
+    return 1 if found.failed_on else 0

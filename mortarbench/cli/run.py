@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from argparse import Namespace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from harness.errors import some
 from harness.files.durable import full_disk_told
+from harness.suite.solver_options import given_options
 from mortarbench.registries import Registries
+
+if TYPE_CHECKING:
+    from mortarbench.results import Results
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure what the result folder lacks of a suite, and report; 1 if not all."""
+    """Measure what the result folder lacks of a suite, and report.
+
+    1 if not all was measured; by ``--strict``, if not all was solved.
+    """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)
+    changed = given_options(options.option)
 
     from mortarbench import results
     from mortarbench.progress import shown_on
@@ -28,15 +39,38 @@ def run(registries: Registries, options: Namespace) -> int:
             repeats=options.repeats,
             time_limit=options.time_limit,
             memory_limit=options.memory_limit,
+            options=changed,
             fresh=options.fresh,
             dask=options.dask,
             progress=progress,
             registries=registries,
         )
-    print(found)
+    if not options.json:
+        print(found)
+    pages: list[Path] = []
     if found.records:
         with full_disk_told(found.folder):
-            pages = report(found.folder, registries=registries).files
-        for page in (file for file in pages if file.suffix == ".html"):
-            print(page)
-    return 1 if found.shortfall else 0
+            files = report(found.folder, registries=registries).files
+        pages = [file for file in files if file.suffix == ".html"]
+    failed = len(found.refuted) + len(found.failed) if options.strict else 0
+    if options.json:
+        print(json.dumps({**found.to_dict(), "pages": [*map(str, pages)]}))
+    else:
+        for line in [*pages, *[_strict(found)] * bool(failed)]:
+            print(line)
+    return 1 if found.shortfall or failed else 0
+
+
+def _strict(found: Results) -> str:
+    """Say in a line why a strict run fails."""
+    counts = (
+        (found.refuted, "answer that refutes its claim", "answers that refute theirs"),
+        (found.failed, "measurement without an answer", "measurements without one"),
+    )
+    told = [
+        f"{len(records)} {one if len(records) == 1 else several} "
+        f"({some(dict.fromkeys(f'{r.solver} on {r.case}' for r in records))})"
+        for records, one, several in counts
+        if records
+    ]
+    return f"strict: {' and '.join(told)}"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from harness.errors import InputError, say
 from harness.names import parse
 from harness.registry import check_name
-from mortarbench.arguments import GRIDS, PICTURES, tolerance, writable
+from harness.suite.solver_options import options_for
+from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -20,23 +23,33 @@ def run(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
     tolerance(options.tol, "--tol")
     if options.plot is not None:
-        writable(options.plot, PICTURES[:1])
+        writable(options.plot, PICTURES)
+    drawn_scale(options.scale, "--scale")
+    if options.plot is None and options.scale != 1.0:
+        raise InputError(
+            f"--scale {options.scale:g} without --plot; expected a picture"
+        )
     if options.vtu is not None:
         writable(options.vtu, GRIDS)
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
+    changed = options_for(options.solver, options.option, registries.solvers)
 
     from harness.record import Verdict
-    from mortarbench.answer import solve
+    from mortarbench.answer import answers_of
     from mortarbench.case import built_case
 
-    case = built_case(parsed, registries)
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
-    if drawn and case.made.fields is None:
-        wanted = ", ".join(f"--{o}" for o in drawn)
-        raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
-    answer = solve(case, options.solver, tol=options.tol)
+    forks = registries.hold_own_code_only() and not _loads_from_here()
+    with answers_of(options.solver, registries, changed, forks=forks) as solved:
+        case = built_case(parsed, registries)  # after the fork, which has no use for it
+        for remark in case.remarks:
+            say(remark)
+        if drawn and case.made.fields is None:
+            wanted = ", ".join(f"--{o}" for o in drawn)
+            raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
+        answer = solved(case, options.tol)
     record = answer.record
     if options.json:
         print(json.dumps(answer.to_dict(), allow_nan=False))
@@ -48,6 +61,15 @@ def run(registries: Registries, options: Namespace) -> int:
     if drawn:
         _draw(answer, options)
     return 0 if record.verdict is Verdict.VERIFIED else 1
+
+
+def _loads_from_here() -> bool:
+    """Whether a library may have come from the working directory, and only from there.
+
+    ``python -m`` looks there first. Workers do not, so they must not be forks then.
+    """
+    first, *others = sys.path
+    return first in ("", os.getcwd()) and first not in others
 
 
 def _show_iterations(answer: Answer) -> None:
@@ -65,6 +87,6 @@ def _draw(answer: Answer, options: Namespace) -> None:
         say(f"no picture: {answer.record.solver} returned no point")
         return
     if options.plot is not None:
-        answer.plot(options.plot)
+        answer.plot(options.plot, scale=options.scale)
     if options.vtu is not None:
         answer.save_vtu(options.vtu)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from harness import QP, Fields, Solution, Vector
 from problems.contact.bodies import Bodies
+from problems.contact.sides import bodies_of, contact_sides
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
 
@@ -20,7 +21,7 @@ def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
     its slave where the master is rigid), −ΣBᵀλ, N/m. max_von_mises: per body, of the
-    patch-recovered stress, Pa.
+    patch-recovered stress, Pa. contacts: per pair, see `pair_results`.
     """
     l, F = bodies.length, bodies.force
     slave, master = bodies.pairs[0]
@@ -42,7 +43,35 @@ def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
             name: float(stress[bodies.body_of_node == b].max())
             for b, name in enumerate(bodies.names)
         },
+        "contacts": pair_results(bodies, primal, s),
     }
+
+
+def pair_results(bodies: Bodies, primal: QP, s: Solution) -> dict[str, dict[str, Any]]:
+    """Report each contact pair by its name.
+
+    force: on each of its bodies, N/m. largest_pressure: at a slave node, Pa.
+    smallest_gap: m; below zero where bodies overlap. half_width: half the length of the
+    undeformed slave side that belongs to nodes under pressure, m.
+    """
+    found = {}
+    for pair, side in zip(bodies.pairs, contact_sides(bodies, primal, s), strict=True):
+        slave, master = bodies_of(bodies, pair)
+        total = side.force.sum(axis=0)
+        force = {slave: total.tolist()}
+        if pair.master.size:
+            force = {master: (0.0 - total).tolist()} | force
+        size = np.hypot(*side.force.T)
+        loaded = size > ACTIVE * size.max(initial=0.0)
+        found[side.name] = {
+            "force": force,
+            "largest_pressure": float(side.pressure.max()),
+            "smallest_gap": (
+                None if np.isnan(side.gap).all() else float(np.nanmin(side.gap))
+            ),
+            "half_width": float(side.length[loaded].sum() / 2),
+        }
+    return found
 
 
 def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
@@ -57,6 +86,7 @@ def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
         nodal=nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s)[slaves],
+        contacts=contact_sides(bodies, primal, s),
     )
 
 

@@ -9,19 +9,17 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from harness import Family, InputError
-from harness.errors import unknown
-from problems.files.file_digest import check_digest, digest
+from problems.files.file_digest import check_digest, digest, format_of
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Solution, Value
-
-SUFFIXES = (".npz", ".mat", ".parquet", ".qps", ".mps", ".sif")
 
 
 @dataclass(frozen=True)
 class FromFile(Family):
     """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
 
+    Text and mat files may be compressed: ``file:PATH.qps.gz``.
     The digest of the file's content is a parameter of the case, so that records say
     what was measured and a changed file is not taken for it.
     """
@@ -45,8 +43,7 @@ class FromFile(Family):
         path = Path(str(params["path"]))
         if not params["path"]:
             raise InputError("file: path is missing; expected file:PATH")
-        if path.suffix.lower() not in SUFFIXES:
-            raise unknown("format", path.suffix, SUFFIXES, where=str(path))
+        format_of(path)
         check_digest(params["path"], params["sha256"], digest(path))
 
     def build(

@@ -1,5 +1,7 @@
 """Plane linear elasticity with bilinear quadrilaterals (paper, Section 2).
 
+Triangles are quadrilaterals with two corners in one, see `problems.fem.mesh`.
+
 Voigt notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy); stiffness per unit
 thickness, so K has the unit of stress (Pa) and forces are in N/m.
 """
@@ -120,7 +122,7 @@ class Pattern:
 
 def sparsity(mesh: Mesh) -> Pattern:
     """Find the pattern of K, once for all values."""
-    cells = mesh.cells.astype(np.int32)
+    cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
     ptr, idx = node_pattern(cells, len(mesh.points))
     return Pattern(cells, ptr, slots(cells, ptr, idx), *dof_pattern(ptr, idx))
 

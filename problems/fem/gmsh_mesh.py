@@ -1,4 +1,4 @@
-"""Gmsh's .msh files with physical names, read as plane bodies of quadrilaterals."""
+"""Gmsh's .msh files with physical names, read as plane bodies."""
 
 from __future__ import annotations
 
@@ -16,21 +16,25 @@ from scipy.sparse.csgraph import connected_components
 
 from harness import InputError
 from harness.files.datafile import check_size, opened, parsing
-from problems.fem.mesh import Nodes
+from problems.fem.mesh import Nodes, boundary_edges, triangular
 
 _COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
-CONNECTED = {"vertex": 0, "line": 1, "quad": 2}  #: cells that we read → dimension
+DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2}  #: cells that we read
 FAR = 1e100  #: coordinates whose products overflow
-CORNERS = {"vertex": 1, "line": 2, "quad": 4}
-RECOMBINE = "expected first-order quadrilaterals: Mesh.RecombineAll = 1 in gmsh"
+CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
+#: kinds of cells that start so are of higher order or solid, by the names of meshio
+_CURVED = ("line", "triangle", "quad")
+_SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
+_FIRST_ORDER = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -2 -order 1"
+_NAMED = 'Physical Surface("NAME") in the .geo file'
 
 
 class NamedMesh(NamedTuple):
-    """A mesh of quadrilaterals, and its named parts; lengths as in the file."""
+    """A mesh of triangles and quadrilaterals, and its named parts."""
 
     points: NDArray[np.float64]  #: (N, 2)
-    cells: Nodes  #: (E, 4) counter-clockwise
+    cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
     surfaces: Mapping[str, Nodes]  #: numbers of the cells of each body
     curves: Mapping[str, Nodes]  #: (k, 2) edges, the body on their left
     spots: Mapping[str, Nodes]  #: nodes with the name of a physical point
@@ -40,14 +44,15 @@ def read_msh(path: Path) -> NamedMesh:
     """Read the physical surfaces, curves and points of a .msh file, format 2.2 or 4.1.
 
     Bodies are numbered one after another, which generalised inverses rely on; within a
-    body, nodes and cells keep their order. Nodes that are in no quadrilateral (such as
-    centres of arcs) are left out.
+    body, nodes and cells keep their order, triangles and quadrilaterals in the order of
+    the file's blocks. Nodes that are in no cell (such as centres of arcs) are left out.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is not plane, has other cells than first-order
-        quadrilaterals, cells without a name or bodies that share nodes or fall apart.
+        When the file cannot be read, is not plane, has other cells than triangles and
+        quadrilaterals of first order, cells without a name or bodies that share nodes
+        or fall apart.
 
     """
     mesh = _read(path)
@@ -56,33 +61,43 @@ def read_msh(path: Path) -> NamedMesh:
     if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
         raise InputError(f"{path}: not plane; expected all nodes at the same z")
     for block in mesh.cells:
-        if block.type not in CONNECTED:
-            raise InputError(f"{path}: cells of type {block.type}; {RECOMBINE}")
-    quads = _named(path, mesh, "quad")
-    if not quads:
-        raise InputError(f"{path}: no named surface with cells; {RECOMBINE}")
-    used = _distinct([np.unique(part) for part in quads.values()])
+        if block.type not in DIMENSION:
+            raise InputError(f"{path}: cells of type {block.type}; {_remedy(block)}")
+    parts = _named(path, mesh, 2)
+    if not parts:
+        raise InputError(f"{path}: no named surface with cells; expected {_NAMED}")
+    used = _distinct([np.unique(part) for part in parts.values()])
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :2]
-    cells = renumbered[np.concatenate(list(quads.values()))]
+    cells = renumbered[np.concatenate(list(parts.values()))]
     cells = _counter_clockwise(path, points, cells)
-    ends = np.cumsum([0] + [len(part) for part in quads.values()])
-    surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(quads)}
+    ends = np.cumsum([0] + [len(part) for part in parts.values()])
+    surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(parts)}
     _check_apart(path, len(points), cells, surfaces)
-    directed = _boundary(cells)
+    once = boundary_edges(cells).tolist()
+    directed = {(min(a, b), max(a, b)): (a, b) for a, b in once}
     return NamedMesh(
         points, cells, surfaces,
         curves={
             name: _directed(path, name, renumbered[edges], directed)
-            for name, edges in _named(path, mesh, "line").items()
+            for name, edges in _named(path, mesh, 1).items()
         },
         spots={
             name: renumbered[nodes].ravel()
-            for name, nodes in _named(path, mesh, "vertex").items()
+            for name, nodes in _named(path, mesh, 0).items()
             if (renumbered[nodes] >= 0).all()
         },
     )  # fmt: skip
+
+
+def _remedy(block: Any) -> str:
+    """Say what gmsh should write instead of cells that we do not read."""
+    if block.type.startswith(_SOLID):
+        return "expected plane bodies: gmsh -2"
+    if block.type.startswith(_CURVED):
+        return f"expected cells of first order: {_FIRST_ORDER}"
+    return f"expected triangles or quadrilaterals: {', '.join(DIMENSION)} of meshio"
 
 
 def _read(path: Path) -> Any:
@@ -137,26 +152,28 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
     return np.array(found, dtype=np.int64)
 
 
-def _named(path: Path, mesh: Any, kind: str) -> dict[str, Nodes]:
-    """Collect the cells of one type under their physical names, in order of file."""
+def _named(path: Path, mesh: Any, wanted: int) -> dict[str, Nodes]:
+    """Collect the cells of one dimension by physical names, in order of file."""
     names = {
         int(tag): name
         for name, (tag, dimension) in mesh.field_data.items()
-        if dimension == CONNECTED[kind]
+        if dimension == wanted
     }
     found: dict[str, list[Nodes]] = {}
     tags = mesh.cell_data.get("gmsh:physical", [np.zeros(len(b)) for b in mesh.cells])
     for block, tag in zip(mesh.cells, tags, strict=True):
-        if block.type != kind:
+        if DIMENSION[block.type] != wanted:
             continue
         for number in np.unique(tag):
             if int(number) in names:
                 part = np.asarray(block.data, dtype=np.int64)[tag == number]
+                if block.type == "triangle":
+                    part = part[:, [0, 1, 2, 2]]
                 found.setdefault(names[int(number)], []).append(part)
-            elif kind == "quad":
+            elif wanted == 2:
                 raise InputError(
-                    f"{path}: {(tag == number).sum()} quadrilaterals without a name; "
-                    "expected each in a named physical surface"
+                    f"{path}: {(tag == number).sum()} cells without a name; expected "
+                    f"each in a named surface: {_NAMED}"
                 )
     return {name: np.concatenate(parts) for name, parts in found.items()}
 
@@ -168,14 +185,20 @@ def _distinct(parts: list[Nodes]) -> Nodes:
 
 
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
-    """Turn clockwise cells over; refuse those that are not convex."""
-    x = points[cells]
-    diagonals = x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]
-    clockwise = _cross(*diagonals) < 0
-    cells = np.where(clockwise[:, None], cells[:, [0, 3, 2, 1]], cells)
+    """Turn clockwise cells over; refuse flat ones and those that are not convex."""
+    x, triangle = points[cells], triangular(cells)[:, None]
+    twice_area = _cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of the diagonals
+    turned = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
+    cells = np.where(twice_area[:, None] < 0, turned, cells)
+    if (flat := twice_area == 0).any():
+        x, y = points[cells[flat.argmax()]].mean(axis=0)
+        raise InputError(
+            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected corners "
+            "that are apart"
+        )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     corners = _cross(np.roll(edges, 1, axis=1), edges)
-    if (bad := (corners <= 0).any(axis=1)).any():
+    if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
         x, y = points[cells[bad.argmax()]].mean(axis=0)
         raise InputError(
             f"{path}: the cell around ({x:.6g}, {y:.6g}) is not convex; "
@@ -210,16 +233,6 @@ def _check_apart(
             )
 
 
-def _boundary(cells: Nodes) -> dict[tuple[int, int], tuple[int, int]]:
-    """Map each edge of exactly one cell, sorted, to its direction in that cell."""
-    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
-    _, first, times = np.unique(
-        np.sort(edges), axis=0, return_index=True, return_counts=True
-    )
-    once = edges[first[times == 1]].tolist()
-    return {(min(a, b), max(a, b)): (a, b) for a, b in once}
-
-
 def _directed(
     path: Path, name: str, edges: Nodes, boundary: Mapping[Any, tuple[int, int]]
 ) -> Nodes:
@@ -228,7 +241,7 @@ def _directed(
     if not all(edge in boundary for edge in sorted_):
         raise InputError(
             f"{path}: curve {name!r} has an edge that bounds no body, or lies within "
-            "one; expected edges of quadrilaterals on the boundary"
+            "one; expected edges of cells on the boundary"
         )
     return np.array([boundary[edge] for edge in sorted_], dtype=np.int64)
 

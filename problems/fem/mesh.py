@@ -1,4 +1,14 @@
-"""Quadrilateral meshes with named boundaries (paper, Section 2 and Figure 1)."""
+"""Meshes with named boundaries (paper, Section 2 and Figure 1).
+
+Cells are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
+whose last two corners are one: with N₃ + N₄ for that corner, the bilinear map is onto
+the triangle, and N₁, N₂, N₃ + N₄ are its barycentric coordinates,
+
+    Σ N_a x_a = x,   Σ N_a = 1   ⟹   N₁, N₂, N₃ + N₄ are linear in x,
+
+so that the bilinear element *is* the linear triangle (P1); 2×2 Gauss points integrate
+its constant BᵀDB exactly, as the Jacobian determinant is linear.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +26,14 @@ Nodes = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Four-node quadrilaterals; lengths in m.
+    """Quadrilaterals and triangles; lengths in m.
 
     A boundary is the chain of its nodes, ordered so that the body lies on its left:
     with the unit tangent t the outward normal is (t_y, −t_x).
     """
 
     points: NDArray[np.float64]  #: (N, 2)
-    cells: Nodes  #: (E, 4) counter-clockwise
+    cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
     boundaries: Mapping[str, Nodes]
 
     @property
@@ -59,8 +69,7 @@ def half_ring(centre: tuple[float, float], radii: tuple[float, float],
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
     """Mesh half a disc by rings of cells that end in triangles at its centre.
 
-    Boundaries: arc (anticlockwise) and flat (through the centre). The triangles are
-    cells whose last two nodes coincide, which bilinear elements degenerate to.
+    Boundaries: arc (anticlockwise) and flat (through the centre).
 
     Parameters
     ----------
@@ -106,6 +115,21 @@ def prefixed(mesh: Mesh, prefix: str) -> Mesh:
     return replace(
         mesh, boundaries={prefix + name: b for name, b in mesh.boundaries.items()}
     )
+
+
+def triangular(cells: Nodes) -> NDArray[np.bool_]:
+    """Say which cells (E, 4) are triangles, (E,)."""
+    return np.asarray(cells[:, 2] == cells[:, 3])
+
+
+def boundary_edges(cells: Nodes) -> Nodes:
+    """List the edges (k, 2) of exactly one cell, the body on their left."""
+    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    _, first, times = np.unique(
+        np.sort(edges), axis=0, return_index=True, return_counts=True
+    )
+    return np.asarray(edges[first[times == 1]])
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:

@@ -1,10 +1,11 @@
 """Stresses from displacements: at cell centres, Gauss points, recovered at nodes.
 
 Superconvergent patch recovery after Zienkiewicz and Zhu (1992): bilinear quadrilaterals
-have their superconvergent stresses at the cell centres; a linear polynomial is fitted
-to those around each interior node. A boundary node takes the mean of the polynomials
-of the interior nodes that it shares a cell with. Bodies share no nodes, so nothing is
-averaged across bodies.
+have their superconvergent stresses at the cell centres, linear triangles their best
+ones at the centroids; a linear polynomial is fitted to those around each interior node.
+A boundary node takes the mean of the polynomials of the interior nodes that it shares a
+cell with, or (a corner of one triangle) of the boundary nodes that have one. Bodies
+share no nodes, so nothing is averaged across bodies.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from problems.fem.elasticity import (
     shape_gradients,
     strain_matrix,
 )
-from problems.fem.mesh import Mesh
+from problems.fem.mesh import Mesh, boundary_edges, triangular
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
@@ -44,10 +45,16 @@ def _stress_at(
 
 def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Recover nodal values (N, k) from cell-centre values (E, k) by patch recovery."""
-    nodes, cells = mesh.cells.ravel(), np.repeat(np.arange(len(mesh.cells)), 4)
+    corner = np.ones(mesh.cells.shape, dtype=bool)
+    corner[:, 3] = ~triangular(mesh.cells)
+    nodes, cells = mesh.cells[corner], np.nonzero(corner)[0]
     N, k = len(mesh.points), values.shape[1]
     size = np.ptp(mesh.points, axis=0).max()
-    offset = (mesh.points[mesh.cells].mean(axis=1)[cells] - mesh.points[nodes]) / size
+    centre = np.average(
+        mesh.points[mesh.cells], axis=1,
+        weights=np.broadcast_to(corner[..., None], (*corner.shape, 2)),
+    )  # fmt: skip
+    offset = (centre[cells] - mesh.points[nodes]) / size
     basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, y about the node
     normal, right = np.zeros((N, 3, 3)), np.zeros((N, 3, k))
     np.add.at(normal, nodes, basis[:, :, None] * basis[:, None, :])
@@ -56,14 +63,18 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     interior = ~_on_boundary(mesh)
     polynomial = np.zeros((N, 3, k))
     polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
+    known = interior
+    for _ in range(2):
+        b, i = _neighbours(mesh, ~known, known)
+        moved = polynomial[i]  # about the node b
+        offset = (mesh.points[b] - mesh.points[i]) / size
+        moved[:, 0] += np.einsum("px,pxk->pk", offset, moved[:, 1:])
+        np.add.at(polynomial, b, moved)
+        count = np.bincount(b, minlength=N)
+        polynomial[count > 0] /= count[count > 0, None, None]
+        known = known | (count > 0)
     result = polynomial[:, 0]
-
-    b, i = _neighbours(mesh, ~interior, interior)
-    shift = np.column_stack([np.ones(len(b)), (mesh.points[b] - mesh.points[i]) / size])
-    count = np.bincount(b, minlength=N)
-    np.add.at(result, b, np.einsum("pt,ptk->pk", shift, polynomial[i]))
-    result[count > 0] /= count[count > 0, None]
-    lonely = ~interior & (count == 0)  # one layer of cells: no interior node nearby
+    lonely = ~known  # one layer of cells: no interior node nearby
     result[lonely] = right[lonely, 0] / normal[lonely, 0, 0, None]
     return result
 
@@ -78,12 +89,8 @@ def von_mises(stress: NDArray[np.float64], nu: Vector | float, plane: Plane) -> 
 
 def _on_boundary(mesh: Mesh) -> NDArray[np.bool_]:
     """Mark nodes on an edge that belongs to one cell only."""
-    edges = np.sort(
-        np.stack([mesh.cells, np.roll(mesh.cells, -1, axis=1)], axis=-1).reshape(-1, 2)
-    )
-    edge, times = np.unique(edges, axis=0, return_counts=True)
     mark = np.zeros(len(mesh.points), dtype=bool)
-    mark[edge[times == 1]] = True
+    mark[boundary_edges(mesh.cells)] = True
     return mark
 
 

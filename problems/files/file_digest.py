@@ -1,4 +1,7 @@
-"""What a case rests on when it comes from files: their content, by digest."""
+"""What a case rests on when it comes from files: their format and content, by digest.
+
+Text and .mat files may be compressed by gzip; npz and Parquet are compressed as it is.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,32 @@ from pathlib import Path
 
 from harness import InputError, Value
 from harness.digest import hex_digest, pieces
+from harness.errors import unknown
 from harness.files.datafile import opened
+
+COMPRESSIBLE = (".qps", ".mps", ".sif", ".mat")
+FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files
+
+
+def format_of(path: Path) -> str:
+    """Name the format of a QP file by its suffix, without a .gz that it has besides.
+
+    Raises
+    ------
+    InputError
+        For a suffix that names none.
+
+    """
+    suffix = path.suffix.lower()
+    if suffix in FORMATS:
+        return suffix
+    if suffix == ".gz":
+        inner = Path(path.stem).suffix.lower()
+        if inner in COMPRESSIBLE:
+            return inner
+        known = " or ".join(f"{s}.gz" for s in COMPRESSIBLE)
+        raise InputError(f"{path}: {inner}.gz is not read; expected {known}")
+    raise unknown("format", path.suffix, (*FORMATS, ".gz"), where=str(path))
 
 
 def digest(*paths: Path) -> str:

@@ -14,21 +14,29 @@ quadratic programming problems", Optim. Methods Softw. 11/12:
 
 Undefined names and numbers that are none are refused, with their line: HiGHS' reader
 (1.15) ignores the one and takes the other for 0.
+
+What is written here is read here as the same QP, to the last digit of every number. Of
+a P that is symmetric up to rounding only, that is its symmetric part: the objective has
+no other, and HiGHS refuses a QMATRIX whose triangles differ in the last digit.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csc_array, tril, vstack
 
-from harness import InputError
+from harness import QP, InputError, Vector
 from harness.errors import shortened, unknown
-from problems.files.two_sided import TwoSidedQP
+from harness.files.durable import replacing
+from harness.files.qpfile import explicit_matrices
+from problems.files.two_sided import INFINITE, TwoSidedQP
 
 _NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",
@@ -86,6 +94,90 @@ def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
     if math.isinf(model.rhs.get(model.objective, 0.0)):
         raise InputError("the constant of the objective is infinite")
     return _two_sided(model), model.sign
+
+
+def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
+    """Write `qp` as a QPS text; an operator P is multiplied out.
+
+    The format has no place for more: `meta`, plain data, becomes comments.
+
+    Raises
+    ------
+    InputError
+        When a side or a bound is as large as what the format takes for infinite, or
+        the file cannot be written.
+
+    """
+    for name in ("b", "h", "lb", "ub"):
+        values = getattr(qp, name)
+        large = np.isfinite(values) & (np.abs(values) >= INFINITE)
+        if large.any():
+            raise InputError(
+                f"{path}: {name} holds {values[large.argmax()]:g}, and QPS takes what "
+                f"is {INFINITE:g} or more for infinite; expected .npz or .mat"
+            )
+    try:
+        with replacing(path) as file:
+            for line in _lines(qp, meta):
+                file.write(f"{line}\n".encode())
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+
+
+def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
+    """Write the sections; rows e1 … are Ax = b, i1 … are Gx ≤ h, columns x1 …."""
+    rows = [f"e{i + 1}" for i in range(qp.b.size)]
+    rows += [f"i{i + 1}" for i in range(qp.h.size)]
+    for key, value in meta.items():
+        yield f"* {key}: {' '.join(str(value).split())}"
+    yield f"NAME          {'_'.join(str(meta.get('name', 'QP')).split())}"
+    yield "ROWS"
+    yield " N  obj"
+    yield from (f" {'E' if row[0] == 'e' else 'L'}  {row}" for row in rows)
+    yield "COLUMNS"
+    yield from _column_lines(csc_array(vstack([csc_array(qp.A), csc_array(qp.G)])),
+                             qp.q, rows)  # fmt: skip
+    yield "RHS"
+    sides = zip(rows, np.append(qp.b, qp.h), strict=True)
+    yield from (f"    rhs       {row}  {_digits(side)}" for row, side in sides if side)
+    yield "BOUNDS"
+    for j, (low, high) in enumerate(zip(qp.lb, qp.ub, strict=True)):
+        for kind, value in _bound_kinds(low, high):
+            yield f" {kind} bnd       x{j + 1}  {value}".rstrip()
+    P = csc_array(explicit_matrices(qp)[0]["P"])
+    entries = coo_array(tril((P + P.T) / 2))
+    yield "QUADOBJ"
+    for i, j, value in zip(*entries.coords, entries.data, strict=True):
+        yield f"    x{j + 1}  x{i + 1}  {_digits(value)}"
+    yield "ENDATA"
+
+
+def _column_lines(A: csc_array, q: Vector, rows: list[str]) -> Iterator[str]:
+    """Write each column; one without entries is named all the same."""
+    for j, cost in enumerate(q):
+        part = slice(A.indptr[j], A.indptr[j + 1])
+        if cost or part.start == part.stop:
+            yield f"    x{j + 1}  obj  {_digits(cost)}"
+        for i, value in zip(A.indices[part], A.data[part], strict=True):
+            yield f"    x{j + 1}  {rows[i]}  {_digits(value)}"
+
+
+def _bound_kinds(low: float, high: float) -> Iterator[tuple[str, str]]:
+    """Say which lines make [0, ∞), the default, [low, high]."""
+    if low == high:
+        yield "FX", _digits(low)
+        return
+    if math.isinf(low):
+        yield ("FR" if math.isinf(high) else "MI"), ""
+    elif low:
+        yield "LO", _digits(low)
+    if not math.isinf(high):
+        yield "UP", _digits(high)
+
+
+def _digits(value: float) -> str:
+    """Write the fewest digits that are read as the same number."""
+    return repr(float(value))
 
 
 def _header(model: _Model, section: str, words: list[str]) -> None:

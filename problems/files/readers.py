@@ -13,10 +13,11 @@ from scipy.sparse import eye_array
 
 from harness import QP, InputError
 from harness.checked import is_number, located
-from harness.files.datafile import check_size, opened
+from harness.files.datafile import content
 from harness.files.matfile import matrix, read_mat, to_qp, vector
 from harness.files.parquetfile import load_parquet
 from harness.files.qpfile import load_qp
+from problems.files.file_digest import format_of
 from problems.files.qps import parse_qps
 from problems.files.two_sided import TwoSidedQP, one_sided
 
@@ -27,7 +28,7 @@ _COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
 
 
 def read(path: Path) -> Loaded:
-    """Read a QP in the format that the suffix of its path names.
+    """Read a QP in the format that the suffix of its path names; .gz may follow it.
 
     Raises
     ------
@@ -37,7 +38,7 @@ def read(path: Path) -> Loaded:
         For another suffix.
 
     """
-    return _READERS[path.suffix.lower()](path)
+    return _READERS[format_of(path)](path)
 
 
 def _npz(path: Path) -> Loaded:
@@ -63,9 +64,7 @@ def _parquet(path: Path) -> Loaded:
 
 
 def _qps(path: Path) -> Loaded:
-    with opened(path, "a QPS text") as file:
-        data = file.read()
-    check_size(f"{path}: what it says", _COPIES * len(data))
+    data = content(path, "a QPS text", copies=_COPIES)
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:

@@ -2,7 +2,8 @@
 
 ::
 
-    mesh = "press.msh"         # beside this file; physical names as used below; m
+    mesh = "press.msh"         # beside this file; physical names as used below
+    length_unit = "m"          # of the mesh file's coordinates alone: "mm", "in", …
     plane = "strain"           # or "stress"
     contact = "nts"            # or "mortar"
     basis = "dual"             # of mortar; or "standard"
@@ -28,9 +29,13 @@
     slave = "arc"              # its nodes must not enter the master
     master = "bottom"
 
-Plane, contact, basis, steps and relin may be left out for the values above; bodies that
-contact alone holds need ``steps = 1`` and have no form dual-bounds. So may
-units, for the larger side of the box around the mesh and the sum of |load| over nodes.
+Whatever the length unit is, everything in this file is in SI units, and so are results:
+E and tractions in Pa, forces in N/m, units.length in m.
+
+Length unit, plane, contact, basis, steps and relin may be left out for the values
+above; bodies that contact alone holds need ``steps = 1`` and have no form dual-bounds.
+So may units, for the larger side of the box around the mesh and the sum of |load| over
+nodes.
 """
 
 from __future__ import annotations
@@ -52,7 +57,22 @@ from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
 from problems.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS, physical
 
-_KEYS = ("mesh", *SETTINGS, "units", "bodies", "supports", "loads", "contacts")
+#: names of units of length, m
+LENGTH_UNITS = {
+    "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
+    "in": 0.0254, "ft": 0.3048,
+}  # fmt: skip
+SOFT = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
+_KEYS = (
+    "mesh",
+    "length_unit",
+    *SETTINGS,
+    "units",
+    "bodies",
+    "supports",
+    "loads",
+    "contacts",
+)
 
 
 def read_description(path: Path) -> dict[str, Any]:
@@ -71,6 +91,9 @@ def read_description(path: Path) -> dict[str, Any]:
             if key not in table:
                 raise InputError(f"{key} is missing")
         checked.text("mesh", table["mesh"])
+        unit = checked.text("length_unit", table.get("length_unit", "m"))
+        if unit not in LENGTH_UNITS:
+            raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
             checked.at_least_one(key, table.get(key, SETTINGS[key]), MOST_STEPS)
         for key, known in (METHODS | PLANES).items():
@@ -91,6 +114,8 @@ def described_bodies(path: Path, plane: Any) -> Bodies:
     """
     table = read_description(path)
     named = read_msh(path.parent / table["mesh"])
+    unit = LENGTH_UNITS[table.get("length_unit", "m")]
+    named = named._replace(points=named.points * unit)
     with located(str(path)):
         materials = _materials(table["bodies"], named)
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
@@ -107,6 +132,17 @@ def described_bodies(path: Path, plane: Any) -> Bodies:
         units=units, fixed=np.unique(np.concatenate(fixed)), load=load.ravel(),
         pairs=tuple(pairs),
     )  # fmt: skip
+
+
+def remarks(path: Path) -> tuple[str, ...]:
+    """Say which moduli of a description that can be read may be in another unit."""
+    table = read_description(path)
+    return tuple(
+        f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
+        f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
+        for i, E in enumerate(body["E"] for body in table["bodies"])
+        if E < SOFT
+    )
 
 
 def _each(

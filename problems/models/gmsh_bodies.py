@@ -6,6 +6,7 @@ The TOML file is described in `problems.models.description`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from harness import QP, Case, InputError, Reference, Value
+from harness.checked import located
+from problems.contact.balance import check_balance
 from problems.contact.bodies import Bodies, clamped, floating, supported
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
 from problems.duality.stepping import LoadPath, primal_qp
 from problems.fem.inverse import GeneralisedInverse
-from problems.models.description import (
-    described_bodies,
-)
+from problems.models.description import described_bodies, remarks
 
 
 def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
@@ -30,12 +31,13 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     source = (p["path"], p["sha256"], p["plane"])
     bodies = model(*source)
     primal = _primal(source, p, reference)
-    return contact_case(
+    case = contact_case(
         bodies, primal, form,
         floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
         supported=lambda: _supported(*source),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
+    return replace(case, remarks=remarks(Path(p["path"])))
 
 
 def _primal(source: tuple[str, str, Any], p: Any, reference: Reference) -> QP:
@@ -44,6 +46,8 @@ def _primal(source: tuple[str, str, Any], p: Any, reference: Reference) -> QP:
     if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
         linearise = linearisation(bodies, p["contact"], p["basis"])
         rows = linearise(np.zeros(bodies.mesh.dofs))
+        with located(source[0]):
+            check_balance(bodies, rows.B)
         return primal_qp(bodies, rows, 1 / p["steps"])
     path = _path(source, p["contact"], p["basis"], p["steps"], p["relin"], reference)
     return path.primal(p["step"])

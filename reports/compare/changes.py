@@ -1,7 +1,7 @@
 """What changed between two result folders, cell by cell and solver by solver.
 
-A cell is one solver, driven in one mode, on one case at one tolerance. Its repeats are
-paired by their numbers: the same place in the same order of the same suite.
+A cell is one solver, driven in one mode, on one case at one tolerance. Its times before
+and after are of different sessions: two samples, that nothing pairs.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from scipy.stats import norm, t
 
-from harness.running.pairs import Ratio, paired_ratio
+from harness.running.pairs import Ratio, unpaired_ratio
 from reports.compare.conditions import hardware
 from reports.data.evidence import SEVERITY, Evidence, Outcome
 from reports.statistics.intervals import COVERAGE
@@ -53,23 +53,23 @@ class Pair:
         return self.before.verified and self.after.verified and self.same_sizes
 
     @cached_property
-    def logs(self) -> tuple[float, ...]:
-        """Logarithms of time after over time before, one per repeat that both have."""
-        if not (self.both_verified and self.same_machine):
-            return ()
+    def log(self) -> float | None:
+        """Mean logarithm of the times after less that of those before."""
         a, b = _seconds(self.after), _seconds(self.before)
-        return tuple(float(np.log(a[i] / b[i])) for i in sorted(a.keys() & b.keys()))
+        if not (self.both_verified and self.same_machine and a and b):
+            return None
+        return float(np.mean(np.log(a)) - np.mean(np.log(b)))
 
     @cached_property
     def ratio(self) -> Ratio | None:
-        """Time after over time before, Student's interval; None below two repeats.
+        """Time after over time before, Welch's interval; None below two repeats.
 
-        Student's and not a bootstrap: resampling three to ten repeats finds a change
+        Welch's and not a bootstrap: resampling three to ten repeats finds a change
         that is not there three to five times as often as one in twenty.
         """
-        if len(self.logs) < 2:
+        if self.log is None:
             return None
-        return paired_ratio(_seconds(self.after), _seconds(self.before))
+        return unpaired_ratio(_seconds(self.after), _seconds(self.before))
 
     @property
     def change(self) -> int:
@@ -138,6 +138,12 @@ class Comparison:
     pairs: tuple[Pair, ...]
     only_before: tuple[Outcome, ...]
     only_after: tuple[Outcome, ...]
+    folders: int = 1  #: that are compared with the first one, this one included
+
+    @property
+    def worse(self) -> tuple[Pair, ...]:
+        """Pairs whose verdict became worse."""
+        return tuple(p for p in self.pairs if p.turn > 0)
 
     @property
     def solvers(self) -> tuple[str, ...]:
@@ -155,8 +161,11 @@ class Comparison:
         return tuple(p for p in self.pairs if p.after.solver == solver)
 
 
-def compare(before: Evidence, after: Evidence) -> Comparison:
-    """Pair the cells of two folders, in the order of the later one."""
+def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
+    """Pair the cells of two folders, in the order of the later one.
+
+    folders : that are compared with `before`, `after` included
+    """
     a, b = _cells(before), _cells(after)
     machines = hardware(before) | hardware(after)
 
@@ -174,14 +183,14 @@ def compare(before: Evidence, after: Evidence) -> Comparison:
         ),
         only_before=tuple(o for key, o in a.items() if key not in b),
         only_after=tuple(o for key, o in b.items() if key not in a),
+        folders=folders,
     )
 
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
     """Average the ratios of times over cells; see `mean_of`. None without any time."""
-    timed = [p for p in pairs if p.logs]
-    logs = [float(np.mean(p.logs)) for p in timed]
-    return mean_of(logs, [str(_key(p.after)) for p in timed])
+    timed = [(p, p.log) for p in pairs if p.log is not None]
+    return mean_of([log for _, log in timed], [str(_key(p.after)) for p, _ in timed])
 
 
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
@@ -192,14 +201,14 @@ def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     """
     others: dict[tuple[str, float], list[float]] = {}
     for p in c.pairs:
-        if p.logs and p.after.solver != solver and not p.after.first.role:
-            key = (p.after.case, p.after.tol)
-            others.setdefault(key, []).append(float(np.mean(p.logs)))
+        other = p.after.solver != solver and not p.after.first.role
+        if p.log is not None and other:
+            others.setdefault((p.after.case, p.after.tol), []).append(p.log)
     logs, names = [], []
     for p in c.of(solver):
         rivals = others.get((p.after.case, p.after.tol))
-        if p.logs and rivals:
-            logs.append(float(np.mean(p.logs)) - float(np.mean(rivals)))
+        if p.log is not None and rivals:
+            logs.append(p.log - float(np.mean(rivals)))
             names.append(str(_key(p.after)))
     return mean_of(logs, names)
 
@@ -265,8 +274,8 @@ def _key(outcome: Outcome) -> Key:
     return outcome.case, outcome.tol, outcome.solver
 
 
-def _seconds(outcome: Outcome) -> dict[int, float]:
-    return {r.repeat: r.total_seconds for r in outcome.records if r.total_seconds}
+def _seconds(outcome: Outcome) -> list[float]:
+    return [*outcome.by_block.values()]
 
 
 def _canaries(outcome: Outcome) -> list[float]:

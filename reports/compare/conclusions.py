@@ -15,6 +15,7 @@ from reports.compare.changes import (
     side,
 )
 from reports.compare.conditions import environments, machines_differ
+from reports.compare.regressions import Slower, regressions
 from reports.data.environment import busy_with, dateline
 from reports.document.formatting import VERDICTS, clean, plural, power, tolerance
 from reports.statistics.intervals import COVERAGE
@@ -28,7 +29,7 @@ def verdict_lines(c: Comparison) -> list[str]:
     if not c.pairs:
         return [_nothing(c)]
     first = (_same(c), _environments(c), _residuals(c), _busy(c))
-    lines = [*filter(None, first), _counted_times(c)]
+    lines = [*filter(None, first), _counted_times(c), _slower(c)]
     means = [(s, mean_ratio(c.of(s))) for s in c.solvers]
     lines += [
         f"  {s}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
@@ -61,6 +62,7 @@ def sentences(c: Comparison) -> tuple[str, ...]:
         _residuals(c),
         _busy(c),
         _counted_times(c),
+        _slower(c),
         _shared(c),
         counted,
     )
@@ -122,6 +124,33 @@ def _counted_times(c: Comparison) -> str:
         f"interval holds 1, and a factor of {ALIKE:g} or its inverse as well. Of "
         f"intervals that hold {COVERAGE:.0%}, {chance:.1f} would show a change by "
         "chance."
+    )
+
+
+def _slower(c: Comparison) -> str:
+    """Say what is slower by intervals that hold all together."""
+    found = regressions(c)
+    if found.why_not:
+        return f"Slower, beyond chance and the machine: not judged, {found.why_not}."
+    named = [slower_text(one) for one in found.slower[:NAMED]]
+    rest = len(found.slower) - len(named)
+    more = [f"and {rest} more"] * (rest > 0)
+    told = "; ".join([*named, *more]) or "none"
+    judged = f"{plural(found.solvers, 'solver')} and {plural(found.cells, 'cell')}"
+    return (
+        f"Slower, beyond chance and the machine: {told} ({judged} judged, all "
+        f"intervals together at {COVERAGE:.0%})."
+    )
+
+
+def slower_text(one: Slower) -> str:
+    """Name what is slower, with its ratio and that relative to the other solvers."""
+    name = clean(one.solver, 40)
+    if one.case and one.tol is not None:
+        name += f" on {clean(one.case)} at {tolerance(one.tol)}"
+    return (
+        f"{name} {ratio_text(one.ratio)} times as long, relative to the others "
+        f"{ratio_text(one.relative)}"
     )
 
 
@@ -187,8 +216,7 @@ def named(c: Comparison) -> list[str]:
     worse = [
         f"{cell_name(p)}: {VERDICTS[p.before.verdict][1]} before, "
         f"{VERDICTS[p.after.verdict][1]} after"
-        for p in c.pairs
-        if p.turn > 0
+        for p in c.worse
     ]
     worse += [
         f"{cell_name(p)}: another answer, {power(p.answers[2])} apart"

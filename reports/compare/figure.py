@@ -30,12 +30,12 @@ _SHIFT = 0.16  #: of cells above the row's middle, and of the mean below
 
 def ratios_figure(c: Comparison) -> Figure:
     """Draw a row per solver: its cells as dots, its mean as a bar with its interval."""
-    solvers = [s for s in c.solvers if any(p.logs for p in c.of(s))]
+    solvers = [s for s in c.solvers if any(p.log is not None for p in c.of(s))]
     marks = [
         mark
         for row, solver in enumerate(solvers)
         for mark in _row(
-            solver, -row, [p for p in c.of(solver) if p.logs],
+            solver, -row, [p for p in c.of(solver) if p.log is not None],
             look(c.after.solvers.index(solver)).colour,
         )
     ]  # fmt: skip
@@ -66,7 +66,7 @@ def _row(solver: str, row: int, pairs: Sequence[Pair], colour: str) -> list[Mark
             )  # fmt: skip
             made.append(
                 Series(
-                    x=tuple(float(np.exp(np.mean(p.logs))) for p in chosen),
+                    x=tuple(float(np.exp(p.log or 0.0)) for p in chosen),
                     y=(row + _SHIFT,) * len(chosen),
                     look=style,
                     solver=solver,

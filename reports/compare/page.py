@@ -124,11 +124,11 @@ def _times(c: Comparison) -> Section:
         title="Times",
         prose=(
             "Medians of total time with their intervals, and the ratio after over "
-            "before: the mean of the logarithms over repeats, paired by their number, "
-            f"with Student's {COVERAGE:.0%} interval. A change is named only where "
-            "that excludes 1. What differs between two runs as a whole (the state of "
-            "the machine, the placing of a process) is not in these intervals: two "
-            "runs of the same code tell how much that is.",
+            "before: the means of their logarithms, unpaired since the folders are "
+            f"different sessions, with Welch's {COVERAGE:.0%} interval. A change is "
+            "named only where that excludes 1. What differs between two runs as a "
+            "whole (the state of the machine, the placing of a process) is not in "
+            "these intervals: two runs of the same code tell how much that is.",
         ),
         tables=(
             Table(
@@ -140,12 +140,12 @@ def _times(c: Comparison) -> Section:
         )
         if shown
         else (),
-        pictures=(picture,) if any(p.logs for p in c.pairs) else (),
+        pictures=(picture,) if any(p.log is not None for p in c.pairs) else (),
     )
 
 
 def _time_row(p: Pair) -> tuple[Cell, ...]:
-    times = [_time_cell(o, voided=not p.logs) for o in (p.before, p.after)]
+    times = [_time_cell(o, voided=p.log is None) for o in (p.before, p.after)]
     if p.ratio is None:
         why = (
             "other machine" if not p.same_machine
@@ -270,7 +270,7 @@ def conditions_that_differ(c: Comparison) -> Section:
     if other:
         prose.append(
             f"{plural(len(other), 'cell')} had another QP after than before, bit for "
-            "bit: the generator, its parameters' meaning or the BLAS changed. The "
+            "bit: the family, its parameters' meaning or the BLAS changed. The "
             f"first: {cell_name(other[0])}. Where sizes differ, nothing is compared."
         )
     return Section(

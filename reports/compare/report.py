@@ -12,6 +12,7 @@ from harness.files.durable import replacing
 from harness.record import VERIFIED_FACTOR
 from reports.compare.changes import Comparison, Pair, compare
 from reports.compare.conclusions import verdict_lines
+from reports.compare.overview import overview
 from reports.compare.page import compose
 from reports.data.evidence import Outcome, read_evidence
 from reports.render.writing import RENDERED, write_page, write_text
@@ -37,7 +38,13 @@ def write_comparison(
         When one is no result folder, or holds no measurements.
 
     """
-    comparison = compare(read_evidence(before, factor), read_evidence(after, factor))
+    _, said, written = write_comparisons(before, [after], formats, factor)
+    return said, written
+
+
+def _write(comparison: Comparison, formats: Sequence[str]) -> list[Path]:
+    """Write the page and the table on two folders."""
+    before, after = comparison.before.directory, comparison.after.directory
     target = after / "report" / f"against-{before.resolve().name}"
     written: list[Path] = []
     if RENDERED & set(formats):
@@ -51,7 +58,44 @@ def write_comparison(
         with replacing(tables / "changes.parquet") as file:
             frame.to_parquet(file, index=False)
         written.append(tables / "changes.parquet")
-    return verdict_lines(comparison), written
+    return written
+
+
+def write_comparisons(
+    first: Path,
+    others: Sequence[Path],
+    formats: Sequence[str],
+    factor: float = VERIFIED_FACTOR,
+) -> tuple[list[Comparison], list[str], list[Path]]:
+    """Compare several folders with the first one, each as `write_comparison` does.
+
+    Of more than one, LAST/report/since-NAME has a page on all, NAME being that of the
+    first.
+
+    Returns
+    -------
+    the comparisons, the verdicts in a few lines of text, and the files, that page first
+
+    Raises
+    ------
+    InputError
+        When one is no result folder, or holds no measurements.
+
+    """
+    before = read_evidence(first, factor)
+    found = [
+        compare(before, read_evidence(other, factor), len(others)) for other in others
+    ]
+    said, written = [], []
+    for c in found:
+        if len(found) > 1:
+            said.append(f"{c.before.directory} to {c.after.directory}:")
+        said += verdict_lines(c)
+        written += _write(c, formats)
+    if len(found) > 1 and RENDERED & set(formats):
+        target = others[-1] / "report" / f"since-{first.resolve().name}"
+        written = [*write_page(overview(found), target, formats), *written]
+    return found, said, written
 
 
 def changes_frame(c: Comparison) -> pd.DataFrame:

@@ -133,7 +133,10 @@ class Ranking:
     def faster(self) -> NDArray[np.bool_]:
         """(solvers, solvers) whether row is told to be faster than column."""
         logs, _ = _logs(self.group, USUAL)
-        return resampling.told_apart(logs, self.group.cases)
+        faster = resampling.told_apart(logs, self.group.cases)
+        if self.group.apart.any():  # of different sessions: no pairs
+            faster = np.where(self.group.apart, self.group.told, faster)
+        return faster
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -12,17 +14,25 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from harness import Record, Verdict
+from harness.running.pairs import Block, ratio_of
 from reports.data.evidence import Evidence
 from reports.document.formatting import clean, listing, plural, tolerance
 
 #: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
 CASES = 6
+POOLED = "all forms"  #: instead of a form, of a group that cases of every form are in
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
 _CELL = ["kind", "case", "solver"]
 
 Times = NDArray[np.float64]
+Pairs = NDArray[np.bool_]
+Seconds = Mapping[Block, float]
 Name = TypeVar("Name")
+
+
+def _no_pairs() -> Pairs:
+    return np.zeros((0, 0), dtype=bool)
 
 
 class Kind(NamedTuple):
@@ -67,7 +77,12 @@ class ComparisonGroup:
     limit: float  #: s per measurement; the longest one, where the suite has no limit
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
+    forms: Mapping[str, int] = field(default_factory=dict)  #: cases of each, if pooled
     incomplete: int = 0  #: cases left out, since some solver was not measured on them
+    apart: Pairs = field(default_factory=_no_pairs)
+    """(solvers, solvers) whether two share no block on some case; none: all share."""
+    told: Pairs = field(default_factory=_no_pairs)
+    """Of those, whether row is faster than column on every case, by its interval."""
 
     @property
     def title(self) -> str:
@@ -78,7 +93,15 @@ class ComparisonGroup:
     def notes(self) -> tuple[str, ...]:
         """Say what takes no part."""
         refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
-        return refused * bool(self.refused) + self.unmeasured
+        counted = [
+            f"{clean(form, 24)} {plural(n, 'case')}" for form, n in self.forms.items()
+        ]
+        pooled = (
+            f"Forms together: {', '.join(counted)}. A form that a solver declines is "
+            "unsolved by it.",
+        )
+        said = pooled * bool(self.forms) + refused * bool(self.refused)
+        return said + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
@@ -90,10 +113,36 @@ class ComparisonGroup:
         ) * bool(self.incomplete)
 
     @property
+    def sessions(self) -> tuple[str, ...]:
+        """Say who was measured in other sessions than whom."""
+        left = self.apart.copy()
+        pairs = []
+        while left.any():
+            late = int(left.sum(axis=1).argmax())
+            others = [self.solvers[i] for i in np.flatnonzero(left[late])]
+            pairs.append(f"{clean(self.solvers[late], 40)} with {listing(others, 4)}")
+            left[late] = left[:, late] = False
+        if not pairs:
+            return ()
+        return (
+            "Measured in different sessions, not within blocks, and told apart only "
+            "where the unpaired interval excludes 1 on every case: "
+            f"{'; '.join(pairs)}.",
+        )
+
+    @property
     def comparable(self) -> bool:
         """Whether cases, solvers and answers are enough for a statement over cases."""
-        shape = len(self.cases) >= CASES and len(self.solvers) > 1
-        return shape and bool(self.solved.any())
+        return not self.lack
+
+    @property
+    def lack(self) -> str:
+        """Say what is missing for a statement over cases; empty if nothing is."""
+        if len(self.solvers) < 2:
+            return plural(len(self.solvers), "solver")
+        if len(self.cases) < CASES:
+            return plural(len(self.cases), "case")
+        return "" if self.solved.any() else "no verified answer"
 
     @cached_property
     def solved(self) -> NDArray[np.bool_]:
@@ -113,38 +162,103 @@ class ComparisonGroup:
         return float(max(self.limit, both[np.isfinite(both)].max()))
 
 
-def comparison_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
-    """Group what was measured by form and accuracy; groups of few cases are left out.
+def comparison_groups(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> tuple[ComparisonGroup, ...]:
+    """Group what was measured, as `all_groups`; groups of few cases are left out.
 
     At least `CASES` cases, two solvers and one verified answer make a group.
     """
-    return tuple(group for group in all_groups(evidence) if group.comparable)
+    groups = all_groups(evidence, pool_forms=pool_forms)
+    return tuple(group for group in groups if group.comparable)
 
 
-def all_groups(evidence: Evidence) -> tuple[ComparisonGroup, ...]:
+def all_groups(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> tuple[ComparisonGroup, ...]:
     """Group what was measured by form and accuracy, whatever can be said of it.
 
     Forms are apart, since the primal and the dual QP of one problem are two problems to
     a solver; so are cold solves and sequences.
+
+    pool_forms : put all forms into one group; each QP is still a case of its own
     """
     records = [r for r in evidence.records if not r.role]
     if not records:
         return ()
-    kinds = _numbered(map(kind_of, records))
+    of = [kind_of(r) for r in records]
+    if pool_forms:
+        of = [kind._replace(form=POOLED) for kind in of]
+    kinds = _numbered(of)
     cases = _numbered(r.case for r in records)
     solvers = _numbered(evidence.solvers)
     rows = [
-        {"kind": kinds[kind_of(r)], "case": cases[r.case], "solver": solvers[r.solver]}
+        {"kind": kinds[kind], "case": cases[r.case], "solver": solvers[r.solver]}
         | _row(r)
-        for r in records
+        for kind, r in zip(of, records, strict=True)
     ]
     outcomes = _outcomes(pd.DataFrame(rows))
     limit = _limit(evidence, outcomes)
-    groups = zip(kinds, outcomes.groupby("kind"), strict=True)
-    return tuple(
+    found = tuple(
         _group(kind, group, [*cases], evidence.solvers, limit)
-        for kind, (_, group) in groups
+        for kind, (_, group) in zip(kinds, outcomes.groupby("kind"), strict=True)
     )
+    if len({r.session for r in records}) > 1:
+        blocks = _blocks(of, records)
+        found = tuple(_with_sessions(group, blocks) for group in found)
+    if not pool_forms:
+        return found
+    form = {r.case: r.form for r in records}
+    return tuple(
+        replace(group, forms=Counter(form[case] for case in group.cases))
+        for group in found
+    )
+
+
+def _blocks(
+    of: Sequence[Kind], records: Sequence[Record]
+) -> dict[tuple[Kind, str, str], Seconds]:
+    """Seconds by block of each solver on each case; of a sweep, of its best answer."""
+    cells: dict[tuple[Kind, str, str], dict[float, list[Record]]] = {}
+    for kind, r in zip(of, records, strict=True):
+        by_tol = cells.setdefault((kind, r.case, r.solver), {})
+        by_tol.setdefault(r.tol, []).append(r)
+
+    def rank(answer: list[Record]) -> tuple[bool, float]:
+        failed = any(r.verdict is not Verdict.VERIFIED for r in answer)
+        return failed, float(np.median([r.total_seconds or np.inf for r in answer]))
+
+    return {
+        cell: {
+            (r.session, r.repeat): r.total_seconds
+            for r in min(by_tol.values(), key=rank)
+            if r.total_seconds
+        }
+        for cell, by_tol in cells.items()
+    }
+
+
+def _with_sessions(
+    group: ComparisonGroup, blocks: Mapping[tuple[Kind, str, str], Seconds]
+) -> ComparisonGroup:
+    """Mark the solvers that were not measured together on every case."""
+    n = len(group.solvers)
+    apart, told = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
+    for i, j in combinations(range(n), 2):
+        pairs = [
+            tuple(
+                blocks[group.kind, case, group.solvers[s]] if group.solved[k, s] else {}
+                for s in (i, j)
+            )
+            for k, case in enumerate(group.cases)
+        ]
+        if all(a.keys() & b.keys() for a, b in pairs if a and b):
+            continue
+        apart[i, j] = apart[j, i] = True
+        ratios = [ratio_of(a, b) if a and b else None for a, b in pairs]
+        told[i, j] = all(r is not None and r.high < 1 for r in ratios)
+        told[j, i] = all(r is not None and r.low > 1 for r in ratios)
+    return replace(group, apart=apart, told=told)
 
 
 def kind_of(r: Record) -> Kind:

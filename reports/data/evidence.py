@@ -14,9 +14,11 @@ from harness.files.reading import read_json, read_toml
 from harness.record import VERIFIED_FACTOR
 from harness.results.faults import Fault, left, read_faults
 from harness.results.journal import read_journal
+from harness.running.pairs import Block
 from harness.verify.kkt import allowed, rejudged
 from reports.statistics.intervals import Interval, median_interval
 
+_MARKED = 6  #: digits of an environment, after the label of a solver
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
@@ -112,9 +114,13 @@ class Outcome:
         return self._intervals[phase]
 
     @property
-    def by_repeat(self) -> dict[int, float]:
-        """Total seconds of each repeat that has them; repeats are of equal blocks."""
-        return {r.repeat: r.total_seconds for r in self.records if r.total_seconds}
+    def by_block(self) -> dict[Block, float]:
+        """Total seconds of each repeat that has them; see `harness.running.pairs`."""
+        return {
+            (r.session, r.repeat): r.total_seconds
+            for r in self.records
+            if r.total_seconds
+        }
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
@@ -180,6 +186,9 @@ class Evidence:
     faults: tuple[
         Fault, ...
     ] = ()  #: why measurements are missing, by no solver's fault
+    #: what follows the label of a solver in some environments, by their digests, where
+    #: a folder holds the same measurements of several
+    marks: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -230,11 +239,14 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
     records = read_journal(directory, say)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
+    environment = _read(directory / "environment.json", read_json)
+    marks = _marks(records, str(environment.get("digest", "")))
     return Evidence(
         directory=directory,
         journal=tuple(records),
-        records=arrange(_apart(_judged(r, factor)) for r in records),
-        environment=_read(directory / "environment.json", read_json),
+        records=arrange(_apart(_judged(r, factor), marks) for r in records),
+        environment=environment,
+        marks=marks,
         suite=_read(directory / "suite.toml", read_toml),
         factor=factor,
         faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
@@ -257,11 +269,31 @@ def _judged(record: Record, factor: float) -> Record:
     return record.but(verdict=rejudged(record, factor))
 
 
-def _apart(record: Record) -> Record:
-    """Call a solver that drove a sequence by another name than one that began cold."""
-    if record.mode == "cold":
-        return record
-    return record.but(solver=f"{record.solver} ({record.mode})")
+def _apart(record: Record, marks: Mapping[str, str]) -> Record:
+    """Call a solver by another name where its measurements are others.
+
+    That is where it drove a sequence instead of beginning cold, and in a further
+    environment of a folder that holds the same measurements of several.
+    """
+    name = (
+        record.solver if record.mode == "cold" else f"{record.solver} ({record.mode})"
+    )
+    mark = marks.get(record.environment, "")
+    return record if name + mark == record.solver else record.but(solver=name + mark)
+
+
+def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
+    """Mark the environments, but one, in which the same was measured more than once.
+
+    first : digest of the one that bears no mark, if it is among them
+    """
+    cells: dict[tuple[Any, ...], dict[str, None]] = {}
+    for r in records:
+        cell = r.mode, r.case, r.solver, r.tol, r.repeat
+        cells.setdefault(cell, {})[r.environment] = None
+    several = dict.fromkeys(e for of in cells.values() if len(of) > 1 for e in of)
+    plain = first if first in several else next(iter(several), "")
+    return {e: f" @{e[:_MARKED]}" for e in several if e != plain}
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness import Verdict
-from harness.running.pairs import Ratio, paired_ratio
+from harness.running.pairs import Ratio, paired_ratio, ratio_of
 from reports.data.aggregation import Ranking
 from reports.data.comparison_groups import CASES, ComparisonGroup, Kind, kind_of
 from reports.data.evidence import Evidence, Outcome
@@ -216,7 +216,7 @@ def _fastest(
         others=tuple(others),
         over_cases=ranking is not None,
         unsolved=len(rows) - len(solved),
-        notes=group.unmeasured,
+        notes=group.unmeasured + group.sessions,
     )
 
 
@@ -243,9 +243,9 @@ def _compared(c: Competitor, first: Competitor, ranking: Ranking | None) -> Comp
 
 
 def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
-    """Compare on each case by the blocks that both were measured in."""
+    """Compare on each case by the blocks that both were measured in, if there are."""
     paired = {
-        case: paired_ratio(c.outcomes[case].by_repeat, first.outcomes[case].by_repeat)
+        case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
         for case in cases
     }
     by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
@@ -257,11 +257,14 @@ def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Compet
 
 
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
-    """Whether blocks of two solvers were measured in different environments."""
+    """Whether what is compared of two solvers comes from different environments."""
     mine, its = (
-        {r.repeat: r.environment for r in one.outcomes[case].records} for one in (a, b)
+        {(r.session, r.repeat): r.environment for r in one.outcomes[case].records}
+        for one in (a, b)
     )
-    return any(mine[block] != its[block] for block in mine.keys() & its.keys())
+    if common := mine.keys() & its.keys():
+        return any(mine[block] != its[block] for block in common)
+    return len({*mine.values(), *its.values()}) > 1
 
 
 def _finding(
@@ -294,11 +297,9 @@ def _finding(
 def _fastest_on(competitors: Sequence[Competitor], case: str) -> str | None:
     """Name the solver with the smallest time on a case, if it is told from all."""
     first = min(competitors, key=lambda c: time_of(c.outcomes[case]) or np.inf)
-    its = first.outcomes[case].by_repeat
+    its = first.outcomes[case].by_block
     ratios = [
-        paired_ratio(c.outcomes[case].by_repeat, its)
-        for c in competitors
-        if c is not first
+        ratio_of(c.outcomes[case].by_block, its) for c in competitors if c is not first
     ]
     told = all(ratio is not None and ratio.low > 1 for ratio in ratios)
     return first.solver if told else None

@@ -13,6 +13,7 @@ from reports.document.formatting import clean, significant, span
 from reports.document.layout import Cell
 
 SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
+_CONTACTS, _PRESSURE = "contacts", "largest_pressure"  #: per pair, and what of it
 _UNITS = {
     "energy": "J/m",
     "tip": "m",
@@ -21,6 +22,7 @@ _UNITS = {
     "max_von_mises": "Pa",
     "p_max": "Pa",
     "half_width": "m",
+    _CONTACTS: "Pa",  # of what tables show of them
 }
 _STRESS = "max_von_mises"  #: what elastic bodies have, and no other family
 MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: a stress depends on the mesh first of all
@@ -64,7 +66,12 @@ def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
     for name, value in outcome.quantities.items():
         if (name in SIZES) is sizes:
             found |= _flat((str(name),), value)
-    return found
+    return {path: leaf for path, leaf in found.items() if path[-1] in _shown(path)}
+
+
+def _shown(path: tuple[str, ...]) -> tuple[str, ...]:
+    """Keep of each contact pair the one scalar that a table has room for."""
+    return (_PRESSURE,) if path[0] == _CONTACTS and len(path) > 1 else path
 
 
 def _flat(path: tuple[str, ...], value: object) -> dict[tuple[str, ...], Leaf]:

@@ -120,6 +120,7 @@ class FieldPanel:
     title: str = ""
     xlabel: str = ""
     ylabel: str = ""
+    unit: float = 1.0  #: length that the axes number as 1
     numbered: tuple[bool, bool] = (True, True)  #: ticks of x and of y
     axes: Literal["lines", "frame", "none"] = "lines"
     scale: ColourScale | None = None  #: explained by a bar below the panel

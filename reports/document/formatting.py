@@ -15,8 +15,8 @@ ABSENT = "–"  #: what was not or cannot be measured
 
 #: What a time is, wherever times are shown.
 TIMED = (
-    "Times are those of the solver from the emitted QP on; assembling, linearising "
-    "and, for dual forms, dualising are the generator's and not in them."
+    "Times are those of the solver, from the QP that it is handed: assembling, "
+    "linearising and, for dual forms, dualising come before and are not in them."
 )
 
 #: Symbol and words of every verdict: colour alone says nothing to many readers.

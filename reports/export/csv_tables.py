@@ -30,12 +30,16 @@ from reports.statistics.profiles import performance_ratios
 _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
 
 
-def csv_tables(evidence: Evidence) -> dict[str, pd.DataFrame]:
+def csv_tables(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> dict[str, pd.DataFrame]:
     """Make every table by the name of its file; empty ones are left out.
 
     measurements: one row per journal line. outcomes: the repeats of one solver on one
     case together, every time a median with its interval. energies, scaling: as in the
     report. contests, means: see `comparison_tables`.
+
+    pool_forms : compare the cases of all forms together
     """
     found = {
         "measurements": _measurements(evidence.records),
@@ -56,7 +60,7 @@ def csv_tables(evidence: Evidence) -> dict[str, pd.DataFrame]:
             for solver in series.solvers
         ),
     }
-    found |= comparison_tables(evidence)
+    found |= comparison_tables(evidence, pool_forms=pool_forms)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
 
 
@@ -122,14 +126,16 @@ def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
     return row
 
 
-def comparison_tables(evidence: Evidence) -> dict[str, pd.DataFrame]:
+def comparison_tables(
+    evidence: Evidence, *, pool_forms: bool = False
+) -> dict[str, pd.DataFrame]:
     """Make the tables of all groups of cases.
 
     contests: a row per case and solver with its time and its ratio to the best, both
     infinite for a failure; profiles are their distributions. means: a row per solver
     and convention, with intervals and tiers where they are made, at the usual one.
     """
-    found = comparison_groups(evidence)
+    found = comparison_groups(evidence, pool_forms=pool_forms)
     return {
         "contests": pd.concat([pd.DataFrame(), *map(_cells, found)]),
         "means": pd.DataFrame(

@@ -1,7 +1,11 @@
-"""Deformed states for ParaView: one .vtu file, or a .pvd series of them."""
+"""Deformed states for ParaView: one .vtu file, or a .pvd series of them.
+
+Beside every .vtu there is a CSV along each contact of the state.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -10,18 +14,22 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Fields, InputError, Vector
+from harness import ContactSide, Fields, InputError, Vector
 from harness.files.durable import replacing
 
 IN_CONTACT = 1e-6  #: a node is in contact where its force exceeds this · the largest
 
 
-def write_vtu(fields: Fields, path: Path) -> None:
+def write_vtu(fields: Fields, path: Path) -> list[Path]:
     """Write a deformed state, SI units; points and vectors get a third component 0.
 
     Point data: displacement (m), contact_force (N/m, on slave nodes, else 0),
-    in_contact (0 or 1) and the nodal fields; cell data: body. *Warp By Vector* in
-    ParaView takes vectors of three components only.
+    in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m, on slave nodes
+    that face a master, else NaN, which ParaView leaves out) and the nodal fields; cell
+    data: body. Triangles come before quadrilaterals. *Warp By Vector* in ParaView takes
+    vectors of three components only.
+
+    Returns the files written: the .vtu, and a CSV for each contact.
 
     Raises
     ------
@@ -34,25 +42,82 @@ def write_vtu(fields: Fields, path: Path) -> None:
         forces[fields.contact_nodes] = fields.contact_forces
     sizes = np.linalg.norm(forces, axis=1)
     touching = sizes > IN_CONTACT * sizes.max(initial=0.0)
+    cells, bodies = np.asarray(fields.cells), np.asarray(fields.bodies).astype(np.int32)
+    triangle = cells[:, 2] == cells[:, 3]
+    blocks = [
+        (kind, which, corners)
+        for kind, which, corners in (("triangle", triangle, 3), ("quad", ~triangle, 4))
+        if which.any()
+    ]
     mesh = meshio.Mesh(
         _padded(fields.points),
-        [("quad", np.asarray(fields.cells))],
+        [(kind, cells[which, :corners]) for kind, which, corners in blocks],
         point_data={
             "displacement": _padded(fields.displacement),
             "contact_force": _padded(forces),
             "in_contact": touching.astype(np.int32),
+            **_along_sides(fields),
             **fields.nodal,
         },
-        cell_data={"body": [np.asarray(fields.bodies).astype(np.int32)]},
+        cell_data={"body": [bodies[which] for _, which, _ in blocks]},
     )
     try:
         mesh.write(path, file_format="vtu")
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    return [path, *(_write_side(fields, side, path) for side in fields.contacts)]
+
+
+def _along_sides(fields: Fields) -> dict[str, Vector]:
+    """Put pressures and gaps at the nodes (N,); of several, the tightest."""
+    if not fields.contacts:
+        return {}
+    pressure, gap = np.zeros(len(fields.points)), np.full(len(fields.points), np.nan)
+    for side in fields.contacts:
+        np.maximum.at(pressure, side.nodes, side.pressure)
+        np.fmin.at(gap, side.nodes, side.gap)
+    return {"pressure": pressure, "gap": gap}
+
+
+def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
+    """Write one contact as a table, a row per node along the slave side."""
+    path = vtu.with_name(f"{vtu.stem}-{_spelt(side.name)}.csv")
+    points = fields.points[side.nodes]
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    columns = {
+        "along_m": np.append(0.0, np.cumsum(steps)),
+        "x_m": points[:, 0],
+        "y_m": points[:, 1],
+        "ux_m": fields.displacement[side.nodes, 0],
+        "uy_m": fields.displacement[side.nodes, 1],
+        "length_m": side.length,
+        "force_x_N_per_m": side.force[:, 0],
+        "force_y_N_per_m": side.force[:, 1],
+        "pressure_Pa": side.pressure,
+        "gap_m": side.gap,
+    }
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    lines = [",".join(columns), *(",".join(map(_number, row)) for row in rows), ""]
+    try:
+        with replacing(path) as file:
+            file.write("\n".join(lines).encode())
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    return path
+
+
+def _number(value: float) -> str:
+    """Write a number with all its digits; what there is none of is left empty."""
+    return "" if value != value else repr(value)
+
+
+def _spelt(name: str) -> str:
+    """Make a name fit for a file: letters, digits and dashes."""
+    return "-".join(re.findall(r"\w+", name)) or "contact"
 
 
 def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Path]:
-    """Write states and their times as path.pvd and, next to it, one .vtu for each.
+    """Write states and their times as path.pvd and, next to it, the files of each.
 
     Returns the files written, the .pvd first; ParaView opens that one.
 
@@ -65,8 +130,7 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
     written, lines = [], []
     for i, (time, fields) in enumerate(states):
         vtu = path.with_name(f"{path.stem}_{i:04d}.vtu")
-        write_vtu(fields, vtu)
-        written.append(vtu)
+        written.extend(write_vtu(fields, vtu))
         lines.append(f'    <DataSet timestep="{time!r}" file={quoteattr(vtu.name)}/>')
     text = "\n".join([
         '<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">',

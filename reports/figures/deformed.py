@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corner
 SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them
 _MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
 _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
+_LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
@@ -45,8 +46,18 @@ def clipped_at(fields: Fields) -> tuple[float, float] | None:
     return float(np.percentile(stress, PERCENTILE)), float(np.max(stress))
 
 
-def deformed_figure(fields: Fields) -> FieldFigure:
-    """Show all bodies, and their contact enlarged where contact forces are given.
+class _Loaded(NamedTuple):
+    """The slave nodes of one contact that carry load."""
+
+    name: str  #: of the pair; empty where the fields tell of no pairs
+    nodes: NDArray[np.int64]  #: (k,)
+    forces: Points  #: on them, N/m
+
+
+def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
+    """Show all bodies, and each contact that carries load enlarged.
+
+    scale : of the displacement, as drawn
 
     Raises
     ------
@@ -59,49 +70,65 @@ def deformed_figure(fields: Fields) -> FieldFigure:
         raise InputError("displacement or stress holds NaN or inf: there is no picture")
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies of no width or no height: there is no picture")
-    forces = fields.contact_forces
-    loaded = forces is not None and bool(np.any(forces))
-    low, high = _box(fields)
+    points = moved(fields, scale)
+    loaded = _loaded(fields)
+    low, high = _box(fields, points)
     width, height = high - low
     pad = 0.02 * width
     drawn = min(_WIDTH * (height + 2 * pad) / (width + 2 * pad), _TALLEST)
-    enlarged = _WIDTH * _FLAT if loaded else 0.0
-    scale = _scale(fields)
-    bodies = _bodies(fields, scale)
+    enlarged = _WIDTH * _FLAT
+    colours = _scale(fields)
+    bodies = _bodies(fields, points, colours)
     before, after = (
-        [Path(points=points[loop], look=style) for loop in outlines(fields.cells)]
-        for points, style in ((fields.points, _BEFORE), (moved(fields), _OUTLINE))
+        [Path(points=at[loop], look=style) for loop in outlines(fields.cells)]
+        for at, style in ((fields.points, _BEFORE), (points, _OUTLINE))
     )
     corners = low - pad, high + pad
+    span = float((high - low).max())
+    letters = [f"({chr(ord('b') + i)})" for i in range(len(loaded))]
+    frames = [
+        mark
+        for letter, contact in zip(letters, loaded, strict=True)
+        for mark in _frame(letter, _window(points[contact.nodes], span), corners)
+    ]
+    there = moved(fields)  # enlarged by more, bodies in contact would overlap
+    near = (
+        *_bodies(fields, there, colours),
+        *(Path(points=there[o], look=_OUTLINE) for o in outlines(fields.cells)),
+    )
+    truly = "" if scale == SCALE else f"displacement × {SCALE:g}"
     overview = FieldPanel(
         low=_pair(corners[0]), high=_pair(corners[1]),
-        marks=(*bodies, *before, *after, *(_frame(fields, *corners) if loaded else ())),
-        title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {SCALE:g}; "
+        marks=(*bodies, *before, *after, *frames),
+        title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {scale:g}; "
         "dashed: undeformed",
-        xlabel="$x$ in m", ylabel="$y$ in m",
+        **_axes(span),
     )  # fmt: skip
+    windows = [
+        _enlarged(near, f"{letter} {_listed(contact.name, truly)}", contact,
+                  there[contact.nodes], span)
+        for letter, contact in zip(letters, loaded, strict=True)
+    ]  # fmt: skip
     return FieldFigure(
-        panels=(overview, _enlarged(fields, (*bodies, *after)))
-        if loaded
-        else (overview,),
-        height=drawn + enlarged + (1.24 if loaded else 0.55),
-        heights=(drawn, enlarged) if loaded else (drawn,),
-        scale=scale,
+        panels=(overview, *windows),
+        height=drawn + 0.55 + len(windows) * (enlarged + 0.69),
+        heights=(drawn, *[enlarged] * len(windows)),
+        scale=colours,
     )
 
 
-def moved(fields: Fields) -> Points:
-    """(n, 2) where the displacement puts the nodes."""
-    return cast(Points, fields.points + SCALE * fields.displacement)
+def moved(fields: Fields, scale: float = SCALE) -> Points:
+    """(n, 2) where `scale` times the displacement puts the nodes."""
+    return cast(Points, fields.points + scale * fields.displacement)
 
 
 def _pair(point: Vector) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
-def _box(fields: Fields) -> tuple[Vector, Vector]:
+def _box(fields: Fields, points: Points) -> tuple[Vector, Vector]:
     """Lower left and upper right corner of the bodies, before and after."""
-    both = np.vstack([fields.points, moved(fields)])
+    both = np.vstack([fields.points, points])
     return both.min(axis=0), both.max(axis=0)
 
 
@@ -125,9 +152,10 @@ def _prefixed(value: float) -> tuple[float, str]:
     return next((p for p in known if value >= p[0]), (1.0, ""))
 
 
-def _bodies(fields: Fields, scale: ColourScale | None) -> list[FieldMark]:
+def _bodies(
+    fields: Fields, points: Points, scale: ColourScale | None
+) -> list[FieldMark]:
     """Show every body: stress and mesh, deformed."""
-    points = moved(fields)
     stress = np.full(len(points), 0.3) if scale is None else fields.nodal["von_mises"]
     marks: list[FieldMark] = []
     for body in np.unique(fields.bodies):
@@ -149,19 +177,21 @@ def _bodies(fields: Fields, scale: ColourScale | None) -> list[FieldMark]:
 
 
 def triangles(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Halve quadrilaterals: (2E, 3) node numbers."""
-    return np.vstack([cells[:, [0, 1, 2]], cells[:, [0, 2, 3]]])
+    """Halve quadrilaterals, keep triangles: node numbers (t, 3)."""
+    halves = cells[cells[:, 2] != cells[:, 3]]
+    return np.vstack([cells[:, [0, 1, 2]], halves[:, [0, 2, 3]]])
 
 
 def edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Every edge of quadrilaterals once, (k, 2) node numbers."""
+    """Every edge of cells once, (k, 2) node numbers."""
     edges: NDArray[np.int64] = np.unique(np.sort(_sides(cells), axis=1), axis=0)
     return edges
 
 
 def _sides(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """List the four directed sides of every cell, (4E, 2) node numbers."""
-    return np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
+    """List the directed sides of every cell, (s, 2) node numbers."""
+    sides = np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
+    return np.asarray(sides[sides[:, 0] != sides[:, 1]])
 
 
 def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
@@ -186,30 +216,45 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
-def _loaded(fields: Fields) -> tuple[Points, Points]:
-    """Places of the loaded contact nodes, and the forces on them, N/m."""
-    assert fields.contact_nodes is not None
-    assert fields.contact_forces is not None
-    size = np.hypot(*fields.contact_forces.T)
-    active = size > _ACTIVE * size.max()
-    return moved(fields)[fields.contact_nodes[active]], fields.contact_forces[active]
+def _axes(span: float) -> dict[str, Any]:
+    """Choose m, mm or µm for the axes of bodies of this size."""
+    unit, name = next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
+    return {"xlabel": f"$x$ in {name}", "ylabel": f"$y$ in {name}", "unit": unit}
 
 
-def _corners(fields: Fields) -> tuple[Vector, Vector]:
-    """Lower left and upper right corner of the enlargement."""
-    tips, _ = _loaded(fields)
-    low, high = _box(fields)
-    span = float((high - low).max())
-    middle = (tips.min(axis=0) + tips.max(axis=0)) / 2
-    reach = max(0.75 * float(np.ptp(tips, axis=0).max()), 0.06 * span)
+def _listed(*words: str) -> str:
+    """Join what a title begins with; empty where that is nothing."""
+    given = ", ".join(filter(None, words))
+    return f"{given}: " if given else ""
+
+
+def _loaded(fields: Fields) -> list[_Loaded]:
+    """List the contacts that carry load; all as one where they are not told apart."""
+    told = [(side.name, side.nodes, side.force) for side in fields.contacts]
+    if not told and fields.contact_nodes is not None:
+        assert fields.contact_forces is not None
+        told = [("", fields.contact_nodes, fields.contact_forces)]
+    found = []
+    for name, nodes, forces in told:
+        size = np.hypot(*forces.T)
+        if (active := size > _ACTIVE * size.max(initial=0.0)).any():
+            found.append(_Loaded(name, nodes[active], forces[active]))
+    return found
+
+
+def _window(places: Points, span: float) -> tuple[Vector, Vector]:
+    """Lower left and upper right corner of an enlargement; span: size of all bodies."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    reach = max(0.75 * float((high - low).max()), 0.06 * span)
     half = np.array([reach, _FLAT * reach])
-    return middle - half, middle + half
+    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-def _enlarged(fields: Fields, bodies: Sequence[FieldMark]) -> FieldPanel:
-    """Zoom to the loaded contact nodes and show the force on each as an arrow."""
-    tips, forces = _loaded(fields)
-    low, high = _corners(fields)
+def _enlarged(
+    bodies: Sequence[FieldMark], title: str, contact: _Loaded, tips: Points, span: float
+) -> FieldPanel:
+    """Zoom to the loaded nodes of a contact and show the force on each as an arrow."""
+    forces, (low, high) = contact.forces, _window(tips, span)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
     arrows = Vectors(
@@ -219,21 +264,23 @@ def _enlarged(fields: Fields, bodies: Sequence[FieldMark]) -> FieldPanel:
     factor, prefix = _prefixed(largest)
     return FieldPanel(
         low=_pair(low), high=_pair(high), marks=(*bodies, arrows), axes="frame",
-        title="(b) contact forces on the slave nodes; the largest is "
+        title=f"{title}contact forces on the slave nodes; the largest is "
         f"{largest / factor:.3g} {prefix}N/m",
-        xlabel="$x$ in m", ylabel="$y$ in m",
+        **_axes(span),
     )  # fmt: skip
 
 
-def _frame(fields: Fields, least: Vector, most: Vector) -> tuple[FieldMark, ...]:
-    """Outline the enlargement in the overview."""
-    low, high = _corners(fields)
+def _frame(
+    letter: str, window: tuple[Vector, Vector], panel: tuple[Vector, Vector]
+) -> tuple[FieldMark, ...]:
+    """Outline an enlargement in the overview, as far as it lies within."""
+    (low, high), (least, most) = window, panel
     (x0, y0), (x1, y1) = np.maximum(low, least), np.minimum(high, most)
     corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
     return (
         Polygons(corners=(corners,), edge=_ARROW, width=0.8, cased=True),
         Label(
-            text="(b)", place=_pair(corners[2]), offset=(3, 0), align=("left", "top"),
+            text=letter, place=_pair(corners[2]), offset=(3, 0), align=("left", "top"),
             colour=_ARROW, cased=True,
         ),
     )  # fmt: skip

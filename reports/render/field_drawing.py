@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from matplotlib import colormaps, patheffects, rc_context
@@ -29,6 +30,10 @@ from reports.render.drawing import STYLE, look_of
 
 _CASING: list[patheffects.AbstractPathEffect] = [
     patheffects.withStroke(linewidth=1.6, foreground="white")
+]
+#: wide enough that the strokes of a letter do not show white between them
+_LETTER_CASING: list[patheffects.AbstractPathEffect] = [
+    patheffects.withStroke(linewidth=3.2, foreground="white")
 ]
 
 
@@ -59,6 +64,9 @@ def _panel(axes: Axes, panel: FieldPanel) -> None:
     for i, mark in enumerate(panel.marks):
         _mark(axes, mark, 1.0 + i / (1 + len(panel.marks)))
     axes.set(xlim=(panel.low[0], panel.high[0]), ylim=(panel.low[1], panel.high[1]))
+    if panel.unit != 1.0:
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(_in_units(panel.unit))
     axes.tick_params(labelbottom=panel.numbered[0], labelleft=panel.numbered[1])
     if panel.axes == "none":
         axes.axis("off")
@@ -107,8 +115,13 @@ def _mark(axes: Axes, mark: FieldMark, height: float) -> None:
             axes.annotate(
                 mark.text, mark.place, xytext=mark.offset, color=mark.colour,
                 textcoords="offset points", ha=mark.align[0], va=mark.align[1],
-                path_effects=_CASING if mark.cased else [], zorder=height,
+                path_effects=_LETTER_CASING if mark.cased else [], zorder=height,
             )  # fmt: skip
+
+
+def _in_units(unit: float) -> Callable[[float, float], str]:
+    """Write numbers of an axis in multiples of `unit`."""
+    return lambda v, _: f"{v / unit:.4g}".replace("-", "−")
 
 
 def _norm(scale: ColourScale) -> Normalize:
@@ -120,8 +133,6 @@ def _bar(
 ) -> None:
     colours = ScalarMappable(norm=_norm(scale), cmap=colormaps[scale.colours])
     bar = canvas.colorbar(colours, ax=beside, extend=scale.beyond, **how)
-    bar.long_axis.set_major_formatter(
-        lambda v, _: f"{v / scale.unit:.4g}".replace("-", "−")
-    )
+    bar.long_axis.set_major_formatter(_in_units(scale.unit))
     bar.set_label(scale.label)
     bar.outline.set_linewidth(0.5)

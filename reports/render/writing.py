@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from reports.render.latex import latex
 from reports.render.markdown import markdown
 from reports.render.svg import Svg
 
+_NUMBERED = re.compile(r"[a-z]+-\d+\.(pdf|svg|png)")  #: files of figures in a series
 RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
 
 
@@ -63,4 +65,12 @@ def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Sv
     for picture in (p for section in page.sections for p in section.pictures):
         paths, drawings[picture.name] = save_all(picture.figure, folder, picture.name)
         written += paths
+    _remove_numbered(folder, keep=written)
     return written, drawings
+
+
+def _remove_numbered(folder: Path, keep: Collection[Path]) -> None:
+    """Delete figures of an earlier report of which this one has fewer, as scaling-2."""
+    for path in folder.iterdir():
+        if _NUMBERED.fullmatch(path.name) and path not in keep:
+            path.unlink()

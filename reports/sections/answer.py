@@ -205,7 +205,7 @@ def _tied(c: Competitor, f: FastestSolver) -> str:
     ends = [bracketed(r.value, r.low, r.high) for r in (ratios[0], ratios[-1])]
     text = f"{_name(c)} took {' to '.join(dict.fromkeys(ends))} times as long"
     if c.ratio and c.ratio.low > 1 and f.over_cases:
-        return f"{text}, which does not outlast a test of all pairs at once"
+        return f"{text}, but a test of all pairs at once does not tell them apart"
     return text
 
 

@@ -23,13 +23,17 @@ DRAWN = 4  #: groups that are drawn; all are tabulated
 FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table
 
 
-def profiles(rankings: Sequence[Ranking], solvers: Sequence[str]) -> Section | None:
-    """Draw and tabulate the profiles of every group; None where there is none.
+def profiles(
+    rankings: Sequence[Ranking], solvers: Sequence[str], left: tuple[str, ...] = ()
+) -> Section:
+    """Draw and tabulate the profiles of every group.
 
     solvers : of the whole report, which their looks go by
+    left : what `reports.sections.ranking.left_out` says
     """
+    name, title = "profiles", "Profiles"
     if not rankings:
-        return None
+        return Section(name=name, title=title, prose=left)
     drawn = rankings[:DRAWN]
     pictures = [
         picture
@@ -38,8 +42,8 @@ def profiles(rankings: Sequence[Ranking], solvers: Sequence[str]) -> Section | N
     ]
     rest = len(rankings) - len(drawn)
     return Section(
-        name="profiles",
-        title="Profiles",
+        name=name,
+        title=title,
         prose=(
             "Performance profiles show the share of the cases that a solver solves "
             "within a factor of the best time of each case; data profiles, within a "
@@ -53,6 +57,7 @@ def profiles(rankings: Sequence[Ranking], solvers: Sequence[str]) -> Section | N
             "leader is set against each of the next in turn."
             + f" The first {len(drawn)} of {len(rankings)} groups are drawn."
             * bool(rest),
+            *left,
         ),
         tables=tuple(map(_table, rankings)),
         pictures=tuple(pictures),

@@ -34,19 +34,50 @@ from reports.document.layout import Cell, Section, Table, name_cell
 from reports.statistics.censoring import restricted_mean
 from reports.statistics.intervals import COVERAGE, Interval
 
+_LACKING = 6  #: groups that are named as not compared
 _COLUMNS = (
     "solver", "tier", "solved", "mean", "to the leader", "P(best)",
     "both solved, to the leader", "common cases, to the leader", "mean up to the limit",
 )  # fmt: skip
 
 
-def means(rankings: Sequence[Ranking]) -> Section | None:
-    """Tabulate the means of every group; None where there is none."""
+def left_out(groups: Sequence[ComparisonGroup], *, poolable: bool) -> tuple[str, ...]:
+    """Say of which groups nothing is said over cases, and what they lack.
+
+    Empty where every group is comparable.
+
+    poolable : whether all forms together would make a group that is
+    """
+    lacking = [group for group in groups if not group.comparable]
+    if not lacking:
+        return ()
+    some = len(lacking) < len(groups)
+    counted = [f"{group.title}: {group.lack}" for group in lacking[:_LACKING]]
+    counted += [f"and {len(lacking) - _LACKING} more"] * (len(lacking) > _LACKING)
+    one_of = "" if any(group.forms for group in groups) else " of one form"
+    text = (
+        f"{'Not compared here' if some else 'Nothing is compared here'}: "
+        f"{'; '.join(counted)}. At least {CASES} cases{one_of} at one accuracy are "
+        "needed, two solvers that were measured on them, and a verified answer: with "
+        "fewer cases no two solvers can be told apart."
+    )
+    hint = (
+        ' "mortarbench report DIR --pool-forms" puts the cases of all forms together.'
+    )
+    return (text + hint * poolable,)
+
+
+def means(rankings: Sequence[Ranking], left: tuple[str, ...] = ()) -> Section:
+    """Tabulate the means of every group.
+
+    left : what `left_out` says
+    """
+    name, title = "means", "Means over cases"
     if not rankings:
-        return None
+        return Section(name=name, title=title, prose=left)
     return Section(
-        name="means",
-        title="Means over cases",
+        name=name,
+        title=title,
         prose=(
             "Shifted geometric means exp(mean log(t + s)) − s of the median times of "
             "verified answers, one time per case. The shift s is the median over the "
@@ -54,8 +85,13 @@ def means(rankings: Sequence[Ranking]) -> Section | None:
             "seconds would make the mean of milliseconds an arithmetic one. An "
             f"unsolved case is charged {USUAL.penalty:g} limits; next to that stand "
             "two comparisons that charge nothing, and the arithmetic mean of times cut "
-            "at the limit. Forms are compared apart, "
-            f"and only where there are at least {CASES} cases.",
+            "at the limit. "
+            + (
+                "Forms are compared together, as asked for."
+                if any(ranking.group.forms for ranking in rankings)
+                else "Forms are compared apart, "
+                f"and only where there are at least {CASES} cases."
+            ),
             "Intervals (95 %) are over the cases: they say what other cases of the "
             "same kind might have given. A solver is in the first tier whose head "
             "these cases do not tell to be faster: within a tier, ranks are inside the "
@@ -63,6 +99,7 @@ def means(rankings: Sequence[Ranking]) -> Section | None:
             "What is told apart is so with 95 % for all pairs at once. P(best) is the "
             "share of resampled sets of cases in which a solver has the least mean. "
             "Formulas, sources and limits are in docs/statistics.md.",
+            *left,
         ),
         tables=tuple(map(_table, rankings)),
     )
@@ -143,9 +180,14 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
         return Cell(text=ABSENT, title=f"fewer than {CASES} cases that both solved")
     return Cell(
         text=bracketed(ratio.value, ratio.low, ratio.high),
-        after=f"n = {ratio.pairs}",
+        after=f"n = {ratio.pairs}{_session(group, i, leader)}",
         value=ratio.value,
     )
+
+
+def _session(group: ComparisonGroup, i: int, j: int) -> str:
+    """Mark two solvers that were not measured within the same blocks."""
+    return ", other session" if group.apart.any() and group.apart[i, j] else ""
 
 
 def _common(ranking: Ranking, i: int) -> Cell:
@@ -170,14 +212,18 @@ def _restricted(group: ComparisonGroup, i: int) -> Cell:
     )
 
 
-def ranking(rankings: Sequence[Ranking]) -> Section | None:
-    """Tabulate the panel of every group; None where there is none."""
+def ranking(rankings: Sequence[Ranking], left: tuple[str, ...] = ()) -> Section:
+    """Tabulate the panel of every group.
+
+    left : what `left_out` says
+    """
+    name, title = "ranking", "What ranks depend on"
     if not rankings:
-        return None
+        return Section(name=name, title=title, prose=left)
     panels = [(ranking, panel(ranking.group)) for ranking in rankings]
     return Section(
-        name="ranking",
-        title="What ranks depend on",
+        name=name,
+        title=title,
         prose=(
             "Ranks by the means above, and what becomes of them when one convention is "
             f"changed: the shift ({_listed(SHIFTS)} times the fitted one), the limits "
@@ -189,6 +235,7 @@ def ranking(rankings: Sequence[Ranking]) -> Section | None:
             "that of all but those told slower; together these ranges hold the true "
             "ranks of all solvers with 95 %. Where a range is longer than one rank, "
             "the rank is inside the noise.",
+            *left,
         ),
         points=tuple(_worth(*each) for each in panels),
         tables=tuple(_panel_table(*each) for each in panels),

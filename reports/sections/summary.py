@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from harness import Verdict
+from harness import InputError, Record, Verdict
 from harness.record import SCHEMA, VERIFIED_FACTOR
 from harness.results.faults import in_words
-from reports.data.environment import QUIET_LOAD, busy_with
+from harness.results.folder import differences, environment_of
+from reports.data.environment import QUIET_LOAD, busy_with, machine
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import (
     ENDINGS,
@@ -40,15 +41,17 @@ def summary(evidence: Evidence) -> Section:
     prose = [
         f"{_made(evidence)}: "
         f"{plural(len(evidence.solvers), 'solver')}, {plural(cases, 'case')}, "
-        f"tolerance {', '.join(map(tolerance, tols))}. A solver claims; the harness "
-        "verifies: every verdict below comes from what we evaluated ourselves at the "
-        "returned point, and only verified answers enter a comparison of times.",
+        f"tolerance {', '.join(map(tolerance, tols))}. What a solver says of its "
+        "answer is recorded beside our verdict: every verdict below comes from "
+        "residuals that we evaluated at the returned point, and only verified answers "
+        "enter a comparison of times.",
     ]
     digests = sorted({r.environment for r in evidence.records})
     if len(digests) > 1:
         prose.append(
             f"Warning: the measurements come from {len(digests)} different "
             f"environments ({listing(digests)}); their times are not comparable."
+            f"{_marked(evidence)}"
         )
     notes = (
         _unmade(evidence), _judged(evidence), _at_factor(evidence), _schemas(evidence),
@@ -62,6 +65,25 @@ def summary(evidence: Evidence) -> Section:
         prose=tuple(prose),
         points=tuple(points),
         tables=(_counts(evidence),),
+    )
+
+
+def _marked(evidence: Evidence) -> str:
+    """Say what the marks behind labels mean, and what differs there."""
+    said = []
+    for digest, mark in evidence.marks.items():
+        try:
+            there = environment_of(evidence.directory, digest)
+        except InputError:
+            said.append(f"{mark.strip()} is {clean(digest)}")
+            continue
+        keys = [key for key, *_ in differences(evidence.environment, there)]
+        other = f" (other: {listing(keys)})" * bool(keys)
+        said.append(f"{mark.strip()} is {clean(machine(there))}{other}")
+    if not said:
+        return ""
+    return (
+        f" The same was measured in several: behind a solver's name, {'; '.join(said)}."
     )
 
 
@@ -98,13 +120,15 @@ def _unmade(evidence: Evidence) -> str:
 
 def _cells(evidence: Evidence) -> int:
     """Count what can be measured: cold solvers on cold cases, sequences on theirs."""
-    modes = {r.solver: r.mode for r in evidence.records}
+
+    def kind(r: Record) -> tuple[str, str]:
+        return r.mode, evidence.marks.get(r.environment, "")
+
+    kinds = {r.solver: kind(r) for r in evidence.records}
     rows = evidence.outcomes.values()
-    present = [{o.first.mode for o in row.values()} for row in rows]
+    present = [{kind(o.first) for o in row.values()} for row in rows]
     return sum(
-        modes.get(solver, "cold") in of_case
-        for of_case in present
-        for solver in evidence.solvers
+        kinds[solver] in of_case for of_case in present for solver in evidence.solvers
     )
 
 

@@ -12,7 +12,7 @@ from statistics import median
 import numpy as np
 
 from harness import Record
-from harness.running.pairs import Ratio, paired_ratio
+from harness.running.pairs import Ratio, paired_ratio, ratio_of
 from harness.suite.suite import NULL
 from reports.data.cells import case_cells, grid, source
 from reports.data.evidence import Evidence, Outcome
@@ -28,6 +28,11 @@ from reports.document.formatting import (
 from reports.document.layout import Cell, Section, Table, name_cell
 from reports.statistics.intervals import COVERAGE, Interval, median_interval
 
+_UNPAIRED = (
+    "Unpaired: the two were not measured in the same blocks, since one was added to "
+    "the suite later, say. Their times are compared as two samples, by Welch's "
+    "interval; what changed on the machine from one session to the other is not in it."
+)
 _PARTS = 3  #: the canary's drift compares the last third with the first
 
 
@@ -164,6 +169,13 @@ def ratios(evidence: Evidence) -> Section | None:
     if not any(len(o.records) > 1 for o in evidence.flat):
         return None
     fastest = {key: _fastest(row) for key, row in evidence.outcomes.items()}
+    apart = any(
+        not (o.by_block.keys() & best.by_block.keys())
+        for key, row in evidence.outcomes.items()
+        if (best := fastest[key]) is not None
+        for o in row.values()
+        if o.verified
+    )
 
     def show(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
         return _ratio(outcome, fastest[outcome.case, outcome.tol])
@@ -177,6 +189,7 @@ def ratios(evidence: Evidence) -> Section | None:
             f"Mean of the logarithms, Student's {COVERAGE:.0%} interval. ≈: the "
             "interval holds 1, so that the two are not told apart. Blocks that both "
             "were measured in count; fewer than two make no interval.",
+            *[_UNPAIRED] * apart,
         ),
         tables=(grid(evidence, "Ratio to the fastest, within blocks.", show),),
     )
@@ -187,14 +200,15 @@ def _ratio(outcome: Outcome, fastest: Outcome | None) -> Cell:
         return Cell(text=ABSENT, title="not verified")
     if outcome is fastest:
         return Cell(text="1", value=1.0, kind="best", title=source(outcome))
-    its = fastest.by_repeat if fastest else {}
-    ratio = paired_ratio(outcome.by_repeat, its)
+    its = fastest.by_block if fastest else {}
+    ratio = ratio_of(outcome.by_block, its)
     if ratio is None:
         return Cell(text=ABSENT, title="fewer than two blocks in common")
     tied = ratio.low <= 1 <= ratio.high
     return Cell(
         text=bracketed(ratio.value, ratio.low, ratio.high),
         symbol="≈" if tied else "",
+        after="" if ratio.paired else "unpaired",
         kind="tied" if tied and not outcome.first.role else "",
         value=ratio.value,
         title=source(outcome),
@@ -206,7 +220,7 @@ def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
     medians = {
         s: median(times)
         for s, o in row.items()
-        if o.verified and not o.first.role and (times := [*o.by_repeat.values()])
+        if o.verified and not o.first.role and (times := [*o.by_block.values()])
     }
     return row[min(medians, key=lambda s: medians[s])] if medians else None
 
@@ -226,8 +240,9 @@ def precision(evidence: Evidence) -> Section | None:
         )
     if canary is not None:
         prose.append(
-            "Just before every measurement the worker times a small kernel that is "
-            "always the same: where that moves, the machine moved, not a solver."
+            "Just before every measurement the worker times one small computation, the "
+            "canary, which is always the same. Where its time changes, the machine has "
+            "changed, and not a solver."
         )
     return Section(
         name="precision",
@@ -245,7 +260,7 @@ def _null_ratios(evidence: Evidence) -> list[tuple[Outcome, Outcome, Ratio]]:
             twin = row.get(null.solver.replace(NULL, "", 1))
             if twin is None or not (null.verified and twin.verified):
                 continue
-            ratio = paired_ratio(null.by_repeat, twin.by_repeat)
+            ratio = paired_ratio(null.by_block, twin.by_block)
             if ratio is not None:
                 found.append((twin, null, ratio))
     return found

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 
 from harness.crossval.discretisation import Discretisation, read_discretisation
-from harness.running.pairs import paired_ratio
+from harness.running.pairs import ratio_of
 from reports.data.cells import source
 from reports.data.evidence import Evidence, Outcome
 from reports.data.time_at_accuracy import counts
@@ -179,7 +179,7 @@ def _price(outcomes: Sequence[Outcome], meshes: Mapping[str, Discretisation]) ->
 def _further(enough: Outcome, tightest: Outcome) -> str:
     if enough is tightest:
         return ", the tightest"
-    ratio = paired_ratio(tightest.by_repeat, enough.by_repeat)
+    ratio = ratio_of(tightest.by_block, enough.by_block)
     at = f"times as long at {tolerance(tightest.tol)}"
     if ratio is not None:
         return f"; {ratio.value:.2f} [{ratio.low:.2f}, {ratio.high:.2f}] {at}"

@@ -13,11 +13,10 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     csc,
     from_one_sided,
-    needs_matrices,
     objective_factor,
     one_sided,
     positive,

@@ -12,13 +12,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness import QP, About, Matrix, Solution, Status
+from harness import QP, About, Matrix, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     csc,
     dense,
     from_one_sided,
     needs_independent_rows,
-    needs_matrices,
     objective_factor,
     one_sided,
     positive,

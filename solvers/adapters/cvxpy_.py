@@ -14,13 +14,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.backends import Call, adapter_files, why_not
 from solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
     csc,
-    needs_matrices,
     objective_factor,
     on_present_bounds,
 )

@@ -13,11 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import csc_matrix, tril, vstack
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     csc,
     needs_dense,
-    needs_matrices,
     objective_factor,
     on_present_bounds,
     one_of,

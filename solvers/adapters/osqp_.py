@@ -12,12 +12,11 @@ from typing import ClassVar
 
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_two_sided,
-    needs_matrices,
     objective_factor,
     positive,
     to_two_sided,

@@ -12,14 +12,13 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     NEGLIGIBLE,
     as_stored,
     csc,
     dense,
     needs_dense,
-    needs_matrices,
     objective_factor,
     one_of,
     positive,

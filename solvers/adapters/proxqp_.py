@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector
+from harness import QP, About, Solution, Status, Vector, needs_matrices
 from solvers.common.conversion import (
     NEGLIGIBLE,
     as_stored,
@@ -21,7 +21,6 @@ from solvers.common.conversion import (
     dense,
     from_two_sided,
     needs_dense,
-    needs_matrices,
     on_present_bounds,
     one_of,
     positive,

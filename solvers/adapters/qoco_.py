@@ -12,13 +12,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
     csc,
     from_one_sided,
-    needs_matrices,
     objective_factor,
     one_sided,
     positive,

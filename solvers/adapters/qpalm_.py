@@ -12,12 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector
+from harness import QP, About, Solution, Status, Vector, needs_matrices
 from solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_two_sided,
-    needs_matrices,
     positive,
     to_two_sided,
     two_sided,

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness import QP, About, Matrix, Solution, Status, Vector
+from harness import QP, About, Matrix, Solution, Status, Vector, needs_matrices
 from solvers.common.backends import Call, adapter_files, why_not
 from solvers.common.conversion import (
     NEGLIGIBLE,
@@ -23,7 +23,6 @@ from solvers.common.conversion import (
     dense,
     needs_dense,
     needs_independent_rows,
-    needs_matrices,
     objective_factor,
     on_present_bounds,
 )

@@ -13,12 +13,11 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status
+from harness import QP, About, Solution, Status, needs_matrices
 from solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_one_sided,
-    needs_matrices,
     one_of,
     one_sided,
     positive,

@@ -37,7 +37,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals
+from harness import QP, About, Solution, Status, Vector, kkt_residuals, needs_matrices
 from solvers.baselines.active_set import (
     DELTA,
     KAPPA,
@@ -49,7 +49,7 @@ from solvers.baselines.active_set import (
     settled,
 )
 from solvers.baselines.infeasibility_certificate import contradicts, descends
-from solvers.common.conversion import needs_matrices, positive
+from solvers.common.conversion import positive
 
 STIFFER = 100.0  #: factor of ρ where the residuals fall too slowly
 MOST_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ up to which it is used

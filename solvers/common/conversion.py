@@ -8,16 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, eye_array, vstack
 
-from harness import QP, Matrix, Solution, Vector, too_large
+from harness import QP, Matrix, Solution, Vector, needs_matrices, too_large
 
 NEGLIGIBLE = 1e-14  #: an absolute tolerance where a solver's test adds it to a relative
 DIVERGED = 1e12  #: an ‖x‖∞ beyond which relative residuals mean nothing
 OBJECTIVE_SIZE = 1e4  #: ‖q‖∞ as handed to solvers that compare with max(1, objective)
-
-
-def needs_matrices(qp: QP) -> str | None:
-    """Give the reason to decline a `qp` whose P is an operator, else None."""
-    return None if qp.is_explicit else "needs explicit matrices"
 
 
 def needs_dense(qp: QP, copies: float) -> str | None:

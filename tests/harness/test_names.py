@@ -180,3 +180,40 @@ def test_patterns_are_shell_globs_over_the_whole_name_with_case():
     assert match("ring/Nh=3/*", names) == [names[0], names[2]]
     assert match("ring/nh=3/*", names) == []
     assert match("ring/Nh=3", names) == []
+
+
+def stored(name, suffix):
+    return as_family(
+        SimpleNamespace(
+            name=name, defaults={"path": ""}, forms=("qp",), path_suffix=suffix,
+            build=None,
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("qp.npz", "file:qp.npz"),
+        ("folder/my.qps.gz", "file:folder/my.qps.gz"),
+        ("/a/b.mat", "file:/a/b.mat"),
+        ("there", "file:there"),
+        ("two/bodies.toml", "meshed:two/bodies.toml/qp"),
+        ("two/bodies.toml/n=3/dual", "meshed:two/bodies.toml/n=3/dual"),
+    ],
+)
+def test_a_bare_path_is_told_how_its_case_is_called(tmp_path, monkeypatch, text, named):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").write_text("")
+    families = {"file": stored("file", ""), "meshed": stored("meshed", ".toml")}
+
+    with pytest.raises(InputError) as e:
+        parse(text, families)
+    head = text.partition("/")[0]
+    assert str(e.value) == f"unknown family {head!r}; did you mean {named!r}, a file?"
+
+
+@pytest.mark.parametrize("text", ["missing", "ring/n=0.5e3/dual", "a.5/dual"])
+def test_what_looks_like_no_path_is_an_unknown_family(text):
+    with pytest.raises(InputError, match="; known: file"):
+        parse(text, {"file": stored("file", "")})

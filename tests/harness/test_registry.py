@@ -8,6 +8,7 @@ import pytest
 
 from harness import InputError, registry
 from harness.registry import (
+    PluginFile,
     SolverSpec,
     entry_point_plugins,
     load_plugin,
@@ -279,3 +280,111 @@ def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
     assert merged("solver", {"a": 1}, {"b": 2}) == {"a": 1, "b": 2}
     with pytest.raises(InputError, match="solver 'a' of the plug-in exists"):
         merged("solver", {"a": 1}, {"a": 2})
+
+
+# plug-ins in two versions, and with neighbours
+
+WITH_NEIGHBOURS = """
+import helper
+from tools.speed import FAST
+from dataclasses import dataclass
+
+@dataclass(frozen=True)
+class Mine:
+    def declines(self, qp):
+        from late import WHY
+        import tools.speed as speed
+        return f"{WHY} {helper.VERSION} {FAST} {speed.FAST}"
+    def prepare(self, qp, tol): raise NotImplementedError
+
+SOLVERS = {"mine": Mine()}
+"""
+
+
+def version(folder, number):
+    """Write a plug-in, and beside it modules of its own that say which version."""
+    (folder / "tools").mkdir(parents=True)
+    (folder / "mine.py").write_text(WITH_NEIGHBOURS)
+    (folder / "helper.py").write_text("from .constants import VERSION")
+    (folder / "constants.py").write_text(f"VERSION = {number}")
+    (folder / "late.py").write_text("import helper\nWHY = f'late {helper.VERSION}'")
+    (folder / "tools" / "__init__.py").write_text("")
+    (folder / "tools" / "speed.py").write_text(f"FAST = 'fast {number}'")
+    return folder / "mine.py"
+
+
+def test_two_versions_of_a_plugin_keep_their_neighbours_apart(tmp_path):
+    """Whenever an import statement runs: at the start, or in a call."""
+    files = {n: version(tmp_path / f"v{n}", n) for n in (1, 2)}
+    solvers = {}
+    for number, file in files.items():
+        solvers |= load_plugin(f"v{number}={file}").solvers
+
+    assert {name: solver.declines(None) for name, solver in solvers.items()} == {
+        "v1:mine": "late 1 1 fast 1 fast 1",
+        "v2:mine": "late 2 2 fast 2 fast 2",
+    }
+    assert not {"helper", "constants", "late", "tools.speed"} & set(sys.modules)
+
+
+def test_a_neighbour_that_changed_is_imported_anew(tmp_path):
+    file = version(tmp_path / "v", 1)
+    load_plugin(file).solvers["mine"].declines(None)
+    (tmp_path / "v" / "constants.py").write_text("VERSION = 345")
+
+    assert load_plugin(file).solvers["mine"].declines(None).startswith("late 345 345")
+
+
+def test_what_lies_beside_a_plugin_takes_the_place_of_neither_us_nor_python(tmp_path):
+    for name in ("harness", "json", "solvers"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('mine')")
+    file = tmp_path / "plug.py"
+    file.write_text(f"{PLUGIN}\nimport json, solvers\nfrom harness import QP")
+
+    assert list(load_plugin(file).solvers) == ["mine", "mine-9"]
+
+
+@pytest.mark.parametrize(
+    "changed", ["mine.py", "helper.py", "constants.py", "late.py", "tools/speed.py"]
+)
+def test_the_code_of_a_plugin_is_that_of_its_neighbours_too(tmp_path, changed):
+    file = version(tmp_path / "v", 1)
+    (tmp_path / "v" / "unused.py").write_text("a = 1")
+    before = b"".join(PluginFile(file).content())
+    (tmp_path / "v" / "unused.py").write_text("a = 2")
+    same = b"".join(PluginFile(file).content())
+    with (tmp_path / "v" / changed).open("a") as code:
+        code.write("\n# slower\n")
+
+    assert before == same
+    assert b"".join(PluginFile(file).content()) != before
+
+
+@pytest.mark.parametrize(
+    ("text", "path", "label", "name"),
+    [
+        ("a/b.py", "a/b.py", "", "b.py"),
+        ("new=a/b.py", "a/b.py", "new", "new=b.py"),
+        ("v1.2-x=b.py", "b.py", "v1.2-x", "v1.2-x=b.py"),
+        ("./a=b.py", "a=b.py", "", "a=b.py"),
+        ("=b.py", "=b.py", "", "=b.py"),
+    ],
+)
+def test_a_label_stands_before_a_plugin(text, path, label, name):
+    file = PluginFile.of(text)
+
+    assert (str(file.path), file.label, file.name) == (path, label, name)
+    assert PluginFile.of(str(file.resolved())) == file.resolved()
+
+
+def test_a_labelled_adapter_of_many_backends_is_one(tmp_path):
+    file = tmp_path / "many.py"
+    file.write_text(
+        PLUGIN.replace("tries: int = 3", "backend: str = ''").replace(
+            'Mine(), "mine-9": Mine(9)}', 'Mine("own"), "mine:*": Mine()}'
+        )
+    )
+    solvers = load_plugin(f"new={file}").solvers
+
+    assert resolve(spec("new:mine:scs"), solvers).backend == "scs"
+    assert resolve(spec("new:mine"), solvers).backend == "own"

@@ -3,19 +3,26 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
+from harness import Verdict
 from harness.files.qpfile import load_qp
+from harness.names import parse
 from harness.processes.reaper import lives
-from harness.registry import load_plugin
+from harness.registry import SolverSpec, load_plugin
 from harness.results.journal import Journal, read_journal
+from harness.verify.verdicts import new_record
+from mortarbench import progress
+from mortarbench.cli import main as main_module
 from mortarbench.cli.main import main
 from mortarbench.progress import shown_on
 from mortarbench.registries import Registries
@@ -25,9 +32,9 @@ SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
 
 
-def report(folder, formats, *, factor=10.0):
+def report(folder, formats, *, factor=10.0, pool_forms=False):
     name = "index" if factor == 10 else f"index-{factor:g}"
-    return [folder / f"{name}.{f}" for f in formats]
+    return [folder / f"{name}{'-pooled' * pool_forms}.{f}" for f in formats]
 
 
 def paper(registries, out, quick, say):
@@ -205,15 +212,27 @@ def test_report_judges_at_the_factor_that_is_asked_for(cli, tmp_path):
     )  # fmt: skip
 
 
-def compare(before, after, formats, factor):
-    said = [f"{before.name} and {after.name} at {factor:g}", "nothing changed"]
-    return said, [after / f"{form}.{form}" for form in formats]
+def test_report_pools_forms_of_one_folder_and_refuses_to_for_two(cli, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+    asked = ("--pool-forms", "--format", "md")
+
+    assert cli("report", "one", *asked) == (0, "one/index-pooled.md\n", "")
+    code, out, err = cli("report", "one", "two", *asked)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--pool-forms" in err
+
+
+def compare(first, others, formats, factor):
+    (after,) = others
+    said = [f"{first.name} and {after.name} at {factor:g}", "nothing changed"]
+    return [], said, [after / f"{form}.{form}" for form in formats]
 
 
 def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(
     cli, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr("reports.write_comparison", compare)
+    monkeypatch.setattr("reports.write_comparisons", compare)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
     argv = ["report", "one", "two", "--factor", "3"]
@@ -417,6 +436,14 @@ WRONG = {
         (*SOLVE, "--plot", "a.txt"),
         "unknown format '.txt'; expected .",
     ),
+    "scale without picture": (
+        (*SOLVE, "--scale", "3"),
+        "--scale 3 without --plot; expected a picture",
+    ),
+    "scale": (
+        (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
+        "--scale = nan; expected a number, at most 1e+09",
+    ),
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),
         "no/a.png: no folder no; expec",
@@ -575,6 +602,23 @@ def test_help_is_no_error(cli, capsys):
     assert "--memory-limit MIB" in capsys.readouterr().out
 
 
+def test_the_version_is_that_of_the_package(cli, capsys):
+    with pytest.raises(SystemExit) as e:
+        cli("--version")
+
+    assert e.value.code == 0
+    assert capsys.readouterr().out == f"mortarbench {version('mortarbench')}\n"
+
+
+def test_every_command_and_option_says_what_it_is_for(capsys):
+    parser = main_module._parser()
+    (commands,) = parser._subparsers._group_actions
+    for name, command in commands.choices.items():
+        assert command.description, name
+        assert all(action.help for action in command._actions), name
+    assert {c.dest for c in commands._choices_actions} == set(commands.choices)
+
+
 PLUGIN = """
 from dataclasses import dataclass
 import numpy as np
@@ -687,7 +731,8 @@ def test_a_plugin_that_changed_is_another_environment(cli, pit, tmp_path):
 
     assert (first, code) == (0, 2)
     assert "another environment" in err
-    assert ": plugins.plug.py changed); choose another --out or use --fresh" in err
+    assert ": content of the plug-in plug.py: " in err
+    assert " now); choose another --out or use --fresh" in err
 
 
 @pytest.mark.parametrize(("load", "lines"), [(0.4, 0), (0.6, 1)])
@@ -722,6 +767,38 @@ def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
 
     assert "1/7" in terminal.getvalue()
     assert "osqp on [red]/primal" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
+def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
+    """Also one whose measurements take long, and that goes on with an earlier run."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(width))
+    now = [0.0]
+    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    case = "beam-ring/Nr=30/Nh=15/step=7/contact=mortar/basis=standard/dual"
+    record = new_record(
+        parse("well/n=2/primal", FAMILIES),
+        SolverSpec(name="exact", label="exact"),
+        options={}, tol=1e-8, repeat=0, environment="here",
+    ).but(verdict=Verdict.VERIFIED)  # fmt: skip
+
+    with shown_on(terminal) as bar:
+        bar.start(1234)
+        for _ in range(1000):
+            bar.advance(None)
+        bar.say(f"{case}, tol 1e-08, repeat 3")
+        now[0] = 100.0
+        bar.advance(record)
+        terminal.truncate(terminal.seek(0))
+
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal.getvalue())
+    lines = [line for line in re.split(r"[\r\n]+", shown) if line.strip()]
+    assert lines
+    assert all(len(line) <= width for line in lines)
+    assert all("1001/1234 6:28:20 left beam" in line for line in lines)
 
 
 def test_the_module_is_the_same_command_from_any_folder(tmp_path):

@@ -1,11 +1,20 @@
 """What the documents show works."""
 
 import re
+import shlex
 
-from harness import kkt_residuals
+import pytest
+import yaml
+
+from harness import InputError, kkt_residuals
 from harness.registry import load_plugin
+from mortarbench.case import build
+from mortarbench.cli.main import _parser as command_line_parser
+from mortarbench.cli.main import main
 from mortarbench.cli.solvers_page import solvers_page
 from mortarbench.listing import about
+from mortarbench.registries import Registries
+from problems import elastic
 from problems.families.beam_ring import BeamRing
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -31,6 +40,30 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     assert qp.objective(s.x) - qp.objective(reference_solution(qp).x) <= 1e-7 * abs(
         qp.objective(s.x)
     )
+
+
+def test_the_elastic_family_of_the_plug_in_page_is_one(tmp_path):
+    """The stamp carries its pressure, the same in both forms and contact methods."""
+    page = (ROOT / "docs/plugins.md").read_text("utf-8")
+    (code,) = re.findall(r"<!-- file: stamp.py -->\n```python\n(.*?)```", page, re.S)
+    path = tmp_path / "stamp.py"
+    path.write_text(code)
+    energies = []
+    for form in ("primal", "dual"):
+        case = build(f"stamp/n=3/width=0.8/{form}", plugins=[path])
+        s = SOLVERS["clarabel"].prepare(case.qp, 1e-10)()
+        found = case.quantities(s)
+        force = found["contacts"]["stamp on block"]["force"]
+        energies.append(found["energy"])
+        assert kkt_residuals(case.qp, s).worst <= 1e-9
+        assert force["stamp"] == pytest.approx([0, 8e5], abs=1)
+        assert found["contacts"]["stamp on block"]["half_width"] <= 0.4 + 1e-9
+    assert energies[0] == pytest.approx(energies[1], rel=1e-8)
+    with pytest.raises(InputError, match="stamp: n=0 must be at least 1"):
+        build("stamp/n=0/dual", plugins=[path])
+    table = page.partition("may be relied on")[2].partition("## What")[0]
+    rows = "".join(re.findall(r"^\| (`.*?) \|", table, re.M))
+    assert set(re.findall(r"`(\w+)`", rows)) == set(elastic.__all__)
 
 
 def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
@@ -94,3 +127,36 @@ def test_every_page_has_a_place_on_the_site():
     made = {"index.md", "contributing.md", "changelog.md"}
 
     assert set(re.findall(r": (\S+\.md)$", nav, re.M)) == found | made
+
+
+def workflow():
+    """The commands of the workflow for CI, with the names of its head filled in."""
+    whole = yaml.safe_load((ROOT / "docs/ci/mortarbench.yml").read_text("utf-8"))
+    steps = [step for job in whole["jobs"].values() for step in job["steps"]]
+    for text in (step["run"] for step in steps if "run" in step):
+        for name, value in whole["env"].items():
+            text = text.replace(f"${name}", value)
+        yield from (shlex.split(line) for line in text.splitlines())
+
+
+def test_the_workflow_for_ci_calls_commands_that_there_are():
+    commands = [words[1:] for words in workflow() if words[0] == "mortarbench"]
+
+    assert [words[0] for words in commands] == ["test-solver", "run", "validate"]
+    for words in commands:
+        assert command_line_parser().parse_known_args(words)[1] == []
+
+
+@pytest.mark.slow
+def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, capsys):
+    """Of a repository with `new solver mine` and `new suite compare`."""
+    monkeypatch.chdir(tmp_path)
+    for kind, name in (("solver", "mine"), ("suite", "compare")):
+        assert main(Registries(), ["new", kind, name]) == 0
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "mine.py").write_text((tmp_path / "mine.py").read_text())
+
+    for first, *words in workflow():
+        if first == "mortarbench":
+            assert main(Registries(), words) == 0, (words, capsys.readouterr().err)
+    assert (tmp_path / "out/ci/report/index.html").is_file()

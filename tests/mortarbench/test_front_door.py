@@ -89,12 +89,17 @@ def test_an_answer_is_drawn_and_written_for_paraview(answer, tmp_path):
         answer.plot(tmp_path / "a.txt")
 
 
+def test_an_answer_shows_no_options_that_are_the_defaults(answer):
+    assert "solver                    smalbe\n" in repr(answer)
+
+
 def test_options_are_those_asked_for_and_history_can_be_left_out():
     case = mb.build(SMALL)
     few = mb.solve(case, "smalbe", options={"max_steps": 3, "history": False})
 
     assert few.verdict is Verdict.ITERATION_LIMIT
     assert few.record.options["max_steps"] == 3
+    assert "solver                    smalbe (max_steps=3)\n" in repr(few)
     assert few.history == {}
     with pytest.raises(mb.InputError, match="smalbe: unknown option 'max_step'"):
         mb.solve(case, "smalbe", options={"max_step": 3})
@@ -227,6 +232,7 @@ def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
     [
         ["--help"],
         ["run", "--help"],
+        ["--version"],
         ["list", "solvers"],
         ["list", "problems", "--json"],
         ["list", "suites"],
@@ -326,16 +332,18 @@ def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
 
 
 @pytest.mark.parametrize(
-    ("done", "total", "seconds", "said"),
+    ("measured", "to_do", "seconds", "said"),
     [
         (0, 9, 1.0, ""),
-        (9, 9, 1.0, ""),
-        (1, 61, 60.0, "1:00:00 left"),
-        (2, 4, 7, "0:00:07 left"),
+        (9, 0, 1.0, ""),
+        (1, 60, 60.0, "1:00:00 left"),
+        (2, 2, 7, "0:00:07 left"),
     ],
 )
-def test_what_is_left_takes_as_long_as_what_is_done(done, total, seconds, said):
-    assert remaining(done, total, seconds) == said
+def test_what_is_left_takes_as_long_as_what_was_measured(
+    measured, to_do, seconds, said
+):
+    assert remaining(measured, to_do, seconds) == said
 
 
 def test_a_case_built_in_many_threads_is_the_one_that_was_measured(tmp_path):

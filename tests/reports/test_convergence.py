@@ -191,7 +191,7 @@ def test_courses_of_very_different_length_share_a_logarithmic_axis(folder):
     assert scale(71) == "log"
 
 
-def test_what_cannot_be_drawn_is_left_out(folder):
+def test_what_cannot_be_drawn_is_left_out(folder, svg_only):
     strange = {
         "step": [1, 2, 3, 4], "products": ["a"] * 4, "outer": ["x", "y", "z", "z"],
         "free_gradient": [np.nan, np.inf, 2, 1], "chopped_gradient": [0, 0, 0, 0],
@@ -201,7 +201,8 @@ def test_what_cannot_be_drawn_is_left_out(folder):
     (gradient,) = convergence_figure(comparison(out)).axes
 
     assert curves(gradient) == [[[3, 1], [4, 0.5]]]
-    write_report(out, ["html", "md"])
+    with svg_only():
+        write_report(out, ["html", "md"])
 
 
 @pytest.mark.parametrize(
@@ -278,11 +279,12 @@ def test_the_first_repeat_that_kept_a_history_speaks_for_all(folder):
     assert "r1." in section(out).pictures[0].caption
 
 
-def test_a_report_without_histories_has_no_such_section(folder):
+def test_a_report_without_histories_has_no_such_section(folder, svg_only):
     out = folder(("a", {}, {}), ("b", {}, {"vectors": None}))
 
     assert section(out) is None
-    names = {f.name for f in write_report(out, ["html", "md", "tex"])}
+    with svg_only():
+        names = {f.name for f in write_report(out, ["html", "md", "tex"])}
     assert not any("convergence" in name or "active" in name for name in names)
 
 

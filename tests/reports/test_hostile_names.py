@@ -33,7 +33,7 @@ NAMES = (
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory):
+def report(tmp_path_factory, svg_only):
     folder = tmp_path_factory.mktemp("hostile")
     with Journal(folder, "test") as journal:
         for i, name in enumerate(NAMES):
@@ -48,7 +48,8 @@ def report(tmp_path_factory):
                     complementarity=1e-9, quantities={"dofs": size, name: name},
                     environment=name, started=name,
                 ))  # fmt: skip
-    write_report(folder, ["html", "md", "tex", "csv"])
+    with svg_only():
+        write_report(folder, ["html", "md", "tex", "csv"])
     return folder / "report"
 
 

@@ -14,12 +14,14 @@ from reports import write_report
 from reports.data.evidence import Evidence, arrange
 from reports.data.quantities import spreads
 from reports.data.size_series import size_series
+from reports.document import layout
 from reports.document.formatting import clean, exponent, seconds, significant
 from reports.folder import compose
 from reports.render.html_page import breakable
 from reports.render.latex import escaped, latex
 from reports.render.markdown import escaped as md_escaped
 from reports.render.markdown import markdown
+from reports.render.writing import write_figures
 from reports.sections.summary import sentences
 from reports.statistics.intervals import power_law
 
@@ -33,7 +35,7 @@ HOSTILE = (
 )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def measured():
     """Factory: one record of beam-ring/size=N/FORM, verified unless told otherwise."""
 
@@ -302,7 +304,7 @@ class Page(HTMLParser):
                 self.links.append(value)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def hostile(measured):
     def record(text, size):
         return measured(
@@ -317,13 +319,14 @@ def hostile(measured):
     ]
 
 
-@pytest.fixture
-def hostile_folder(hostile, tmp_path):
-    folder = write(tmp_path / "run", hostile)
+@pytest.fixture(scope="module")
+def hostile_folder(hostile, tmp_path_factory, svg_only):
+    folder = write(tmp_path_factory.mktemp("hostile") / "run", hostile)
     (folder / "environment.json").write_text(
         '{"machine": {"cpu": "<b>$x_1$ & co</b>"}, "list": [{"</style>": null}]}'
     )
-    write_report(folder, ["html", "md", "tex"])
+    with svg_only():
+        write_report(folder, ["html", "md", "tex"])
     return folder / "report"
 
 
@@ -430,6 +433,18 @@ def test_the_same_journal_gives_the_same_bytes(measured, square, tmp_path):
             "figures/deformed.pdf", "figures/scaling-1.svg"} <= set(names)  # fmt: skip
     for a, b in zip(first, second, strict=True):
         assert a.read_bytes() == b.read_bytes(), a.name
+
+
+def test_a_report_takes_away_numbered_figures_that_only_an_earlier_one_had(tmp_path):
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    for name in ("profiles-2.pdf", "deformed.png", "profiles-2.txt", "my-2 notes.pdf"):
+        (figures / name).touch()
+
+    write_figures(layout.Page(title="", dateline="", sections=()), tmp_path)
+
+    left = {path.name for path in figures.iterdir()}
+    assert left == {"deformed.png", "profiles-2.txt", "my-2 notes.pdf"}
 
 
 def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):

@@ -55,6 +55,8 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: no condition of conformance are equivalent formulations, which have their own test
 STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
+#: take seconds for all equivalent formulations
+REWRITTEN = {"highs", "qtqp", "daqp", "proxqp"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 
@@ -79,11 +81,35 @@ def test_a_planted_point_is_a_solution(shape, dense):
 ONE_THREAD = "computes in one thread"
 UNBOUNDED = "claims no success: unbounded"
 #: go on to the last of their iterations, for many seconds; `smalbe` is here for its kin
-LONG = [("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED)]
+LONG = [
+    ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
+    ("projected-gradient", UNBOUNDED),
+]  # fmt: skip
+#: planted solutions for all solvers: each shape once, and one of them in every way
+PLANTED = re.compile(
+    r"(finds the planted solution|reaches the tolerance [\d.e-]+): (.*)"
+)
+IN_EVERY_WAY = "everything"
+ONCE = ", sparse"
+
+
+def is_for_all(name, check):
+    """Whether a check is made by default; of our own solver, all are."""
+    planted = PLANTED.match(check)
+    return name == "smalbe" or planted is None or (
+        planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
+    )  # fmt: skip
+
+
+def test_by_default_every_shape_is_planted_for_every_solver():
+    chosen = [check for check in STRICT if is_for_all("any", check)]
+    kinds = {check.partition(":")[0] for check in STRICT}
+    assert {check.partition(":")[0] for check in chosen} == kinds
+    assert all(any(f": {s}, " in check for check in chosen) for s in SHAPES)
 
 
 def marks(name, check):
-    if (name, check) in LONG:
+    if (name, check) in LONG or not is_for_all(name, check):
         return pytest.mark.slow
     return pytest.mark.alone if check == ONE_THREAD else ()
 
@@ -127,7 +153,9 @@ def weaknesses(solver):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if name in NATIVE else pytest.mark.slow)
+        pytest.param(
+            name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
+        )
         for name in CONCRETE  # the others hand the same QPs to libraries among these
     ],
 )
@@ -338,6 +366,18 @@ def test_a_sound_solver_fails_no_check(check):
 def test_a_check_catches_its_fault(kind, check):
     MEMORY.clear()
     assert run_check(check, kind()).grade is Grade.FAIL
+
+
+def test_who_fails_on_an_operator_is_told_the_line_to_write():
+    """The line itself, put where the message says, makes the check pass."""
+    check = "takes or declines an operator"
+    message = run_check(check, TakesOperatorsForZero()).message
+    ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)
+    scope: dict = {}
+    exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
+    told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
+
+    assert run_check(check, told()) == (Grade.DECLINE, "needs explicit matrices", None)
 
 
 @pytest.mark.parametrize(

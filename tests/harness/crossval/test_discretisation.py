@@ -98,7 +98,10 @@ def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n)
     assert found.change < found.error  # the next mesh has an error, too
 
 
-@pytest.mark.parametrize(("dim", "least", "most"), [(1, 0.9, 1.0), (2, 0.6, 0.7)])
+@pytest.mark.parametrize(
+    ("dim", "least", "most"),
+    [(1, 0.9, 1.0), pytest.param(2, 0.6, 0.7, marks=pytest.mark.slow)],
+)
 def test_energies_say_more_than_the_error_where_boundary_values_move(
     tmp_path, dim, least, most
 ):
@@ -113,16 +116,22 @@ def test_energies_say_more_than_the_error_where_boundary_values_move(
         assert least <= error / np.sqrt(2 * excess) <= most + 1e-6
 
 
-def test_energies_of_mechanics_are_those_of_the_case():
+@pytest.mark.parametrize(
+    "name",
+    [
+        "contact-patch", "obstacle", "hertz-plane",
+        pytest.param("hertz-cylinder", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_energies_of_mechanics_are_those_of_the_case(name):
     """½ of the work of the pressure on the patch; what a dual form finds for others."""
-    for name in ("contact-patch", "obstacle", "hertz-plane", "hertz-cylinder"):
-        family = PROBLEMS[name]
-        for form in family.forms:
-            case = family.build(form, completed(family, {}), reference_solution)
-            point = reference_point(case.mechanics, reference_solution)
-            s = reference_solution(case.qp)
-            energy = case.scale * case.qp.objective(s.x) + case.constant
-            assert case.mechanics.energy(point.u) == pytest.approx(energy, rel=1e-11)
+    family = PROBLEMS[name]
+    for form in family.forms:
+        case = family.build(form, completed(family, {}), reference_solution)
+        point = reference_point(case.mechanics, reference_solution)
+        s = reference_solution(case.qp)
+        energy = case.scale * case.qp.objective(s.x) + case.constant
+        assert case.mechanics.energy(point.u) == pytest.approx(energy, rel=1e-11)
 
 
 def test_a_solution_in_the_space_has_no_error_that_could_be_seen(tmp_path):

@@ -1,5 +1,6 @@
 """Data files that somebody wrote to do harm: refused in one line, at little cost."""
 
+import gzip
 import io
 import json
 import os
@@ -252,11 +253,11 @@ HOSTILE_NPZ = [
     (encrypted, "not an npz file"),
     (unknown_method, "not an npz file"),
     (twice, "not an npz file"),
-    (pickled, "not an npz file"),
+    (pickled, "q is a pickled Python object, which is never read; expected an arr"),
     (header_only(header(f"({N}, {N})")), "not an npz file"),
     (header_only(header("(-1,)")), "not an npz file"),
     (header_only(header("(2,)")), "not an npz file"),
-    (header_only(header(descr="'|O'")), "not an npz file"),
+    (header_only(header(descr="'|O'")), "is a pickled Python object"),
     (header_only(header(descr="[('a', '<f4'), ('b', '<f4')]")), "not an npz file"),
     (header_only("(" * 110), "not an npz file"),
     (header_only("x" * 60000), "not an npz file"),
@@ -272,6 +273,38 @@ def test_an_archive_that_expands_is_refused_before_it_is_read(
 
     with pytest.raises(InputError, match=r"would take 16 MiB.*at most 8"):
         build(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("name", ["a.qps.gz", "a.mat.gz"])
+def test_a_gzip_file_that_expands_is_refused_while_it_is_counted(
+    tmp_path, monkeypatch, cheaply, name
+):
+    """A gigabyte of nothing, in several members, as one may write them one by one."""
+    member = gzip.compress(bytes(2**24))
+    (tmp_path / name).write_bytes(member * 64)
+    assert (tmp_path / name).stat().st_size < 2**21
+    monkeypatch.setenv(VARIABLE, "32")
+
+    with pytest.raises(InputError, match=r"expands to would take more than 32 MiB"):
+        build(tmp_path / name)
+
+
+@pytest.mark.parametrize("damage", [b"", b"no gzip", "cut", "checksum", "after"])
+def test_a_damaged_gzip_file_is_refused(tmp_path, damage):
+    whole = gzip.compress(QPS)
+    damaged = {
+        "cut": whole[:-20],
+        "checksum": whole[:-8] + b"abcd" + whole[-4:],
+        "after": whole + b"and more",
+    }
+    (tmp_path / "a.qps.gz").write_bytes(damaged.get(damage, damage))
+
+    with pytest.raises(InputError) as e:
+        build(tmp_path / "a.qps.gz")
+    assert str(e.value) == (
+        f"{tmp_path}/a.qps.gz: not a gzip file, or damaged; expected a QPS text, "
+        "compressed"
+    ) or (damage == b"" and "no ENDATA" in str(e.value))
 
 
 @pytest.mark.parametrize(("write", "message"), HOSTILE_NPZ)

@@ -87,7 +87,6 @@ def test_a_file_name_is_taken_as_it_is(tmp_path):
     ("changes", "complaint"),
     [
         ({"h": None, "G_indptr": None}, "h, G_indptr missing"),
-        ({"meta": None}, "meta missing"),
         ({"meta": np.array("[1]")}, "meta is no JSON object"),
         ({"meta": np.array("{")}, "Expecting property name"),
         ({"q": np.zeros(2)}, r"QP.P has shape \(3, 3\), expected \(2, 2\)"),
@@ -118,11 +117,77 @@ def test_other_files_are_refused_and_never_unpickled(tmp_path):
     with pickled.open("wb") as file:
         np.savez(file, q=np.array([print], dtype=object))
 
-    for path in (text, single, pickled):
+    for path in (text, single):
         with pytest.raises(InputError, match="not an npz file of plain arrays"):
             load_qp(path)
+    with pytest.raises(InputError, match="q is a pickled Python object, which is nev"):
+        load_qp(pickled)
     with pytest.raises(InputError, match="nowhere: No such file"):
         load_qp(tmp_path / "nowhere")
+
+
+# what somebody saves by numpy alone
+
+
+def plain(**changes):
+    """Every kind of constraint, as arrays of numpy."""
+    arrays = {
+        "P": np.diag([2.0, 3.0]), "q": np.ones(2), "G": np.ones((1, 2)), "h": [4.0],
+        "A": np.array([[1, -1]]), "b": [0], "lb": [-np.inf, 0], "ub": [1.0, np.inf],
+    }  # fmt: skip
+    return {k: v for k, v in (arrays | changes).items() if v is not None}
+
+
+def test_plain_arrays_are_a_qp(tmp_path):
+    np.savez(tmp_path / "a.npz", **plain())
+    qp, meta = load_qp(tmp_path / "a.npz")
+
+    assert meta == {}
+    for name, array in plain().items():
+        assert isinstance(getattr(qp, name), np.ndarray)
+        np.testing.assert_array_equal(getattr(qp, name), array)
+
+
+def test_of_plain_arrays_those_of_a_cost_alone_are_enough(tmp_path):
+    np.savez_compressed(tmp_path / "a.npz", P=np.eye(3), q=np.zeros((3, 1)))
+    qp, _ = load_qp(tmp_path / "a.npz")
+
+    assert qp.sizes == {"variables": 3, "equalities": 0, "inequalities": 0, "bounds": 0}
+
+
+def test_a_sparse_matrix_may_be_given_by_its_parts(tmp_path):
+    M = csr_array(np.array([[2.0, 1.0], [1.0, 2.0]])).tocsc()
+    parts = {f"P_{part}": getattr(M, part) for part in ("data", "indices", "indptr")}
+    np.savez(tmp_path / "a.npz", **plain(P=None, P_shape=M.shape, **parts))
+    qp, _ = load_qp(tmp_path / "a.npz")
+
+    np.testing.assert_array_equal(qp.P.toarray(), M.toarray())
+    assert isinstance(qp.G, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"P": None}, "P is missing"),
+        ({"q": None}, "q is missing"),
+        ({"h": None}, "h is missing beside G"),
+        ({"A": None}, "A is missing beside b"),
+        ({"Aeq": np.eye(2)}, "unknown array 'Aeq'; known: A, G, P, b, h, lb, q, ub"),
+        ({"P": None, "P_data": np.ones(1)}, "P_indices, P_indptr, P_shape missing be"),
+        ({"P": np.eye(3)}, "QP.P has shape (3, 3), expected (2, 2)"),
+        ({"P": np.ones(4)}, "P has shape (4,); expected two dimensions"),
+        ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),
+        ({"G": np.array([[np.nan, 1.0]])}, "G holds NaN or inf; expected finite num"),
+        ({"h": np.array(["4"])}, "h is of type <U1; expected numbers"),
+        ({"lb": [2.0, 0.0]}, "QP bounds cross"),
+    ],
+)
+def test_plain_arrays_that_are_no_qp_are_refused(tmp_path, changes, complaint):
+    np.savez(tmp_path / "a.npz", **plain(**changes))
+
+    with pytest.raises(InputError) as e:
+        load_qp(tmp_path / "a.npz")
+    assert str(e.value).startswith(f"{tmp_path}/a.npz: {complaint}")
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path):

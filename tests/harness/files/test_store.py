@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import Fields, InputError, Solution, Status
+from harness import ContactSide, Fields, InputError, Solution, Status
 from harness.files.store import load_fields, load_solution, save_fields, save_solution
 
 
@@ -116,3 +116,22 @@ def test_a_point_is_stored_where_its_folder_was_deleted(tmp_path, solution):
     digest = save_solution(tmp_path, solution)
 
     assert load_solution(tmp_path, digest, Status.SOLVED).z_box[0] == np.inf
+
+
+def test_each_contact_of_a_deformed_state_comes_back(tmp_path, fields):
+    sides = tuple(
+        ContactSide(
+            name=f"ä on {i}", nodes=np.array([i, 3]), length=np.array([0.5, 0.25]),
+            force=np.arange(4.0).reshape(2, 2) - i, pressure=np.array([i, 2.0]),
+            gap=np.array([0.0, np.nan]),
+        )
+        for i in range(2)
+    )  # fmt: skip
+    stored = replace(fields, contacts=sides)
+    loaded = load_fields(tmp_path, save_fields(tmp_path, stored))
+
+    assert [side.name for side in loaded.contacts] == ["ä on 0", "ä on 1"]
+    for one, two in zip(loaded.contacts, sides, strict=True):
+        for part in ("nodes", "length", "force", "pressure", "gap"):
+            np.testing.assert_array_equal(getattr(one, part), getattr(two, part))
+    assert load_fields(tmp_path, save_fields(tmp_path, fields)).contacts == ()

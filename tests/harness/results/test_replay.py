@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -269,33 +268,25 @@ def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
     assert "--plugin empty.py" in err
 
 
-def real(*arguments, folder):
-    return subprocess.run(
-        [sys.executable, "-m", "harness", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
-
-
-def test_a_case_whose_file_has_changed_is_refused(manufactured, tmp_path):
+def test_a_case_whose_file_has_changed_is_refused(cli, manufactured, tmp_path):
     qp, _ = manufactured("box")
     save_qp(tmp_path / "a.npz", qp, {})
     (tmp_path / "a.toml").write_text(
         'name = "a"\nrepeats = 1\nsolvers = ["osqp"]\n'
         '[[problems]]\nfamily = "file"\nparams = { path = "a.npz" }\n'
     )
-    done = real("run", "a.toml", "--out", "done", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    ours = Registries(report=no_report)
+    code, _, err = cli("run", "a.toml", "--out", "done", registries=ours)
+    assert code == 0, err
     (record,) = read_journal(tmp_path / "done")
-    same = real("replay", "done", record.run_id, folder=tmp_path)
-    save_qp(tmp_path / "a.npz", replace(qp, q=2 * qp.q), {})
-    changed = real("replay", "done", record.run_id, folder=tmp_path)
+    code, out, _ = cli("replay", "done", record.run_id, registries=ours)
+    assert (code, "Reproduced" in out) == (0, True)
 
-    assert (same.returncode, "Reproduced" in same.stdout) == (0, True)
-    assert (changed.returncode, changed.stderr.count("\n")) == (2, 1)
-    assert record.run_id in changed.stderr
-    assert "the file changed" in changed.stderr
+    save_qp(tmp_path / "a.npz", replace(qp, q=2 * qp.q), {})
+    code, _, err = cli("replay", "done", record.run_id, registries=ours)
+    assert (code, err.count("\n")) == (2, 1)
+    assert record.run_id in err
+    assert "the file changed" in err
 
 
 @pytest.mark.parametrize("shape", ["box", "everything"])

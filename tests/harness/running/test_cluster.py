@@ -1,7 +1,9 @@
 """Runs on a real Dask scheduler with two worker processes, some of which are lost."""
 
 import json
+import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -244,6 +246,37 @@ def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
         assert code == 2
         assert err.splitlines()[-1].startswith(f"mortarbench: --dask {address}:")
+        assert not Path("d").exists()
+
+
+def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeypatch):
+    """Not even with --fresh, which forgets what a folder holds."""
+    monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
+    assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
+    before = measured("d")
+
+    code = cli("run", "toy.toml", "--out", "d", "--fresh", "--dask", "nonsense://x")[0]
+
+    assert code == 2
+    assert measured("d") == before
+
+
+def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
+    from harness.running.cluster import _interrupted_later
+
+    start = multiprocessing.get_context("spawn").Process  # as Dask does
+    child = start(target=time.sleep, args=(60,))
+    with pytest.raises(KeyboardInterrupt), _interrupted_later():  # noqa: PT012
+        os.kill(os.getpid(), signal.SIGINT)
+        child.start()
+
+    status = Path(f"/proc/{child.pid}/status").read_text()
+    child.kill()
+    child.join()
+    blocked = int(re.search(r"^SigBlk:\s*(\w+)", status, re.M)[1], 16)
+    assert blocked >> (signal.SIGINT - 1) & 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 def test_without_dask_one_line_says_what_to_install(cli, monkeypatch):
@@ -384,8 +417,16 @@ def test_another_environment_is_kept_and_told_once(meet):
         kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
     assert len(kept) == 1
     assert len(said) == 1
-    assert "node07" in said[0]
-    assert "machine.cpu" in said[0]
+    cpu = capture()["machine"]["cpu"]
+    assert said[0].startswith(
+        "node07 measures under other conditions than this machine "
+        f"(processor: {cpu} here, Another there); "
+    )
+
+
+def test_workers_that_share_a_machine_are_told_in_words(meet):
+    _, said = meet(lambda there: there["machine"].update(shared_by_workers=2))
+    assert "(Dask workers that share the machine: none here, 2 there)" in said[0]
 
 
 @pytest.mark.parametrize(

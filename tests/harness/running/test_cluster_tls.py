@@ -100,13 +100,13 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     assert set(measured(tmp_path / "out").values()) == {Verdict.VERIFIED}
 
 
-def test_without_certificates_one_line_says_where_dask_looks_for_them(tmp_path):
-    opens = on_cluster(
+def test_without_certificates_one_line_says_where_dask_looks_for_them():
+    cluster = on_cluster(
         "tls://127.0.0.1:9", plugins=[], operators={}, environment={}, keep=None,
         warn=None,
     )  # fmt: skip
     with (
         pytest.raises(InputError, match=r"no certificate.*distributed\.comm\.tls"),
-        opens(None, tmp_path, tmp_path),
+        cluster,
     ):
         pass

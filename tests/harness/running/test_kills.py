@@ -15,6 +15,7 @@ import pytest
 
 from harness.results.journal import read_journal
 from tests.support import ADVERSARIES
+from tests.support.fork_server import INSTALL
 
 PLUGIN = ADVERSARIES
 SUITE = """
@@ -41,6 +42,7 @@ from harness.registry import load_plugin, resolve
 from harness.running.run import run
 from harness.suite.suite import load_suite
 
+exec(sys.argv[3])
 start = [sys.executable, "-P", {str(PLUGIN)!r}]
 plugin = load_plugin(Path({str(PLUGIN)!r}))
 suite = load_suite(Path(sys.argv[1]), plugin.problems, plugin.solvers)
@@ -69,8 +71,9 @@ ASKED = {
 
 
 def started(suite, out):
+    """Start a run; its processes are forks, whose server is the first that it has."""
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", RUNS, str(suite), str(out)],
+        [sys.executable, "-P", "-c", RUNS, str(suite), str(out), INSTALL],
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -97,7 +100,7 @@ def family(process):
 
 def kill_one(run, rng, out):
     """Kill the run or one of its processes."""
-    if rng.random() < 0.5 and (young := children(run.pid)):
+    if rng.random() < 0.5 and (young := children(run.pid)[1:]):
         with suppress(ProcessLookupError):
             os.kill(rng.choice(young), signal.SIGKILL)
         return

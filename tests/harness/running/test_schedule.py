@@ -150,7 +150,10 @@ def test_each_block_says_what_it_is_before_it_starts():
     schedule = planned(repeats=2)
     list(schedule.blocks())
 
-    assert schedule.progress.said == ["f/p, tol 1e-06, 1", "f/p, tol 1e-06, 2"]
+    assert schedule.progress.said == [
+        "f/p, tol 1e-06, repeat 1",
+        "f/p, tol 1e-06, repeat 2",
+    ]
 
 
 def test_without_a_precision_there_are_the_repeats_of_the_suite():

@@ -412,6 +412,63 @@ def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monke
     assert all((tmp_path / path).is_file() for path in elsewhere)
 
 
+def folder_of_files(folder, monkeypatch, *, here=True):
+    """Write a suite beside some files; work there, or elsewhere."""
+    (folder / "set" / "more.qps").mkdir(parents=True)
+    (folder / "elsewhere").mkdir()
+    for name in ("b.qps", "a.qps", "c[1].qps", "d.txt", "more.qps/e.qps"):
+        (folder / "set" / name).write_text("")
+    monkeypatch.chdir(folder if here else folder / "elsewhere")
+
+
+def patterned(folder, path):
+    (folder / "s.toml").write_text(
+        HEAD + f'[[problems]]\nfamily = "stored"\nparams = {{ path = {path} }}\n'
+    )
+    stored = SimpleNamespace(
+        name="stored", defaults={"path": ""}, forms=("qp",), path_suffix=""
+    )
+    families = {"stored": as_family(SimpleNamespace(**vars(stored), build=None))}
+    return [
+        c.params["path"] for c in load_suite(folder / "s.toml", families, SOLVERS).cases
+    ]
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ('"set/*.qps"', ["set/a.qps", "set/b.qps", "set/c[1].qps"]),
+        ('["set/b*", "set/[a-b].qps"]', ["set/b.qps", "set/a.qps"]),
+        ('"set/c[1].qps"', ["set/c[1].qps"]),
+        ('"set/?.txt"', ["set/d.txt"]),
+        ('"set/*/*.qps"', ["set/more.qps/e.qps"]),
+    ],
+)
+def test_a_pattern_of_paths_is_the_files_that_match_sorted(
+    tmp_path, monkeypatch, path, expected
+):
+    folder_of_files(tmp_path, monkeypatch)
+
+    assert patterned(tmp_path, path) == expected
+
+
+def test_a_pattern_is_sought_beside_the_suite_too(tmp_path, monkeypatch):
+    folder_of_files(tmp_path, monkeypatch, here=False)
+
+    assert patterned(tmp_path, '"set/[ab].qps"') == ["../set/a.qps", "../set/b.qps"]
+
+
+def test_a_pattern_without_files_is_refused(tmp_path, monkeypatch):
+    folder_of_files(tmp_path, monkeypatch)
+
+    with pytest.raises(InputError) as e:
+        patterned(tmp_path, '["set/a.qps", "set/*.npz"]')
+    assert str(e.value) == (
+        f"{tmp_path}/s.toml: problems[0]: params.path = 'set/*.npz' matches no file; "
+        "expected a pattern of files, from here or from the folder of the suite"
+    )
+
+
 def test_the_suite_of_the_load_path_is_one_sequence_per_form():
     path = shipped("path")
 

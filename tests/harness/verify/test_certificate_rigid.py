@@ -317,7 +317,10 @@ def test_balance_is_not_sought_beyond_what_rounding_allows():
     assert (found == lam).all()
 
 
-@pytest.mark.parametrize("name", ["disc under rollers", "stiff disc"])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param("disc under rollers", marks=pytest.mark.slow), "stiff disc"],
+)
 def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
     """Contact pushes, but not where the answer says: that is no reason for a null."""
     mechanics, u, lam, _ = known(name)

@@ -222,7 +222,13 @@ CONVERGED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("problem", "u", "force", "active"), CONVERGED)
+@pytest.mark.parametrize(
+    ("problem", "u", "force", "active"),
+    [
+        pytest.param(*row, marks=pytest.mark.slow if " 40" in row[0] else ())
+        for row in CONVERGED
+    ],
+)
 def test_linearised_to_convergence_it_has_the_reference_values(
     problem, u, force, active
 ):
@@ -258,7 +264,9 @@ def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
     assert abs(tip(steps=1, relin=2) - exact) > errors[1]
 
 
-@pytest.mark.parametrize("basis", ["dual", "standard"])
+@pytest.mark.parametrize(
+    "basis", ["dual", pytest.param("standard", marks=pytest.mark.slow)]
+)
 def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
     def force(contact, Nr):
         given = dict(steps=1, relin=10, contact=contact, basis=basis)

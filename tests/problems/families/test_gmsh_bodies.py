@@ -11,12 +11,13 @@ from harness import InputError
 from harness.names import parse
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
-from problems.fem.mesh import nodal_lengths
+from problems.fem.mesh import Mesh, nodal_lengths
 from problems.models.beam_ring import model
 from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT
+from tests.support.triangles import halved
 
 NR, NH = 2, 1
 RING = model(NR, NH, 2, "strain")
@@ -49,6 +50,9 @@ force = [0, -1e8]
 slave = "outer"
 master = "bottom"
 """
+
+FLOATING = TOML.replace('[[supports]]\nboundary = "left"\nfix = ["x", "y"]\n', "")
+TOP = 'force = [0, 0]\n[[loads]]\nboundary = "top"\nforce = [0, -1e8]'
 
 
 def edges(chain):
@@ -162,6 +166,35 @@ def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, 
     np.testing.assert_array_equal(pair.master, expected.master)
 
 
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
+    quads, curves, spots = parts()
+    triangles = {
+        name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
+        for name, cells in quads.items()
+    }
+    given = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
+    (tmp_path / "m.msh").write_text(msh22(POINTS, given, curves, spots, quad_type=2))
+    read = read_msh(tmp_path / "m.msh")
+
+    for name, expected in triangles.items():
+        got = read.cells[read.surfaces[name]]
+        np.testing.assert_array_equal(np.sort(got[:, :3]), np.sort(expected))
+        np.testing.assert_array_equal(got[:, 3], got[:, 2])
+        (ax, ay), (bx, by) = (
+            (read.points[got[:, k]] - read.points[got[:, 0]]).T for k in (1, 2)
+        )
+        assert (ax * by > ay * bx).all()
+    whole = read_mesh_of_quads(tmp_path, quads, curves, spots)
+    for name, edge in whole.curves.items():
+        np.testing.assert_array_equal(read.curves[name], edge)
+
+
+def read_mesh_of_quads(tmp_path, *contents):
+    (tmp_path / "quads.msh").write_text(msh22(POINTS, *contents))
+    return read_msh(tmp_path / "quads.msh")
+
+
 @pytest.mark.parametrize(
     "keys", ["", "/step=1", "/contact=mortar", "/relin=2/plane=stress"]
 )
@@ -239,8 +272,7 @@ def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
 
 
 def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(described):
-    floating = TOML.replace('[[supports]]\nboundary = "left"\nfix = ["x", "y"]\n', "")
-    text = described(toml=floating)
+    text = described(toml=FLOATING.replace("force = [0, -1e8]", TOP))
 
     dual = build(f"{text}/steps=1/dual")
     assert dual.qp.b.size == 6
@@ -249,6 +281,52 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
         build(f"{text}/dual")
     with pytest.raises(InputError, match=r"dual-bounds does not exist"):
         build(f"{text}/steps=1/dual-bounds")
+
+
+@pytest.mark.parametrize(
+    ("load", "told"),
+    [
+        ("force = [0, -1e8]", "body 'beam': nothing balances the moment of its load"),
+        (f'{TOP}\n[[loads]]\nboundary = "left"\nforce = [-1e3, 0]', "beam"),
+    ],
+)
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_a_load_that_nothing_balances_is_named_before_solving(
+    described, load, told, form
+):
+    text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
+    with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
+        build(f"{text}/steps=1/{form}")
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"), [("mm", 1e-3), ("cm", 1e-2), ("in", 0.0254), ("m", 1.0)]
+)
+def test_a_mesh_in_another_unit_of_length_is_the_same_problem(described, unit, size):
+    ours = build(f"{described()}/step=1/dual-bounds")
+    inches = TOML.replace("steps = 2", f'steps = 2\nlength_unit = "{unit}"')
+    theirs = build(
+        f"{described(msh22(POINTS / size, *parts()), inches)}/step=1/dual-bounds"
+    )
+    s = reference_solution(ours.qp)
+
+    np.testing.assert_allclose(theirs.qp.P, ours.qp.P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(theirs.qp.q, ours.qp.q, rtol=1e-9, atol=1e-12)
+    assert theirs.quantities(s)["energy"] == pytest.approx(
+        ours.quantities(s)["energy"], rel=1e-9
+    )
+
+
+def test_a_modulus_in_megapascals_is_remarked_upon_and_a_rubber_is_not(described):
+    soft = build(f"{described(toml=TOML.replace('200e9', '210000'))}/step=1/primal")
+    (remark,) = soft.remarks
+
+    assert remark.startswith("a.toml: bodies[1]: E = 210000 Pa is softer than rubber;")
+    assert remark.endswith("if 210000 MPa is meant, write 2.1e+11")
+    assert build(f"{described(toml=TOML.replace('20e9', '1e6'))}/primal").remarks == ()
 
 
 def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
@@ -306,6 +384,8 @@ def test_nodes_of_no_cell_are_left_out(described):
         ("steps", "stops", "a.toml: unknown key 'stops'; did you mean 'steps'?"),
         ("steps = 2", "steps = 2.5", "a.toml: steps = 2.5; expected an integer"),
         ("steps = 2", 'plane = "bent"', "a.toml: unknown value of plane 'bent'"),
+        ("steps = 2", 'length_unit = "mn"', "a.toml: unknown length_unit 'mn'; did"),
+        ("steps = 2", "length_unit = 1e-3", "a.toml: length_unit = 0.001; expected"),
         ("steps = 2", "steps 2", "a.toml: line "),
         ('name = "ring"', 'name = "rink"',
          "a.toml: bodies[0]: name: unknown physical surface 'rink'; did you mean 'r"),
@@ -377,8 +457,15 @@ def bent(points):
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
-        (lambda p, c: (p, {"a": c[:, :3]}, {}, {}, 2), "cells of type triangle; expec"),
-        (lambda p, c: (p, {"": c}, {}, {}), "4 quadrilaterals without a name"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0, 1]]}, {}, {}, 9),
+         "cells of type triangle6; expected cells of first order: Mesh.ElementOrder = 1"
+         " in the .geo file, or gmsh -2 -order 1"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3] * 2]}, {}, {}, 16),
+         "cells of type quad8; expected cells of first order: Mesh.ElementOrder = 1"),
+        (lambda p, c: (p, {"a": c}, {}, {}, 4), "cells of type tetra; expected plane"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
+        (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
+         ' named surface: Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),

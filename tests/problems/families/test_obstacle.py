@@ -174,7 +174,9 @@ def test_the_exact_energy_over_the_hemisphere_is_that_of_the_exact_height():
     assert energy == pytest.approx(exact_energy(2, "hemisphere"), rel=1e-4)
 
 
-@pytest.mark.parametrize("form", ["primal", "dual-bounds"])
+@pytest.mark.parametrize(
+    "form", ["primal", pytest.param("dual-bounds", marks=pytest.mark.slow)]
+)
 def test_over_the_hemisphere_it_converges_with_second_order(form):
     got = []
     for n in (16, 32, 64):

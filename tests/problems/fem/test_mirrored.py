@@ -65,7 +65,9 @@ def results(bodies, primal, form):
     s = SMALBE().prepare(case.qp, 1e-12)()
     found = dict(case.quantities(s))
     (push, found["up"]), stress = found.pop("contact_force"), found.pop("max_von_mises")
+    (pair,) = found.pop("contacts").values()
     found |= stress | {
+        "pressure": pair["largest_pressure"],
         "sideways": abs(push),
         "objective": case.scale * case.qp.objective(s.x) + case.constant,
     }

@@ -1,7 +1,9 @@
 """QPs from files: what is read is the QP that was written down."""
 
+import gzip
 import json
 import re
+from dataclasses import replace
 
 import highspy
 import numpy as np
@@ -9,14 +11,15 @@ import pytest
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, vstack
 
-from harness import InputError, kkt_residuals
-from harness.files.qpfile import load_qp, save_qp
+from harness import QP, InputError, kkt_residuals
+from harness.files.qpfile import explicit_matrices, load_qp, save_qp
 from harness.names import assemble, parse
 from harness.registry import SolverSpec, resolve
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from problems import PROBLEMS
-from problems.files.qps import parse_qps
+from problems.files.qps import parse_qps, save_qps
+from problems.files.readers import read
 from problems.files.two_sided import one_sided
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -145,6 +148,108 @@ def test_highs_reads_the_same_qp(tmp_path, section):
             given.lb, given.ub, given.r)  # fmt: skip
     for mine, theirs in zip(ours, highs_reads(path), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+def awkward(rng, n=7, *, symmetric=True):
+    """Every kind of bound, an empty row and column, numbers of 17 and of few digits."""
+    P = rng.standard_normal((n, n))
+    P = P @ P.T
+    P[:, -1] = P[-1] = 0
+    if not symmetric:
+        P[0, 1] *= 1 + 2**-50
+    A, G = (np.where(rng.random((3, n)) < 0.5, rng.standard_normal((3, n)), 0)
+            for _ in range(2))  # fmt: skip
+    A[0] = A[:, -1] = G[:, -1] = 0
+    inf = np.inf
+    return QP(
+        P=csc_array(P), q=np.append(rng.standard_normal(n - 1), 0), A=csr_array(A),
+        b=np.array([0.0, 1e-300, -0.1]), G=csr_array(G),
+        h=np.array([0.0, 1 / 3, -1e19]),
+        lb=np.array([0, -inf, -inf, 0.1, -2.0, 1.5, -inf]),
+        ub=np.array([inf, inf, -3.0, inf, -1.0, 1.5, 0.0]),
+    )  # fmt: skip
+
+
+def of_symmetric_part(qp):
+    """The same QP: no objective depends on the rest of P."""
+    M = {name: csc_array(M) for name, M in explicit_matrices(qp)[0].items()}
+    return replace(qp, **{**M, "P": csc_array((M["P"] + M["P"].T) / 2)}, structure=None)
+
+
+def test_an_exported_qps_comes_back_to_the_last_digit(tmp_path):
+    qp = awkward(np.random.default_rng(31))
+    save_qps(tmp_path / "a.qps", qp, {"name": "a case", "two": "lines\nof it"})
+    back, scale, constant = read(tmp_path / "a.qps")
+
+    assert_same(qp, back)
+    assert (scale, constant) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+def test_the_export_of_a_case_as_qps_is_its_qp(written, command, form):
+    assert command("export", f"{SMALL}/{form}", "a.qps")[0] == 0
+    qp = build(f"{SMALL}/{form}").qp
+    back = build("file:a.qps").qp
+
+    assert_same(of_symmetric_part(qp), back)
+
+
+def test_highs_reads_an_exported_qps(tmp_path):
+    """Also where P is symmetric up to rounding only."""
+    qp = awkward(np.random.default_rng(32), symmetric=False)
+    save_qps(tmp_path / "a.mps", qp, {})
+    qp = of_symmetric_part(qp)
+    P, rows, q, low, high, lb, ub, constant = highs_reads(tmp_path / "a.mps")
+
+    np.testing.assert_allclose(P, qp.P.toarray(), rtol=1e-15)
+    np.testing.assert_array_equal(rows, np.vstack([qp.A.toarray(), qp.G.toarray()]))
+    for mine, theirs in [
+        (qp.q, q), (qp.lb, lb), (qp.ub, ub), (np.append(qp.b, qp.h), high),
+        (np.append(qp.b, np.full(3, -np.inf)), low), (0.0, constant),
+    ]:  # fmt: skip
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_what_qps_would_take_for_infinite_is_not_written(tmp_path):
+    qp = replace(awkward(np.random.default_rng(33)), h=np.array([0.0, 1.0, 1e20]))
+
+    with pytest.raises(
+        InputError, match=r"h holds 1e\+20, and QPS takes what is 1e\+20"
+    ):
+        save_qps(tmp_path / "a.qps", qp, {})
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize("name", ["a.qps", "a.MPS", "a.mat"])
+def test_a_compressed_file_is_the_file(written, tmp_path, name):
+    content = {
+        "P": np.eye(2),
+        "q": [1.0, 2.0],
+        "A": np.eye(2),
+        "l": [0, 0],
+        "u": [1, 1],
+    }
+    written(content if name == "a.mat" else QPS, name)
+    plain = (tmp_path / name).read_bytes()
+    (tmp_path / f"{name}.gz").write_bytes(
+        gzip.compress(plain[:99]) + gzip.compress(plain[99:])
+    )
+
+    assert_same(build(f"file:{name}").qp, build(f"file:{name}.gz").qp)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a.npz.gz", "a.npz.gz: .npz.gz is not read; expected .qps.gz or .mps.gz or "),
+        ("a.gz", "a.gz: .gz is not read; expected .qps.gz or "),
+        ("a.csv", "a.csv: unknown format '.csv'; "),
+    ],
+)
+def test_what_is_no_format_compressed_or_not_is_refused(written, name, message):
+    with pytest.raises(InputError) as e:
+        build(written("", name))
+    assert str(e.value).startswith(message)
 
 
 def test_the_name_of_a_set_may_be_left_out():
@@ -434,7 +539,8 @@ def test_unknown_formats_of_an_export_are_refused_with_those_there_are(
 
     assert code == 2
     assert err == (
-        "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet\n"
+        "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet "
+        "or .qps\n"
     )
 
 

@@ -193,12 +193,13 @@ def test_one_repeat_in_each_folder_names_no_change_of_a_cell(changed):
     assert side(mean_ratio(c.of("two"))) == 1  # over twelve cells it can be told
 
 
-def test_only_repeats_that_both_have_are_paired(changed):
+def test_all_repeats_of_both_count_since_nothing_pairs_two_sessions(changed):
     before = [record(repeat=i) for i in range(3)]
     after = [record(repeat=i, total_seconds=0.02) for i in range(1, 5)]
     pair = only(changed(before, after))
 
-    assert pair.ratio.pairs == 2
+    assert pair.ratio.pairs == 3
+    assert not pair.ratio.paired
     assert pair.ratio.value == pytest.approx(2)
 
 

@@ -1,12 +1,15 @@
 """From records to the sections on means, ranks, profiles, ratios, growth and claims."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
 from harness import Record, Verdict
 from harness.results.journal import Journal
+from harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 from reports import write_report
 from reports.data.aggregation import ranking_of
 from reports.data.comparison_groups import comparison_groups
@@ -69,10 +72,90 @@ def some_records(record, solvers, cases=6):
 # ---- what is compared
 
 
-def test_fewer_than_six_cases_or_one_solver_make_no_statement(record, evidence):
-    for few in (some_records(record, 3, cases=5), some_records(record, 1)):
-        page = compose(evidence(few))
-        assert not {"means", "ranking", "profiles"} & {s.name for s in page.sections}
+OVER_CASES = ("means", "ranking", "profiles")
+
+
+def over_cases(page):
+    """The sections over cases, all of which are there."""
+    found = {s.name: s for s in page.sections}
+    return [found[name] for name in OVER_CASES]
+
+
+@pytest.mark.parametrize(
+    ("solvers", "cases", "said"),
+    [(3, 5, "dual, tol 1e-6: 5 cases."), (1, 6, "dual, tol 1e-6: 1 solver.")],
+)
+def test_fewer_than_six_cases_or_one_solver_make_no_statement_and_it_is_said(
+    record, evidence, solvers, cases, said
+):
+    page = compose(evidence(some_records(record, solvers, cases=cases)))
+    for section in over_cases(page):
+        assert (section.tables, section.pictures) == ((), ())
+        (text,) = section.prose
+        assert text.startswith(f"Nothing is compared here: {said} At least 6 cases of")
+        assert "--pool-forms" not in text
+
+
+def of_two_forms(record, primal):
+    """Three dual cases and some primal ones; b takes three times as long as a."""
+    return [
+        record(s, case, seconds, form=form)
+        for s, seconds in (("a", 0.1), ("b", 0.3))
+        for form, count in (("dual", 3), ("primal", primal))
+        for case in range(count)
+    ]
+
+
+def test_forms_with_few_cases_are_named_with_how_to_put_them_together(record, evidence):
+    for section in over_cases(compose(evidence(of_two_forms(record, 3)))):
+        (text,) = section.prose
+        assert "dual, tol 1e-6: 3 cases; primal, tol 1e-6: 3 cases." in text
+        assert '"mortarbench report DIR --pool-forms"' in text
+
+
+def test_a_form_that_is_left_out_is_named_beside_those_that_are_compared(
+    record, evidence
+):
+    for section in over_cases(compose(evidence(of_two_forms(record, 6)))):
+        assert len(section.tables) == 1
+        assert section.prose[-1].startswith("Not compared here: dual, tol 1e-6: 3 case")
+
+
+def test_pooled_forms_are_cases_of_one_group(record, evidence):
+    """Equal times on all cases have that mean, whatever the forms."""
+    page = compose(evidence(of_two_forms(record, 3)), pool_forms=True)
+    for section in over_cases(page):
+        assert len(section.tables) == 1
+    table = over_cases(page)[0].tables[0]
+    assert "all forms, tol 1e-6: 6 cases" in table.caption
+    assert "Forms together: dual 3 cases, primal 3 cases." in table.legend
+    assert [row[3].value for row in table.rows] == pytest.approx([0.1, 0.3])
+    assert not any("--pool-forms" in text for s in page.sections for text in s.prose)
+
+
+def test_a_form_that_a_solver_declines_is_unsolved_by_it_where_forms_are_pooled(
+    record, evidence
+):
+    records = [
+        r for r in of_two_forms(record, 3) if (r.solver, r.form) != ("b", "dual")
+    ]
+    records += [
+        record("b", case, None, form="dual", verdict=Verdict.DECLINED, claimed=None)
+        for case in range(3)
+    ]
+    (found,) = comparison_groups(evidence(records), pool_forms=True)
+    assert found.solved.sum(axis=0).tolist() == [6, 3]
+    assert dict(found.forms) == {"dual": 3, "primal": 3}
+
+
+def test_what_a_report_does_not_show_is_named_with_what_it_needs(record, evidence):
+    page = compose(evidence(some_records(record, 2)))
+    (absent,) = (s for s in page.sections if s.name == "absent")
+    shown = {s.title for s in page.sections}
+    missing = {point.partition(":")[0] for point in absent.points}
+    assert "Ratios within blocks" in missing
+    assert not shown & missing
+    assert {s.name for s in page.sections[-2:]} == {"environment", "definitions"}
 
 
 def test_forms_tolerances_and_modes_are_compared_apart(record, evidence):
@@ -277,7 +360,7 @@ def test_the_sections_render(record, evidence):
 # ---- pictures
 
 
-@pytest.mark.parametrize("count", [2, 7, 20, 50])
+@pytest.mark.parametrize("count", [2, 7, 20, pytest.param(50, marks=pytest.mark.slow)])
 def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
     records = [
         record(f"s{k:02d}", case, (1 + (k % 6) + k / 100) * 0.01 * (case + 1))
@@ -420,7 +503,7 @@ def test_one_refuted_repeat_refutes_the_claim(record, evidence):
 # ---- the whole way
 
 
-def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
+def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path, svg_only):
     names = (
         "<script>x</script>",
         r"\input{a}$^_#&%",
@@ -435,11 +518,12 @@ def test_hostile_names_reach_no_markup_and_bytes_repeat(record, tmp_path):
                 for case in range(6):
                     journal.append(record(name, case, 0.01 * (k + 1), form=names[0]))
         (folder / "suite.toml").write_text('name = "hostile"')
-        written.append(write_report(folder, ["html", "md", "tex", "csv"]))
+        with svg_only():
+            written.append(write_report(folder, ["html", "md", "tex", "csv"]))
     one, two = ({p.name: p.read_bytes() for p in paths} for paths in written)
     assert one == two
     assert {"means.tex", "ranking.tex", "contests.csv", "profiles-1.svg",
-            "pairwise-1.pdf"} <= set(one)  # fmt: skip
+            "pairwise-1.svg"} <= set(one)  # fmt: skip
     assert b"<script>x" not in one["index.html"] + one["report.md"]
     for name in ("means.tex", "ranking.tex", "profiles.tex", "tally.tex"):
         for line in one[name].decode().splitlines()[1:]:
@@ -478,3 +562,70 @@ def test_the_sheet_of_means_holds_every_convention(record, evidence):
     assert usual["rank"].tolist() == [1, 2, 3]
     assert usual["tier"].tolist() == [1, 2, 3]
     assert (usual["ratio_low"] <= usual["ratio"]).all()
+
+
+# sessions
+
+
+def of_two_sessions(record, factor, scatter=0.002, cases=8):
+    """Measure b beside a, and c in another session; both take `factor` as long."""
+    rng = np.random.default_rng(577215)
+    return [
+        record(
+            s, k, 1e-3 * 2.0**k * time * rng.lognormal(0, scatter), i,
+            session="late" if s == "c" else "early",
+        )
+        for s, time in (("a", 1.0), ("b", factor), ("c", factor))
+        for k in range(cases)
+        for i in range(3)
+    ]  # fmt: skip
+
+
+def test_of_different_sessions_only_what_intervals_tell_on_every_case_is_ranked(
+    evidence, record
+):
+    for factor, told in ((1.1, True), (1.0015, False)):
+        (group,) = comparison_groups(evidence(of_two_sessions(record, factor)))
+        faster = ranking_of(group).faster
+        assert group.solvers == ("a", "b", "c")
+        assert group.apart.tolist() == [
+            [False, False, True], [False, False, True], [True, True, False],
+        ]  # fmt: skip
+        assert faster[0, 2] == told
+        assert not faster[2, 0]
+    together = [replace(r, session="") for r in of_two_sessions(record, 1.0015)]
+    (group,) = comparison_groups(evidence(together))
+    assert group.apart.size == 0
+
+
+def test_who_was_measured_in_another_session_is_named_and_marked(evidence, record):
+    said = markdown(compose(evidence(of_two_sessions(record, 1.1))))
+
+    assert (
+        "told apart only where the unpaired interval excludes 1 on every case: c"
+        in (" ".join(said.split()))
+    )
+    assert "n = 8, other session" in said
+    assert said.count("unpaired") >= 8
+
+
+def test_what_a_sequence_took_in_two_sessions_is_paired_with_nothing_else():
+    a, b = {("s", 0): 1.0, ("s", 1): 1.1}, {("s", 0): 2.0, ("s t", 1): 2.2}
+
+    assert paired_ratio(a, b) is None
+    assert not ratio_of(a, b).paired
+
+
+def test_an_unpaired_interval_is_welchs():
+    """Against scipy's, on samples of different scatter and number."""
+    rng = np.random.default_rng(16180)
+    a, b = rng.lognormal(0.2, 0.1, 5), rng.lognormal(0, 0.3, 9)
+    expected = ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.9)
+    found = unpaired_ratio(a, b, 0.9)
+
+    assert np.log([found.low, found.high]) == pytest.approx(
+        [expected.low, expected.high]
+    )
+    assert found.value == pytest.approx(np.exp(np.log(a).mean() - np.log(b).mean()))
+    assert unpaired_ratio(a[:1], b) is None
+    assert unpaired_ratio([1.0, 1.0], [2.0, 2.0]) == (0.5, 0.5, 0.5, 2, False)

@@ -1,12 +1,14 @@
 """VTU files, read back by meshio and by an XML parser."""
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import meshio
 import numpy as np
+import pandas as pd
 import pytest
 
-from harness import Fields, InputError
+from harness import ContactSide, Fields, InputError
 from harness.files.qpfile import save_qp
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
@@ -49,6 +51,19 @@ def test_cells_know_their_body(grid):
     np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
 
 
+def test_triangles_are_triangles_with_their_bodies(tmp_path):
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
+    write_vtu(
+        replace(FIELDS, cells=cells, bodies=np.array([3, 4, 5])), tmp_path / "a.vtu"
+    )
+    grid = meshio.read(tmp_path / "a.vtu")
+
+    assert [block.type for block in grid.cells] == ["triangle", "quad"]
+    np.testing.assert_array_equal(grid.cells[0].data, cells[1:, :3])
+    np.testing.assert_array_equal(grid.cells[1].data, cells[:1])
+    assert [body.tolist() for body in grid.cell_data["body"]] == [[4, 5], [3]]
+
+
 def test_contact_is_a_force_and_a_flag_without_gaps_elsewhere(grid):
     force, flag = grid.point_data["contact_force"], grid.point_data["in_contact"]
 
@@ -78,7 +93,13 @@ def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path)
     write_vtu(case.fields(s), tmp_path / "a.vtu")
     data = meshio.read(tmp_path / "a.vtu").point_data
 
-    assert all(np.isfinite(values).all() for values in data.values())
+    side = np.isfinite(data["gap"])
+    assert side.sum() == case.qp.q.size  # one row for each slave node
+    assert all(np.isfinite(values).all() for k, values in data.items() if k != "gap")
+    assert not data["pressure"][~side].any()
+    found = case.quantities(s)["contacts"]["ring on beam"]
+    assert data["pressure"].max() == found["largest_pressure"]
+    assert data["gap"][side].min() == found["smallest_gap"]
     assert data["in_contact"].sum() == case.quantities(s)["active"]
     # on the ring, so opposite to what the beam gets
     on_beam = case.quantities(s)["contact_force"]
@@ -86,6 +107,41 @@ def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path)
         data["contact_force"].sum(axis=0)[:2], np.negative(on_beam)
     )
     np.testing.assert_allclose(data["displacement"][:, :2].ravel(), case.recover(s))
+
+
+SIDE = ContactSide(
+    name="disc on a/b (2)", nodes=np.array([3, 2, 7]), length=np.array([0.5, 1.0, 0.5]),
+    force=np.array([[0.0, -3e5], [1e-3, -0.1], [0.0, 0.0]]),
+    pressure=np.array([6e5, 0.1, 0.0]), gap=np.array([-1e-18, 0.25, np.nan]),
+)  # fmt: skip
+
+
+def test_each_contact_is_a_table_beside_the_grid(tmp_path):
+    written = write_vtu(replace(FIELDS, contacts=(SIDE,)), tmp_path / "a.vtu")
+    table = pd.read_csv(tmp_path / "a-disc-on-a-b-2.csv")
+
+    assert written == [tmp_path / "a.vtu", tmp_path / "a-disc-on-a-b-2.csv"]
+    assert table.along_m.tolist() == [0, 1, 1 + np.sqrt(5)]
+    assert table.pressure_Pa.tolist() == SIDE.pressure.tolist()
+    assert table.gap_m[:2].tolist() == SIDE.gap[:2].tolist()
+    assert table.gap_m.isna().tolist() == [False, False, True]
+    np.testing.assert_array_equal(
+        table[["force_x_N_per_m", "force_y_N_per_m"]], SIDE.force
+    )
+    np.testing.assert_array_equal(table[["x_m", "y_m"]], FIELDS.points[SIDE.nodes])
+
+
+def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_path):
+    other = replace(
+        SIDE, name="b on c", pressure=np.array([0.0, 7.0, 0.0]),
+        gap=np.array([0.5, np.nan, np.nan]),
+    )  # fmt: skip
+    write_vtu(replace(FIELDS, contacts=(SIDE, other)), tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+
+    assert data["pressure"].tolist() == [0, 0, 7.0, 6e5, 0, 0, 0, 0]
+    np.testing.assert_array_equal(data["gap"][[3, 2]], [-1e-18, 0.25])
+    assert np.isnan(data["gap"]).sum() == 6
 
 
 @pytest.fixture
@@ -131,6 +187,7 @@ def test_a_series_names_its_files_and_times_next_to_it(tmp_path):
     assert written[0] == path
     assert [float(s.get("timestep")) for s in sets] == [0.5, 1.0]
     assert [tmp_path / s.get("file") for s in sets] == written[1:]
+    assert len(written) == 3
     for file in written[1:]:
         assert len(meshio.read(file).points) == 8
 

@@ -1,6 +1,7 @@
 """Pictures of two rectangles: what is drawn is where and what the fields say."""
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,11 +10,17 @@ from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure as Canvas
 from matplotlib.quiver import Quiver
 
-from harness import Fields, InputError
-from reports.document.fields import FieldFigure, FieldPanel, Polygons
+from harness import ContactSide, Fields, InputError
+from reports.document.fields import (
+    ColourField,
+    FieldFigure,
+    FieldPanel,
+    Label,
+    Polygons,
+)
 from reports.document.figure import Axis, Figure, Panel, Row, Series
 from reports.document.layout import Page, Picture, Section
-from reports.figures.deformed import deformed_figure, outlines
+from reports.figures.deformed import deformed_figure, edges, outlines, triangles
 from reports.figures.style import look
 from reports.render.saving import ENDINGS, draw, save, save_all
 from reports.render.svg import inline
@@ -145,6 +152,84 @@ def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
     tails = arrows.XY
     assert ((x0 < tails[:, 0]) & (tails[:, 0] < x1)).all()
     assert ((y0 < tails[:, 1]) & (tails[:, 1] < y1)).all()
+
+
+def side(name, nodes, forces):
+    """One contact, as loaded."""
+    forces = np.array(forces, dtype=float)
+    ones = np.ones(len(forces))
+    return ContactSide(
+        name=name, nodes=np.array(nodes), length=ones, force=forces, pressure=ones,
+        gap=0 * ones,
+    )  # fmt: skip
+
+
+def test_each_contact_that_carries_load_has_a_window_with_its_own_forces(bodies):
+    pairs = (
+        side("up on low", [4, 5], [[0, 0], [0, -3e6]]),
+        side("idle", [8, 9], [[0, 0], [0, 0]]),
+        side("low on floor", [0, 1], [[0, 5e3], [0, 4e3]]),
+    )
+    figure = deformed_figure(replace(bodies, contacts=pairs))
+    titles = [panel.title for panel in figure.panels]
+    arrows = [p.marks[-1] for p in figure.panels[1:]]
+
+    assert titles[0].startswith("(a) ")
+    assert titles[1].startswith("(b) up on low: contact forces")
+    assert titles[1].endswith("the largest is 3 MN/m")
+    assert titles[2].startswith("(c) low on floor: contact forces")
+    assert len(figure.panels) == len(figure.heights) == 3
+    assert [len(a.feet) for a in arrows] == [1, 2]
+    framed = [m.text for m in figure.panels[0].marks if isinstance(m, Label)]
+    assert framed == ["(b)", "(c)"]
+    for panel, pair in zip(figure.panels[1:], (pairs[0], pairs[2]), strict=True):
+        loaded = pair.nodes[np.abs(pair.force[:, 1]) > 0]
+        tips = (bodies.points + bodies.displacement)[loaded]
+        assert (tips >= panel.low).all()
+        assert (tips <= panel.high).all()
+
+
+def test_the_scale_is_that_of_the_displacement(bodies):
+    there = deformed_figure(bodies, 4.0).panels[0]
+    (field, *_) = (m for m in there.marks if isinstance(m, ColourField))
+
+    np.testing.assert_allclose(field.points, bodies.points + 4 * bodies.displacement)
+    assert "displacement × 4;" in there.title
+
+
+def test_contacts_are_enlarged_as_they_are_whatever_the_scale_of_the_whole(bodies):
+    """Where displacements are multiplied, bodies in contact overlap."""
+    one, four = (deformed_figure(bodies, scale).panels[1] for scale in (1.0, 4.0))
+
+    assert (one.low, one.high) == (four.low, four.high)
+    np.testing.assert_array_equal(one.marks[-1].feet, four.marks[-1].feet)
+    assert one.title.startswith("(b) contact forces")
+    assert four.title.startswith("(b) displacement × 1: contact forces")
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "name"),
+    [(1.0, 1.0, "m"), (0.05, 1e-3, "mm"), (5e-5, 1e-6, "µm"), (1e-9, 1e-6, "µm")],
+)
+def test_axes_number_lengths_in_a_unit_of_their_size(bodies, size, unit, name):
+    small = replace(
+        bodies, points=size * bodies.points / 2, displacement=0 * bodies.displacement
+    )
+    (panel, *_) = deformed_figure(small).panels
+
+    assert panel.unit == unit
+    assert panel.xlabel == f"$x$ in {name}"
+
+
+def test_triangles_are_drawn_once_and_without_sides_of_no_length():
+    cells = np.array([[0, 1, 2, 2], [0, 2, 3, 3], [3, 2, 4, 5]])
+
+    assert sorted(map(sorted, triangles(cells).tolist())) == [
+        [0, 1, 2], [0, 2, 3], [2, 3, 4], [3, 4, 5],
+    ]  # fmt: skip
+    assert len(edges(cells)) == 8
+    (loop,) = outlines(cells)
+    assert sorted(loop[:-1]) == [0, 1, 2, 3, 4, 5]
 
 
 def test_without_contact_forces_there_is_one_panel(bodies):

@@ -90,11 +90,24 @@ EXACT = {
 }
 
 
+def seeds(first, few, all_):
+    """Give so many seeds by default, and the others to a slow test."""
+    return pytest.mark.parametrize(
+        "seeds",
+        [
+            range(first, first + few),
+            pytest.param(range(first + few, first + all_), marks=pytest.mark.slow),
+        ],
+        ids=["few", "more"],
+    )
+
+
+@seeds(0, 2, 5)
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize("kind", EXACT.values(), ids=EXACT)
-def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense):
+def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense, seeds):
     """A component that is not zero has all of its digits."""
-    for seed in range(5):
+    for seed in seeds:
         qp, x, X = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
 
@@ -103,6 +116,7 @@ def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense):
         assert kkt_residuals(qp, s).worst <= 1e-13
 
 
+@seeds(11, 2, 6)
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize(
     "kind",
@@ -114,8 +128,8 @@ def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense):
     ],
     ids=["singular P", "singular P, repeated rows", "no P", "no P, repeated rows"],
 )
-def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense):
-    for seed in range(11, 17):
+def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense, seeds):
+    for seed in seeds:
         qp, x, _ = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
 
@@ -224,7 +238,11 @@ def test_energies_known_by_hand_are_reached(name, given, form, energy):
 
 
 @pytest.mark.parametrize(
-    ("steps", "tip", "force"), [(1, -0.303750, 0.0), (10, -0.297282, -2.840e7)]
+    ("steps", "tip", "force"),
+    [
+        pytest.param(1, -0.303750, 0.0, marks=pytest.mark.slow),
+        (10, -0.297282, -2.840e7),
+    ],
 )
 def test_the_beam_sinks_by_what_a_prototype_found(steps, tip, force):
     """Nr = 20, Nh = 10; the load in one or ten linearisations; 11 844 displacements."""

@@ -1,0 +1,83 @@
+"""The entries of an environment as people call them, and what differs in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from harness.errors import shortened
+
+Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
+
+_MOST = 48  #: characters of a value
+_TOLD = 3  #: differences
+
+_NAMES = {
+    "machine.cpu": "processor",
+    "machine.physical_cores": "physical cores",
+    "machine.logical_cores": "logical cores",
+    "machine.usable_cores": "usable cores",
+    "machine.cpu_limit": "cores that the container may use",
+    "machine.memory_mib": "memory in MiB",
+    "machine.architecture": "architecture",
+    "machine.system": "operating system",
+    "machine.kernel": "kernel",
+    "machine.libc": "C library",
+    "machine.virtual": "virtual machine",
+    "machine.governor": "frequency governor",
+    "machine.turbo": "turbo frequencies",
+    "machine.smt": "hyper-threading",
+    "machine.shared_by_workers": "Dask workers that share the machine",
+    "source": "the checkout that mortarbench runs from",
+    "source.commit": "commit of mortarbench",
+    "source.dirty": "code that differs from the commit",
+    "source.changes": "digest of that code",
+    "plugins": "plug-ins",
+    "threads.pools": "libraries with threads",
+    "cholmod.version": "version of CHOLMOD",
+    "cholmod.blas": "BLAS behind CHOLMOD",
+}
+_GROUPS = {
+    "versions.": "version of {}",
+    "plugins.": "content of the plug-in {}",
+    "threads.variables.": "the variable {}",
+}
+
+
+def named(key: str) -> str:
+    """Name an entry of an environment, given as a dotted key, for people."""
+    for group, text in _GROUPS.items():
+        if key.startswith(group):
+            return text.format(key.removeprefix(group))
+    return _NAMES.get(key, key)
+
+
+def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
+    """Say what differs: "processor: A then, B now; kernel: 6.1 then, 6.2 now".
+
+    The first few differences are told, and how many more there are.
+
+    one, other : when, or where, the one and the other was found, as "then" and "now"
+    """
+    told = [
+        f"{named(key)}: {_shown(a)} {one}, {_shown(b)} {other}"
+        if _is_short(a) and _is_short(b)
+        else f"other {named(key)}"
+        for key, a, b in changes
+    ]
+    rest = [f"and {len(told) - _TOLD} more"] * (len(told) > _TOLD)
+    return "; ".join([*told[:_TOLD], *rest])
+
+
+def _is_short(value: Any) -> bool:
+    return not isinstance(value, Mapping | list | tuple)
+
+
+def _shown(value: Any) -> str:
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return "yes" if value else "no"
+        case _:
+            return shortened(str(value), _MOST)

@@ -1,0 +1,137 @@
+"""A worker that is a fork of the process that asks it, in place of a new interpreter.
+
+To load numpy and scipy takes a process half a second of CPU time, and a fork has them
+already. Like a worker that is started by its command it lives below a sub-reaper
+(`harness.processes.reaper`), in a session of its own, on one CPU, and has no open files
+but its log and its two pipes. Two things differ:
+
+* It begins with a copy of our memory. So it is forked before anything is read or built,
+  and only where nothing runs beside us, see `is_safe`.
+* `/proc/PID/environ` is ours, which does not have the mark that names its tree. In its
+  place this process becomes a sub-reaper, too: what a solver leaves, even when it has
+  killed the sub-reaper above it, is below us.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
+from typing import BinaryIO
+
+from harness.processes import reaper
+
+#: what a worker does with the two file descriptors of its requests and its replies
+Serve = Callable[[int, int], None]
+
+_POLL_SECONDS = 0.001
+
+
+def is_safe() -> bool:
+    """Whether this process may fork: it has one thread, and no children.
+
+    Locks that other threads hold would stay locked in the fork. Children would pass for
+    what a solver has left.
+    """
+    return len(os.listdir("/proc/self/task")) == 1 and not reaper.descendants(
+        os.getpid()
+    )
+
+
+class Fork:
+    """The sub-reaper above a forked worker: what is used of a `subprocess.Popen`."""
+
+    def __init__(self, pid: int, stdin: BinaryIO) -> None:
+        self.pid = pid
+        self.stdin = stdin  #: its tree is killed when this is closed, or we are dead
+
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until it has ended.
+
+        Raises
+        ------
+        subprocess.TimeoutExpired
+            When it has not after `timeout` seconds.
+
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with suppress(ChildProcessError):  # it was collected with its tree
+            while os.waitpid(self.pid, os.WNOHANG)[0] == 0:
+                if deadline is not None and time.monotonic() > deadline:
+                    raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
+                time.sleep(_POLL_SECONDS)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
+    def end_orphans(self) -> None:
+        """End what came to be below us because the sub-reaper was killed."""
+        reaper.end_all(os.getpid(), spared=(self.pid,))
+        _adopt(False)
+
+
+def fork(
+    serve: Serve,
+    *,
+    cpu: int,
+    pipes: tuple[int, int],
+    log: int,
+    environment: Mapping[str, str],
+) -> Fork:
+    """Start a worker; the caller has seen that it `is_safe`.
+
+    cpu, pipes : as of `reaper.supervise`; the pipes are those that `serve` is given
+    log : a file descriptor, its standard output and error
+    environment : variables that differ from ours
+    """
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        stream.flush()  # or the fork would write it once more
+    theirs, ours = os.pipe()
+    _adopt(True)
+    pid = os.fork()
+    if pid:
+        os.close(theirs)
+        return Fork(pid, os.fdopen(ours, "wb"))
+    try:
+        os.setsid()
+        _keep_open(theirs, log, pipes)
+        os.environ.update(environment)
+        reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)
+    finally:  # whatever happens: only the parent goes back to where it came from
+        os._exit(1)
+
+
+def _keep_open(stdin: int, log: int, pipes: tuple[int, int]) -> None:
+    for fd, at in ((stdin, 0), (log, 1), (log, 2)):
+        os.dup2(fd, at)
+    for fd in map(int, os.listdir("/proc/self/fd")):
+        if fd > 2 and fd not in pipes:
+            with suppress(OSError):  # that of the list itself
+                os.close(fd)
+
+
+def _serve(serve: Serve, pipes: tuple[int, int]) -> None:
+    code = 1
+    try:
+        serve(*pipes)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with suppress(Exception):
+            sys.stdout.flush()
+        os._exit(code)
+
+
+def _adopt(orphans: bool) -> None:
+    """Become the parent of orphaned descendants, or no longer."""
+    ctypes.CDLL(None).prctl(reaper.PR_SET_CHILD_SUBREAPER, int(orphans), 0, 0, 0)

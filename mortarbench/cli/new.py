@@ -1,0 +1,49 @@
+"""The command `new`: a solver, a problem or a suite to start from."""
+
+from __future__ import annotations
+
+import re
+from argparse import Namespace
+from collections.abc import Mapping
+from pathlib import Path
+
+from harness.errors import InputError, say, shown
+from mortarbench.registries import Registries
+
+_TEMPLATES = Path(__file__).parents[1] / "templates"
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+#: what to do with the file first
+_NEXT = {
+    "solver": "mortarbench test-solver {0} --plugin {0}.py",
+    "problem": "mortarbench solve {0}/primal --solver clarabel --plugin {0}.py",
+    "suite": "mortarbench run {0}.toml",
+}
+
+
+def run(registries: Registries, options: Namespace) -> int:
+    """Write NAME.py or NAME.toml into this folder, unless there is one."""
+    kind, name = options.kind, options.name
+    if not _NAME.fullmatch(name):
+        raise InputError(
+            f"name {shown(name)}; expected letters, digits, '-' and '_', a letter first"
+        )
+    taken: Mapping[str, object] = {
+        "solver": registries.solvers,
+        "problem": registries.families,
+        "suite": {path.stem: path for path in registries.suites.glob("*.toml")},
+    }[kind]
+    if name in taken:
+        raise InputError(f"there is a {kind} {name!r}; expected a name of its own")
+    (template,) = _TEMPLATES.glob(f"{kind}.*")
+    path = Path(f"{name}{template.suffix}")
+    text = re.sub(r"\bNAME\b", name, template.read_text("utf-8"))
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise InputError(
+            f"{path} exists; expected another name, or no such file"
+        ) from None
+    print(path)
+    say(f"try it: {_NEXT[kind].format(name)}")
+    return 0

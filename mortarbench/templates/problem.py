@@ -1,0 +1,61 @@
+"""A family of problems to start from: replace the mathematics of `build`, and the keys.
+
+    mortarbench solve NAME/n=100/primal --solver clarabel --plugin NAME.py
+
+It is called NAME in suites, and its cases NAME/key=value/…/FORM. Make the data of the
+QP of order one: tolerances then mean the same as elsewhere. The way back to physical
+units is `recover`, `quantities`, and energy = scale · objective + constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.sparse import diags_array
+
+from harness import QP, Case, Family, InputError, Reference, Solution, Value, no_rows
+
+
+@dataclass(frozen=True)
+class Problem(Family):
+    """A string on (0, 1) under a load of one, above a flat obstacle: u ≥ −depth."""
+
+    name: str = "NAME"
+    #: every key of a case name with its default, in the order of names
+    defaults: Mapping[str, Value] = field(
+        default_factory=lambda: {"n": 50, "depth": 0.05}, hash=False
+    )
+    forms: tuple[str, ...] = ("primal",)
+
+    def check(self, params: Mapping[str, Value]) -> None:
+        """Refuse values out of range in one line, before anything is built."""
+        n, depth = int(params["n"]), float(params["depth"])
+        if n < 2:
+            raise InputError(f"NAME: n = {n}; expected at least 2")
+        if not depth > 0:
+            raise InputError(f"NAME: depth = {depth}; expected a positive number")
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Build one case: linear elements on n inner nodes."""
+        n, depth = int(params["n"]), float(params["depth"])
+        h = 1 / (n + 1)
+        K = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)) / h
+        qp = QP(
+            P=K.tocsc(), q=np.full(n, h),
+            A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
+            lb=np.full(n, -depth), ub=np.full(n, np.inf),
+        )  # fmt: skip
+
+        def quantities(s: Solution) -> Mapping[str, Any]:
+            touching = np.count_nonzero(s.x <= -depth * (1 - 1e-6))
+            return {"lowest": float(s.x.min()), "touching": int(touching)}
+
+        return Case(qp=qp, recover=lambda s: s.x, quantities=quantities)
+
+
+PROBLEMS = {"NAME": Problem()}

@@ -1,0 +1,156 @@
+"""Whether supports and contacts can balance the loads on bodies, before any solve.
+
+The potential energy has a lower bound if and only if no rigid motion r that the
+supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains from the load
+(fᵀr > 0). With Z a basis of the motions that the supports allow, Farkas' lemma says the
+same of forces: there are contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.  Their best
+approximation in the sense of least squares leaves, by Moreau's decomposition, a
+remainder that *is* such a motion, and the part of the load that nothing balances.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from harness import InputError, Matrix
+from problems.contact.bodies import Bodies
+
+#: part of the load that may be left: rounding of coordinates, normals and tractions
+UNBALANCED = 1e-6
+_SLIGHT = 1e-3  #: parts of a motion that are not worth a word
+_AXES = ("x", "y")
+
+Floats = NDArray[np.float64]
+
+
+class _Moving(NamedTuple):
+    """How a body moves."""
+
+    name: str
+    centre: Floats  #: (2,) of its nodes, m
+    velocity: Floats  #: (2,) of the centre
+    turn: float  #: anticlockwise, as a velocity at a `size` from the centre
+
+
+def check_balance(bodies: Bodies, B: Matrix) -> None:
+    """Refuse loads that neither supports nor contacts can balance.
+
+    B : (m, n) contact rows at u = 0
+
+    Raises
+    ------
+    InputError
+        With the body, and the direction or the point about which it turns.
+
+    """
+    R, centres, size = _motions(bodies)
+    allowed = _kernel(bodies.B_D @ R)
+    if not allowed.shape[1]:  # the supports hold every body
+        return
+    load, closing = R.T @ bodies.f, csr_array(B) @ R
+    least = UNBALANCED * np.abs(bodies.f).sum()
+    sliding = [
+        (b, axis)
+        for b in range(len(bodies.names))
+        for axis in (0, 1)
+        if abs(load[3 * b + axis]) > least
+        and _slides(bodies, R[:, 3 * b + axis], B, np.sign(load[3 * b + axis]))
+    ]
+    if sliding:
+        first = sliding[0][0]
+        axes = [_AXES[axis] for b, axis in sliding if b == first]
+        raise InputError(
+            _text([bodies.names[first]], f"its load in {' and '.join(axes)}")
+        )
+    left = allowed @ _remainder(allowed.T @ load, closing @ allowed)
+    if np.linalg.norm(left) <= least:
+        return
+    parts = left.reshape(-1, 3)
+    moving = [
+        _Moving(name, centre, part[:2], float(part[2]))
+        for name, centre, part in zip(bodies.names, centres, parts, strict=True)
+        if np.abs(part).max() > _SLIGHT * np.abs(parts).max()
+    ]
+    raise InputError(_named(moving, size))
+
+
+def _motions(bodies: Bodies) -> tuple[Floats, Floats, float]:
+    """Return R (n, 3 bodies), the centres (bodies, 2) of the turns, and a size, both m.
+
+    Of each body: x, y, and a turn about its centre that moves what is `size` away by 1,
+    so that loads along all of them are forces.
+    """
+    owner, points = bodies.body_of_node, bodies.mesh.points
+    size = float(np.ptp(points, axis=0).max())
+    R = np.zeros((points.size, 3 * len(bodies.names)))
+    centres = np.zeros((len(bodies.names), 2))
+    for b in range(len(bodies.names)):
+        mine = np.flatnonzero(owner == b)
+        centres[b] = points[mine].mean(axis=0)
+        x, y = ((points[mine] - centres[b]) / size).T
+        R[2 * mine, 3 * b] = R[2 * mine + 1, 3 * b + 1] = 1
+        R[2 * mine, 3 * b + 2], R[2 * mine + 1, 3 * b + 2] = -y, x
+    return R, centres, size
+
+
+def _kernel(A: Floats) -> Floats:
+    """Orthonormal basis of the kernel of A (m, k), (k, r)."""
+    _, sizes, turn = np.linalg.svd(A, full_matrices=True)
+    rank = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
+    return np.asarray(turn[rank:].T)
+
+
+def _slides(bodies: Bodies, r: Floats, B: Matrix, sign: float) -> bool:
+    """Whether the motion sign·r is allowed by the supports and closes no gap."""
+    closing = sign * (B @ r)
+    free = not (bodies.B_D @ r).any()
+    return free and bool((closing <= 1e-9).all())
+
+
+def _remainder(load: Floats, closing: Floats) -> Floats:
+    """Return what is left of a load (k,) by the best forces λ ≥ 0 on rows (m, k)."""
+    from scipy.optimize import nnls  # late: only bodies that supports do not hold
+
+    sizes = np.linalg.norm(closing, axis=1)
+    rows = closing[sizes > 1e-12 * sizes.max(initial=0.0)]
+    if not rows.size:
+        return load
+    A = (rows / np.linalg.norm(rows, axis=1)[:, None]).T
+    try:
+        forces, _ = nnls(A, load, maxiter=100 * A.shape[1])
+    except RuntimeError:  # no answer within so many steps: nothing is known to be left
+        return np.zeros_like(load)
+    return np.asarray(load - A @ forces)
+
+
+def _named(moving: list[_Moving], size: float) -> str:
+    """Say in words what nothing balances."""
+    turning = max(moving, key=lambda body: abs(body.turn))
+    sliding = max(moving, key=lambda body: float(np.abs(body.velocity).max()))
+    most = float(np.abs(sliding.velocity).max())
+    if abs(turning.turn) <= _SLIGHT * most:
+        axes = [
+            axis
+            for axis, v in zip(_AXES, sliding.velocity, strict=True)
+            if abs(v) > _SLIGHT * most
+        ]
+        names = [body.name for body in moving]
+        whose = "its" if len(names) == 1 else "their"
+        return _text(names, f"{whose} load in {' and '.join(axes)}")
+    (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.turn
+    return _text(  # about the point that has no velocity
+        [turning.name],
+        f"the moment of its load: it can turn about ({x - vy:.4g}, {y + vx:.4g}) m",
+    )
+
+
+def _text(names: list[str], what: str) -> str:
+    who = "bodies" if len(names) > 1 else "body"
+    return (
+        f"{who} {' and '.join(map(repr, names))}: nothing balances {what}; expected a "
+        "support, or a contact that presses against it"
+    )

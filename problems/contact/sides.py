@@ -1,0 +1,94 @@
+"""Each contact pair of a solution on its own: forces, pressures and gaps along a side.
+
+The rows of the primal QP stand pair by pair, those of a pair along its slave side. A
+row belongs to the first pair, from that of the row before on, whose two sides hold all
+nodes that it touches; so what two pairs share with both their sides is told of the
+first of them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from harness import QP, ContactSide, Solution
+from problems.contact.bodies import Bodies, ContactPair
+from problems.contact.polyline import current_polyline
+from problems.fem.mesh import Nodes, as_vectors, nodal_lengths
+
+RIGID = "rigid"  #: name of a master that is no body
+
+
+def contact_sides(bodies: Bodies, primal: QP, s: Solution) -> tuple[ContactSide, ...]:
+    """Evaluate every pair along its slave side; SI units.
+
+    The pressure at a node is the normal part of the contact force on it over the length
+    of the undeformed side that belongs to it, ∫N_j ds; the normal is that of the
+    deformed side. The gap is the slack of the node's row, c − Bu: with mortar contact
+    the mean of the gap around the node, weighted as its row is.
+    """
+    B, l, F = csr_array(primal.G), bodies.length, bodies.force
+    points, u = bodies.mesh.points, s.x * l
+    slack = (primal.h - B @ s.x) * l
+    found = []
+    for name, pair, rows in zip(
+        pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
+    ):
+        force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)
+        side = current_polyline(points, u, pair.slave, "slave")
+        length = nodal_lengths(points[pair.slave])
+        normal = np.einsum("sx,sx->s", force[pair.slave], side.node_normal)
+        gap = np.full(len(pair.slave), np.nan)
+        gap[slave_places(B[rows], pair.slave)] = slack[rows]
+        found.append(
+            ContactSide(
+                name=name, nodes=pair.slave, length=length,
+                force=force[pair.slave], pressure=(0.0 - normal) / length, gap=gap,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def pair_names(bodies: Bodies) -> list[str]:
+    """Name the pairs by their bodies, slave first; equal ones by a number, too."""
+    names: list[str] = []
+    for pair in bodies.pairs:
+        slave, master = bodies_of(bodies, pair)
+        name = f"{slave} on {master}"
+        again = sum(known.partition(" (")[0] == name for known in names)
+        names.append(f"{name} ({again + 1})" if again else name)
+    return names
+
+
+def bodies_of(bodies: Bodies, pair: ContactPair) -> tuple[str, str]:
+    """Name the bodies of slave and master."""
+    owner = bodies.body_of_node
+    master = bodies.names[owner[pair.master[0]]] if pair.master.size else RIGID
+    return bodies.names[owner[pair.slave[0]]], master
+
+
+def rows_of_pairs(B: csr_array, bodies: Bodies) -> list[slice]:
+    """Find which rows of B (m, n) belong to which pair."""
+    m = B.shape[0]
+    touches = csr_array(
+        (np.ones(B.nnz), B.indices // 2, B.indptr), shape=(m, len(bodies.mesh.points))
+    )
+    outside = []
+    for pair in bodies.pairs:
+        other = np.ones(len(bodies.mesh.points))
+        other[np.concatenate(pair)] = 0.0
+        outside.append(touches @ other > 0)
+    slices, first = [], 0
+    for k in range(len(bodies.pairs)):
+        beyond = np.flatnonzero(outside[k][first:])
+        end = first + int(beyond[0]) if beyond.size else m
+        slices.append(slice(first, end))
+        first = end
+    return slices
+
+
+def slave_places(B: csr_array, slave: Nodes) -> NDArray[np.int64]:
+    """Find each row's node, as its place on the slave side: where B is largest."""
+    x, y = (abs(B[:, 2 * slave + c]).toarray() for c in (0, 1))
+    return np.asarray((x + y).argmax(axis=1))

@@ -1,0 +1,222 @@
+"""Workers that are forks: as alone as those that a command starts, and as mortal."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+from harness.limits import ONE_THREAD, VARIABLE
+from harness.processes.case_folder import user_key
+from harness.processes.reaper import MARK, lives
+from harness.processes.supervisor import WorkerProcess
+from mortarbench import case
+from mortarbench.cli.main import main
+from mortarbench.registries import Registries
+from tests.support import TOY_PROBLEM
+
+#: asks workers that are forks of it, prints what came of each, and is killed; a process
+#: of its own, since what forks safely has one thread
+PARENT = '''
+import atexit, json, os, signal, subprocess, sys, threading
+from contextlib import suppress
+from math import inf
+from pathlib import Path
+from harness.processes.protocol import answer_requests
+from harness.processes.reaper import descendants
+from harness.processes.supervisor import WorkerProcess
+
+folder = Path(sys.argv[1])
+COMMAND = [sys.executable, "-S", "-c", """
+import json, os, sys
+requests, replies = map(int, sys.argv[1:])
+def reply(line, **event):
+    nonce = json.loads(line)["nonce"]
+    os.write(replies, (json.dumps(event | {"nonce": nonce}) + "\\\\n").encode())
+reply('{"nonce": ""}', event="ready")
+for line in os.fdopen(requests):
+    if "warm_up" in line:
+        reply(line, event="warm")
+        continue
+    reply(line, event="start")
+    reply(line, event="done", how="command")
+"""]
+held = open(folder / "held", "w")
+atexit.register(lambda: held.write("the parent ends"))
+
+
+def targets():
+    for fd in range(256):
+        with suppress(OSError):
+            yield fd, os.readlink(f"/proc/self/fd/{fd}")
+
+
+def answer(request, events):
+    events.start()
+    if request["do"] == "escape":
+        daemon = subprocess.Popen(["sleep", "60"], env={}, start_new_session=True)
+        (folder / "daemon").write_text(str(daemon.pid))
+        os.kill(os.getppid(), signal.SIGKILL)
+        signal.pause()
+    if request["do"] == "die":
+        os.write(2, b"my last words")
+        os._exit(7)
+    return dict(
+        how="fork", process=os.getpid(), open=dict(targets()),
+        cpus=sorted(os.sched_getaffinity(0)), environ=dict(os.environ),
+        leads=[os.getsid(p) == p for p in (os.getppid(), os.getpid())],
+        signals=[signal.getsignal(s).name for s in (signal.SIGCHLD, signal.SIGPIPE)],
+    )
+
+
+def serve(requests, replies):
+    answer_requests(answer, lambda: None, requests, replies)
+
+
+def told(*requests, serve=serve):
+    worker = WorkerProcess(COMMAND, folder / "log")
+    worker.fork(serve)
+    replies = [
+        worker.ask({"do": do}, time_limit=20.0, memory_limit=inf) for do in requests
+    ]
+    if "stay" not in requests:
+        worker.close()
+    return [[r.verdict, r.message, r.answer] for r in replies]
+
+
+def raises(requests, replies):
+    raise ValueError("not to be had")
+
+
+def unsafely(begin, end):
+    begin()
+    try:
+        return told("tell")
+    finally:
+        end()
+
+
+sleeps = threading.Event()
+thread = threading.Thread(target=sleeps.wait)
+child = subprocess.Popen(["sleep", "60"])
+results = dict(
+    child=unsafely(lambda: None, lambda: (child.kill(), child.wait())),
+    thread=unsafely(thread.start, lambda: (sleeps.set(), thread.join())),
+    tell=told("tell", "tell"),
+    escape=told("escape", "tell"),
+    die=told("die", "tell"),
+    raises=told("tell", serve=raises),
+)
+results["left"] = descendants(os.getpid())
+results["stay"] = told("stay")
+print(json.dumps(results), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+'''
+
+
+def soon(condition):
+    deadline = time.monotonic() + 20
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return condition()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("forks")
+
+
+@pytest.fixture(scope="module")
+def results(folder):
+    """What came of workers, by what they did: pairs of verdict, message and answer."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", PARENT, str(folder)],
+        env=os.environ | {"SPECIAL": "known"}, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    return json.loads(done.stdout)
+
+
+def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
+    results, folder
+):
+    (_, _, first), (_, _, second) = results["tell"]
+    opened = list(first["open"].values())
+
+    assert first["how"] == "fork"
+    assert first["process"] == second["process"]
+    assert opened[:3] == [os.devnull, str(folder / "log"), str(folder / "log")]
+    assert len(opened) == 5
+    assert all(target.startswith("pipe:") for target in opened[3:])
+    assert first["cpus"] == [max(os.sched_getaffinity(0))]
+    assert first["leads"] == [True, True]  # a session each, the sub-reaper and itself
+    assert first["signals"] == ["SIG_DFL", "SIG_IGN"]  # as in a new interpreter
+    assert ONE_THREAD.items() <= first["environ"].items()
+    assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")
+    assert len(first["environ"][MARK]) == 32
+
+
+def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
+    assert results["tell"]
+    assert (folder / "held").read_text() == ""
+
+
+@pytest.mark.parametrize("beside", ["thread", "child"])
+def test_what_has_a_thread_or_a_child_does_not_fork(results, beside):
+    assert results[beside] == [[None, "", {"how": "command"}]]
+
+
+def test_what_a_fork_starts_ends_even_if_it_kills_the_process_that_sees_to_that(
+    results, folder
+):
+    (verdict, message, _), after = results["escape"]
+
+    assert (verdict, message) == ("crashed", "SIGKILL")
+    assert not lives(int((folder / "daemon").read_text()))
+    assert results["left"] == []
+    assert after == [None, "", {"how": "command"}]
+
+
+def test_a_fork_that_dies_is_replaced_by_a_worker_that_the_command_starts(results):
+    (verdict, message, _), after = results["die"]
+
+    assert (verdict, message) == ("crashed", "exit code 7: my last words")
+    assert after == [None, "", {"how": "command"}]
+    assert results["raises"] == [after]
+
+
+def test_a_fork_ends_when_its_parent_is_killed(results):
+    ((_, _, answer),) = results["stay"]
+    assert soon(lambda: not lives(answer["process"]))
+
+
+def test_the_command_forks_before_it_builds_and_before_it_reads_a_key(
+    monkeypatch, capsys
+):
+    events, build = [], case.built_case
+
+    def fork(worker, serve):
+        events.append(("fork", user_key.cache_info().currsize))
+
+    def built(*arguments):
+        events.append("build")
+        return build(*arguments)
+
+    monkeypatch.setattr(WorkerProcess, "fork", fork)
+    monkeypatch.setattr(case, "built_case", built)
+    user_key.cache_clear()
+    code = main(Registries(), ["solve", "string/n=10/primal", "--solver", "smalbe"])
+
+    assert code == 0, capsys.readouterr()
+    assert events == [("fork", 0), "build"]
+
+
+def test_where_code_of_others_is_loaded_the_command_does_not_fork(monkeypatch, capsys):
+    forked = []
+    monkeypatch.setattr(WorkerProcess, "fork", lambda *_: forked.append(True))
+    plugin = ["--plugin", str(TOY_PROBLEM)]
+    code = main(Registries(), ["solve", "well/dual", "--solver", "exact", *plugin])
+
+    assert code == 0, capsys.readouterr()
+    assert forked == []

@@ -1,0 +1,56 @@
+"""A suite may ask for more while its folder lasts, and for nothing else."""
+
+import pytest
+
+from harness.suite.growth import refused
+
+SUITE = {
+    "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,
+    "solvers": ["a", {"name": "b", "label": "b-50", "options": {"max_iter": 50}}],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"time_limit": 60.0, "memory_limit": 4096},  # what holds anyway
+        {"solvers": [*SUITE["solvers"], "c"]},
+        {"solvers": SUITE["solvers"][::-1]},
+        {"tolerances": [1e-4, 1e-6, 1e-8]},
+        {"repeats": 5, "precision": 0.1, "max_repeats": 50, "budget": 700},
+        {"null_arm": "a"},
+    ],
+)
+def test_a_suite_that_asks_for_more_is_the_same(more):
+    assert refused(SUITE, SUITE | more) == ""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"name": "t"}, "name was 's', now 't'"),
+        ({"time_limit": 5}, "time_limit was 60, now 5"),
+        ({"memory_limit": 100}, "memory_limit was 4096, now 100"),
+        ({"accuracy": 1e-6}, "accuracy was not set, now 1e-06"),
+        ({"repeats": 2}, "repeats was 3, now 2; it may only grow"),
+        ({"tolerances": [1e-8]}, "tolerance 1e-06 is missing; tolerances may be added"),
+        ({"solvers": ["a"]}, "solver 'b-50' is missing; solvers may be added"),
+        (
+            {"solvers": ["a", {"name": "c", "label": "b-50"}]},
+            "solver 'b-50' was 'b', now 'c'",
+        ),
+    ],
+)
+def test_what_was_measured_may_not_become_something_else(change, said):
+    assert refused(SUITE, SUITE | change) == said
+
+
+def test_a_stopping_rule_may_become_stricter_and_not_laxer():
+    ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
+
+    assert refused(ruled, ruled | {"precision": 0.05}) == ""
+    said = "precision was 0.1, now 0.2; it may only become finer"
+    assert refused(ruled, ruled | {"precision": 0.2}) == said
+    assert refused(ruled, SUITE).startswith("precision was 0.1, now not set")
+    assert refused(ruled, ruled | {"null_arm": None}) == "null_arm was 'a', now not set"

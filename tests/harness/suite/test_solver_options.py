@@ -1,0 +1,171 @@
+"""Options of solvers from the command line: read by type, swept, told apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import pytest
+
+from harness import InputError
+from harness.registry import SolverSpec, resolve
+from harness.suite.solver_options import (
+    as_given,
+    given_options,
+    options_for,
+    swept,
+    without_options,
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    max_iter: int = 200
+    alpha: float = 1.5
+    scaling: bool = True
+    mode: Literal["fast", "exact"] = "fast"
+    title: str = "none"
+    seed: int | None = None
+    shape: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.max_iter < 1:
+            raise ValueError("max_iter must be positive")
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Plain:
+    steps: int = 7
+
+    declines, prepare = Method.declines, Method.prepare
+
+
+SOLVERS = {"method": Method(), "plain": Plain()}
+SPECS = tuple(SolverSpec(name=name, label=name) for name in SOLVERS)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("max_iter=50", 50),
+        ("alpha=2", 2.0),
+        ("alpha=1e-3", 0.001),
+        ("scaling=false", False),
+        ("mode=exact", "exact"),
+        ("title=7", "7"),
+        ("title=a=b", "a=b"),
+        ("seed=7", 7),
+        ("seed=none", None),
+    ],
+)
+def test_a_value_is_read_as_the_type_of_its_field(text, value):
+    ((_, found),) = options_for("method", [text], SOLVERS).items()
+
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "max_itr=5",
+            "--option: method: unknown option 'max_itr'; did you mean 'max_i",
+        ),
+        ("max_iter=5.0", "--option: method: max_iter = '5.0'; expected an integer"),
+        ("max_iter=1_0", "--option: method: max_iter = '1_0'; expected an integer"),
+        ("max_iter=0", "--option: method: max_iter must be positive"),
+        ("alpha=fast", "--option: method: alpha = 'fast'; expected a number"),
+        ("scaling=1", "--option: method: scaling = '1'; expected true or false"),
+        ("mode=slow", "--option: method: mode = 'slow'; expected fast or exact"),
+        ("seed=x", "--option: method: seed = 'x'; expected an integer or none"),
+        ("shape=1", "--option: method: shape = '1'; expected what only a suite can"),
+        ("max_iter", "--option 'max_iter'; expected KEY=VALUE, such as max_iter=50"),
+        ("max_iter=", "--option 'max_iter='; expected KEY=VALUE"),
+        ("max_iter=5,", "--option 'max_iter=5,'; expected KEY=VALUE"),
+        ("=5", "--option '=5'; expected KEY=VALUE"),
+        ("max_iter=5,6", "--option: max_iter has 2 values; expected one, only `run`"),
+    ],
+)
+def test_what_is_no_option_of_a_solver_is_refused(text, message):
+    with pytest.raises(InputError) as e:
+        options_for("method", [text], SOLVERS)
+
+    assert str(e.value).startswith(message)
+
+
+def labels(*texts, specs=SPECS):
+    return [spec.label for spec in swept(specs, given_options(texts), SOLVERS)]
+
+
+def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
+    """As a list, or given again; who has no such option is measured as it is."""
+    assert labels("max_iter=5,6", "scaling=false") == [
+        "method max_iter=5 scaling=false", "method max_iter=6 scaling=false", "plain"
+    ]  # fmt: skip
+    assert labels("max_iter=5", "max_iter=6") == labels("max_iter=5,6")
+    assert labels("steps=1") == ["method", "plain steps=1"]
+    assert labels() == ["method", "plain"]
+
+
+def test_labels_say_the_value_however_it_is_written():
+    assert labels("alpha=1e-3") == labels("alpha=0.001")
+
+
+def test_an_option_goes_before_that_of_the_suite():
+    own = SolverSpec(name="method", label="mine", options={"max_iter": 9, "alpha": 2.0})
+    (changed,) = swept([own], {"max_iter": ["5"]}, SOLVERS)
+
+    assert changed.label == "mine max_iter=5"
+    assert resolve(changed, SOLVERS) == Method(max_iter=5, alpha=2.0)
+
+
+def test_a_null_arm_has_the_options_of_its_twin():
+    null = SolverSpec(name="method", label="method (A/A)", role="null")
+    found = swept([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
+
+    assert [(s.label, s.role) for s in found] == [
+        ("method max_iter=5", ""), ("method max_iter=5 (A/A)", "null")
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (["max_itr=5"], "--option: unknown option 'max_itr'; did you mean 'max_iter'?"),
+        (["max_iter=5,5"], "--option: 'method max_iter=5' is asked for twice"),
+        (["alpha=1,1.0"], "--option: 'method alpha=1.0' is asked for twice"),
+        (["max_iter=0"], "--option: method: max_iter must be positive"),
+        (["mode=fast,slow"], "--option: method: mode = 'slow'; expected fast or exact"),
+        (
+            [f"max_iter={','.join(map(str, range(1, 50)))}",
+             f"alpha={','.join(map(str, range(1, 50)))}"],
+            "--option spans 2401 variants of method; expected at most 1000",
+        ),
+    ],
+)  # fmt: skip
+def test_a_sweep_that_makes_no_sense_is_refused(texts, message):
+    with pytest.raises(InputError) as e:
+        labels(*texts)
+
+    assert str(e.value).startswith(message)
+
+
+def test_options_of_a_program_are_those_of_the_command_line():
+    values = {"max_iter": [5, 6], "scaling": False, "mode": "exact", "seed": None}
+
+    assert as_given(values) == given_options(
+        ["max_iter=5,6", "scaling=false", "mode=exact", "seed=none"]
+    )
+
+
+def test_the_label_of_the_suite_is_found_in_a_longer_one():
+    assert list(without_options("my way x=1 max_iter=5")) == [
+        "my way x=1 max_iter=5", "my way x=1", "my way"
+    ]  # fmt: skip

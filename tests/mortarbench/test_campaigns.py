@@ -1,0 +1,426 @@
+"""Campaigns that grow, are merged and gate a CI: real runs of toy problems."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+
+import pytest
+
+import mortarbench as mb
+from harness.files.reading import read_toml
+from harness.files.store import is_stored
+from harness.results.folder import environment_of
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.registries import Registries
+from reports.data.evidence import read_evidence
+from reports.folder import compose
+from reports.render.markdown import markdown
+from tests.support import ROOT, TOY_PROBLEM
+
+
+def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
+    lines = [f"{key} = {value}" for key, value in settings.items()]
+    head = f'name = "c"\nsolvers = [{solvers}]\n' + "\n".join(lines)
+    return (
+        f'{head}\n[[problems]]\nfamily = "well"\nforms = ["dual"]\n'
+        f"params = {{ depth = [{depths}] }}\n"
+    )
+
+
+@pytest.fixture(autouse=True)
+def environment(monkeypatch):
+    """What runs find out of this machine, in no time; a test may say otherwise."""
+    here = {"machine": {"cpu": "one"}}
+    monkeypatch.setattr(Registries, "environment", lambda _: here)
+    return here
+
+
+@pytest.fixture
+def measure(tmp_path):
+    """Run a suite, given as for `suite`, into a folder of that name."""
+
+    def measure(out="out", **asked):
+        file = tmp_path / f"{out}.toml"
+        file.write_text(suite(**({"repeats": 2} | asked)))
+        return mb.run(file, out=tmp_path / out, plugins=[TOY_PROBLEM])
+
+    return measure
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two folders of a campaign, as runs leave them."""
+    where = tmp_path_factory.mktemp("made")
+    for name, depths in (("a", "1"), ("b", "2")):
+        (where / f"{name}.toml").write_text(suite(depths=depths))
+        mb.run(where / f"{name}.toml", out=where / name, plugins=[TOY_PROBLEM])
+    return where
+
+
+@pytest.fixture
+def stored(made, tmp_path):
+    """A copy of these folders."""
+    for name in "ab":
+        shutil.copytree(made / name, tmp_path / name)
+    return tmp_path / "a", tmp_path / "b"
+
+
+# growth
+
+
+def test_of_a_suite_that_grew_only_the_missing_is_measured(measure, tmp_path):
+    measure()
+    before = (tmp_path / "out/journal").glob("*.jsonl").__next__().read_bytes()
+    grown = {
+        "solvers": '"exact", "lax", "near"', "depths": "1, 2, 3",
+        "tolerances": "[1e-6, 1e-4]",
+    }  # fmt: skip
+    measure(**grown)
+    after = next((tmp_path / "out/journal").glob("*.jsonl")).read_bytes()
+    records = read_journal(tmp_path / "out")
+
+    assert after.startswith(before)  # not a byte of it was touched
+    assert len(records) == len({r.run_id for r in records}) == 3 * 3 * 2 * 2
+    first, second = dict.fromkeys(r.session for r in records)
+    old = {(r.solver, r.case) for r in records if r.session == first}
+    assert {s for s, _ in old} == {"exact", "lax"}
+    assert sum(r.session == second for r in records) == 36 - 8
+    assert "depth = [1, 2, 3]" in (tmp_path / "out/suite.toml").read_text()
+    assert len(measure(**grown).records) == 36  # nothing is left
+
+
+def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(
+    measure, tmp_path
+):
+    measure()
+    measure(solvers='"exact", "lax", { name = "exact", label = "again" }')
+    evidence = read_evidence(tmp_path / "out")
+    said = markdown(compose(evidence))
+
+    assert "Measured in different sessions" in said
+    assert "again with exact, lax" in said
+    assert "Unpaired: the two were not measured in the same blocks" in said
+    row = evidence.outcomes["well/dual", 1e-6]
+    assert not row["again"].by_block.keys() & row["exact"].by_block.keys()
+    assert row["lax"].by_block.keys() == row["exact"].by_block.keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"depths": "2"}, "holds well/dual, which the suite has no longer"),
+        ({"time_limit": 5}, r"time_limit was 60, now 5\); choose another --out"),
+        (
+            {"solvers": '{name = "exact", options = {factor = 1.5}}, "lax"'},
+            "holds exact with factor = 1.0, now 1.5; give other options another label",
+        ),
+    ],
+)
+def test_what_would_mix_two_suites_is_refused(measure, tmp_path, change, said):
+    measure()
+    held = (tmp_path / "out/suite.toml").read_text()
+    with pytest.raises(mb.InputError, match=said):
+        measure(**change)
+
+    assert (tmp_path / "out/suite.toml").read_text() == held
+    assert len(measure().records) == 8
+
+
+# merging
+
+
+def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
+    measure("a", depths="1")
+    measure("b", depths="2", solvers='"exact", "liar"')
+    again = []
+    merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
+    mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all", tell=again.append)
+    held = read_journal(tmp_path / "all")
+
+    assert held == list(merged.records)
+    assert {r.run_id for r in held} == {
+        r.run_id for name in "ab" for r in read_journal(tmp_path / name)
+    }
+    assert [line.rpartition(": ")[2] for line in again] == [
+        "4 of 4 are there already, and count once"
+    ] * 2
+    assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
+    assert read_toml(tmp_path / "all/suite.toml") == {
+        "name": "c", "solvers": ["exact", "lax", "liar"], "repeats": 2,
+        "problems": [
+            {"family": "well", "forms": ["dual"], "params": {"depth": [depth]}}
+            for depth in (1, 2)
+        ],
+    }  # fmt: skip
+    measure("all", depths="1, 2", solvers='"exact", "lax", "liar"')  # it goes on
+    assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
+
+
+def test_the_same_of_two_machines_is_kept_apart_and_marked(
+    measure, tmp_path, environment
+):
+    measure("a")
+    environment["machine"] = {"cpu": "two"}
+    measure("b")
+    orders = [
+        {
+            r.but(run_id="").to_json()
+            for r in mb.merge(
+                tmp_path / x, tmp_path / y, out=tmp_path / f"{x}{y}"
+            ).records
+        }
+        for x, y in ("ab", "ba")
+    ]
+    records = read_journal(tmp_path / "ab")
+    evidence = read_evidence(tmp_path / "ab")
+    said = markdown(compose(evidence))
+
+    assert orders[0] == orders[1]
+    assert len(records) == len({r.run_id for r in records}) == 16
+    digests = [*dict.fromkeys(r.environment for r in records)]
+    assert [environment_of(tmp_path / "ab", d)["machine"]["cpu"] for d in digests] == [
+        "one", "two",
+    ]  # fmt: skip
+    mark = f"@{digests[1][:6]}"
+    assert set(evidence.solvers) == {"exact", "lax", f"exact {mark}", f"lax {mark}"}
+    assert all(len(o.records) == 2 for o in evidence.flat)
+    assert f"{mark} is two (other: machine.cpu)" in said
+    assert "not made yet" not in said
+    mb.merge(tmp_path / "ba", tmp_path / "a", out=tmp_path / "ab")  # nothing new
+    assert read_journal(tmp_path / "ab") == records
+
+
+def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_path):
+    first = measure("a", depths="1")
+    measure("b", depths="1, 2")
+    merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
+
+    assert merged.records[:4] == first.records
+    assert len(merged) == 8
+    row = read_evidence(tmp_path / "all").outcomes["well/dual", 1e-6]
+    assert [len(o.records) for o in row.values()] == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            lambda a, b: (b / "vectors/x.npz").symlink_to("/etc/passwd"),
+            "is a link, pipe",
+        ),
+        (
+            lambda a, b: (b / "journal/x.jsonl").write_text("{}\n"),
+            "journal line of sch",
+        ),
+        (
+            lambda a, b: (b / "suite.toml").write_text("time_limit = 5\n"),
+            r"time_limit is 60 in .*a, 5 in .*b; expected suites whose measurements",
+        ),
+        (
+            lambda a, b: (b / "suite.toml").write_text(
+                'solvers = [{ name = "lax", label = "exact" }]\n'
+            ),
+            "label 'exact' is {'name': 'exact'} in .* expected one solver for a label",
+        ),
+        (lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"), "is no suite"),
+        (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),
+    ],
+)
+def test_folders_that_cannot_be_one_are_refused_before_anything_is_written(
+    stored, tmp_path, damage, said
+):
+    a, b = stored
+    damage(a, b)
+    with pytest.raises(mb.InputError, match=said):
+        mb.merge(a, b, out=tmp_path / "all")
+
+    assert not (tmp_path / "all").exists()
+
+
+def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path):
+    a, b = stored
+    with pytest.raises(mb.InputError, match="is one of the folders to merge"):
+        mb.merge(a, b, out=b)
+    with pytest.raises(mb.InputError, match=r"holds measurements of a run \(journal/"):
+        mb.merge(a, out=b)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/suite.toml").write_text("mine")
+    with pytest.raises(mb.InputError, match="is no result folder"):
+        mb.merge(a, b, out=tmp_path / "mine")
+    assert (tmp_path / "mine/suite.toml").read_text() == "mine"
+
+
+def test_a_merge_that_is_killed_anywhere_loses_and_doubles_nothing(stored, tmp_path):
+    """At every file that it puts in place, before and after."""
+    a, b = stored
+    whole = read_all(mb.merge(a, b, out=tmp_path / "whole"))
+    ends = {}
+    for instant in range(100):
+        out = tmp_path / f"out{instant}"
+        ends[instant] = killed_merge([a, b], out, instant)
+        if (out / "journal").exists():
+            with suppress(mb.InputError):
+                assert read_all(mb.load(out)) == whole
+        again = mb.merge(a, b, out=out)
+        assert read_all(again) == read_all(mb.load(out)) == whole
+        assert not list(out.rglob("*.tmp"))
+        if ends[instant] == 0:
+            break
+    assert set(ends.values()) == {-signal.SIGKILL, 0}
+    assert len(ends) > 5
+
+
+def killed_merge(folders, out, instant):
+    """Merge in a process that is killed as it puts file number `instant` in place."""
+    if child := os.fork():
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    left = iter(range(instant))
+    put = os.replace
+
+    def put_or_die(*paths):
+        if next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        put(*paths)
+
+    os.replace = put_or_die
+    mb.merge(*folders, out=out)
+    os._exit(0)
+
+
+def read_all(results):
+    return [r.to_json() for r in results.records]
+
+
+# what a CI asks
+
+
+@pytest.fixture
+def cli(tmp_path, capsys, monkeypatch):
+    """Run a command line in the folder of the test; returns code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def cli(*argv):
+        code = main(Registries(), [str(word) for word in argv])
+        streams = capsys.readouterr()
+        return code, streams.out, streams.err
+
+    return cli
+
+
+def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(cli, tmp_path):
+    asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
+    (tmp_path / "s.toml").write_text(
+        suite('"exact", "picky", "liar", "lost"', depths="2")
+    )
+
+    code, out, _ = cli(*asked, "--strict")
+    assert code == 1
+    assert out.splitlines()[-1] == (
+        "strict: 1 answer that refutes its claim (liar on well/depth=2/dual) and 1 "
+        "measurement without an answer (lost on well/depth=2/dual)"
+    )
+    good = (*asked, "--solver", "exact", "--solver", "picky")
+    assert cli(*good, "--strict")[0] == 0  # one declined; the others are not asked for
+    code, out, _ = cli(*asked, "--strict", "--json")
+    told = json.loads(out)
+    assert code == 1
+    assert told["solvers"]["exact"] == {"verified": 1}
+    assert [one["solver"] for one in told["refuted"]] == ["liar"]
+    assert [(one["solver"], one["status"]) for one in told["failed"]] == [
+        ("lost", "failed")
+    ]
+    assert told["not_measured"] == []
+
+
+def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
+    cli, measure, tmp_path, monkeypatch
+):
+    """A solver that sleeps takes ten times as long in b; another one lies in c."""
+    monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
+    slow = '{{ name = "slow", label = "{}", options.seconds = {} }}'
+    honest, liar = slow.format("old", 0.02), '{ name = "liar", label = "old" }'
+    for name, seconds, old in (
+        ("a", 0.02, honest),
+        ("b", 0.2, honest),
+        ("c", 0.02, liar),
+    ):
+        solvers = f"{slow.format('new', seconds)}, {old}"
+        measure(name, solvers=solvers, depths="2, 3, 4")
+
+    assert cli("report", "a", "b", "--fail-on", "worse", "--format", "csv")[0] == 0
+    gates = ("--fail-on", "worse,slower", "--format", "csv", "--json")
+    code, out, _ = cli("report", "a", "b", *gates)
+    told = json.loads(out)
+    assert (code, told["failed_on"]) == (1, ["slower"])
+    (change,) = told["changes"]
+    assert {one["solver"] for one in change["slower"]} == {"new"}
+    assert change["slower"][0]["relative"]["low"] > 1
+    assert (change["cells"], change["worse"]) == (6, [])
+    code, out, _ = cli("report", "a", "b", "c", "--fail-on", "worse", "--format", "md")
+    assert code == 1
+    assert out.splitlines()[-1] == "failed on worse"
+    assert "c/report/since-a/report.md" in out
+    assert "| new |" in (tmp_path / "c/report/since-a/report.md").read_text()
+    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
+
+
+def test_what_cannot_be_judged_fails_by_its_own_line(cli, stored, measure):
+    assert cli("report", "a", "--fail-on", "worse")[0] == 2
+    code, _, err = cli("report", "a", "b", "--fail-on", "worse")
+    assert code == 2
+    assert "no cell (a solver on a case at a tolerance) is in both a and b" in err
+    code, _, err = cli("report", "a", "a", "--fail-on", "slower")
+    assert code == 2
+    assert "fail-on slower: a and a: fewer than 3 cases of a solver" in err
+    code, _, err = cli("report", "a", "b", "--fail-on", "slowr")
+    assert (code, "did you mean 'slower'" in err) == (2, True)
+
+
+def test_folders_are_merged_from_the_command_line(cli, stored):
+    code, out, _ = cli("merge", "a", "b", "--out", "all")
+    assert code == 0
+    assert out.splitlines()[-1] == "all: 12 measurements"
+    code, out, err = cli("merge", "a", "nowhere", "--out", "more")
+    assert (code, out) == (2, "")
+    assert "nowhere: no such folder; expected a result folder of `run`" in err
+
+
+def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
+    """By SIGKILL, as it is about to write its fourth line."""
+    before = measure(depths="2", repeats=1).records
+    grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}
+    (tmp_path / "grown.toml").write_text(suite(**grown))
+    given = [tmp_path / "grown.toml", tmp_path / "out", 3, TOY_PROBLEM]
+    program = [sys.executable, "-c", KILLED_RUN, *map(str, given)]
+    assert subprocess.run(program, cwd=ROOT).returncode == -signal.SIGKILL
+    held = read_journal(tmp_path / "out")
+    assert len(held) == len(before) + 3
+    whole = measure(**grown).records
+
+    assert len(whole) == len({r.run_id for r in whole}) == 3 * 2 * 2
+    assert list(whole[: len(held)]) == held
+
+
+KILLED_RUN = """
+import os, signal, sys
+import mortarbench as mb
+from harness.results.journal import Journal
+from mortarbench.registries import Registries
+
+suite, out, lines, plugin = sys.argv[1:]
+Registries.environment = lambda _: {"machine": {"cpu": "one"}}
+append, left = Journal.append, iter(range(int(lines)))
+
+def append_or_die(self, record):
+    if next(left, None) is None:
+        os.kill(os.getpid(), signal.SIGKILL)
+    append(self, record)
+
+Journal.append = append_or_die
+mb.run(suite, out=out, plugins=[plugin])
+"""

@@ -1,0 +1,250 @@
+"""What authors of solvers do: sweeps, versions side by side, files to start from."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from harness.conformance.conformance import CHECKS, Grade, run_check
+from harness.registry import load_plugin
+from harness.results.journal import read_journal
+from harness.suite.suite import load_suite
+from mortarbench.cli.main import main
+from mortarbench.cli.test_solver import conforms
+from mortarbench.registries import Registries
+from tests.support import TOY_PROBLEM
+
+TOY = load_plugin(TOY_PROBLEM)
+
+#: its answer is right in the second version only; what differs is a neighbour
+MINE = """
+from dataclasses import dataclass
+from harness import Solution, Status
+import step
+
+@dataclass(frozen=True)
+class Mine:
+    factor: float = 1.0
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        def solve():
+            from step import LENGTH
+            x = -qp.q / qp.P.diagonal() * step.LENGTH * self.factor
+            return Solution(
+                status=Status.SOLVED, x=x, y=qp.b, z=qp.h, z_box=0 * x,
+                iterations=LENGTH,
+            )
+        return solve
+
+SOLVERS = {"mine": Mine()}
+"""
+
+
+@pytest.fixture
+def cli(capsys, monkeypatch, tmp_path):
+    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+    registries = Registries(
+        families=TOY.problems,
+        solvers=TOY.solvers,
+        reference=lambda qp: TOY.solvers["exact"].prepare(qp, 0.0)(),
+        report=lambda *_, **__: [],
+        start=(sys.executable, "-P", str(TOY_PROBLEM)),
+    )
+
+    def cli(*argv):
+        return main(registries, [*map(str, argv)]), *capsys.readouterr()
+
+    return cli
+
+
+@pytest.fixture
+def versions(tmp_path):
+    """Give the options that load two versions of a plug-in of the same file name."""
+    for name, length in (("old", 2), ("new", 1)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mine.py").write_text(MINE)
+        (tmp_path / name / "step.py").write_text(f"LENGTH = {length}")
+    (tmp_path / "mine.toml").write_text(
+        "name = 'mine'\nsolvers = ['old:mine', 'new:mine', 'exact']\nrepeats = 1\n"
+        "[[problems]]\nfamily = 'well'\nforms = ['dual']\n"
+    )
+    return ("--plugin", "old=old/mine.py", "--plugin", "new=new/mine.py")
+
+
+def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path):
+    code, _, err = cli("run", "mine.toml", *versions)
+    records = {r.solver: r for r in read_journal(Path("out/mine"))}
+    environment = json.loads(Path("out/mine/environment.json").read_text())
+
+    assert code == 0, err
+    assert {s: (str(r.verdict), r.iterations) for s, r in records.items()} == {
+        "old:mine": ("wrong", 2), "new:mine": ("verified", 1),
+        "exact": ("verified", None),
+    }  # fmt: skip
+    assert len({r.block for r in records.values()}) == 1
+    assert environment["plugins"].keys() == {"old=mine.py", "new=mine.py"}
+    assert len(set(environment["plugins"].values())) == 2
+
+    again = cli("run", "mine.toml", *versions)
+    assert again[0] == 0
+    assert len(read_journal(Path("out/mine"))) == 3  # nothing was measured twice
+
+    run_id = records["old:mine"].run_id
+    code, out, _ = cli("replay", "out/mine", run_id, *versions, "--json")
+    assert (code, json.loads(out)["environment"]) == (0, [])
+    code, _, err = cli("replay", "out/mine", run_id)
+    assert code == 2
+    assert err.endswith("give --plugin old=mine.py --plugin new=mine.py\n")
+
+    (tmp_path / "old" / "step.py").write_text("LENGTH = 3")
+    code, _, err = cli("run", "mine.toml", *versions)
+    assert code == 2
+    assert "content of the plug-in old=mine.py: " in err
+
+
+def test_versions_without_labels_are_told_of_them(cli, versions):
+    code, _, err = cli(
+        "list", "solvers", "--plugin", "old/mine.py", "--plugin", "new/mine.py"
+    )
+
+    assert code == 2
+    assert err == (
+        "mortarbench: new/mine.py: solver 'mine' of the plug-in exists; rename the new "
+        "one, or tell its plug-in apart by --plugin LABEL=FILE.py\n"
+    )
+
+
+def test_options_of_the_command_line_are_swept_and_measured_again(cli, versions):
+    sweep = ("--solver", "new:mine", "--option", "factor=1,2")
+    code, _, err = cli("run", "mine.toml", *versions, *sweep)
+    records = {r.solver: r for r in read_journal(Path("out/mine"))}
+
+    assert code == 0, err
+    assert {s: (str(r.verdict), r.options) for s, r in records.items()} == {
+        "new:mine factor=1.0": ("verified", {"factor": 1.0}),
+        "new:mine factor=2.0": ("wrong", {"factor": 2.0}),
+    }
+    run_id = records["new:mine factor=2.0"].run_id
+    code, out, _ = cli("replay", "out/mine", run_id, *versions, "--json")
+    assert (code, json.loads(out)["now"]["options"]) == (0, {"factor": 2.0})
+
+
+def test_one_solve_has_options_too(cli, versions):
+    solve = ("solve", "well/dual", "--solver", "new:mine", *versions)
+    codes = [cli(*solve, "--option", f"factor={f}")[0] for f in (1, 2)]
+
+    assert codes == [0, 1]
+    assert cli(*solve, "--option", "faktor=2")[2] == (
+        "mortarbench: --option: new:mine: unknown option 'faktor'; did you mean "
+        "'factor'? known: factor\n"
+    )
+
+
+# files to start from
+
+
+@pytest.fixture
+def starting(capsys, monkeypatch, tmp_path):
+    """Run the command line with all that there is, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+
+    def run(*argv):
+        return main(Registries(), [*map(str, argv)]), *capsys.readouterr()
+
+    return run
+
+
+def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
+    code, out, err = starting("new", "solver", "my-own")
+    solver = load_plugin("my-own.py").solvers["my-own"]
+    results = {check: run_check(check, solver) for check in CHECKS}
+
+    assert (code, out) == (0, "my-own.py\n")
+    assert "mortarbench test-solver my-own --plugin my-own.py" in err
+    assert conforms(results)
+    assert {c for c, r in results.items() if r.grade is Grade.DECLINE} == {
+        "takes or declines an operator", "solves a sequence"
+    }  # fmt: skip
+
+
+def test_a_new_problem_builds_what_its_name_says(starting):
+    """−u″ = −1 and u = −depth where it touches: u leaves it at √(2·depth)."""
+    starting("new", "problem", "mine")
+    name = "mine/n=399/primal"
+    solve = ("solve", name, "--solver", "clarabel", "--plugin", "mine.py", "--json")
+    code, out, err = starting(*solve)
+    quantities = json.loads(out)["quantities"]
+
+    assert code == 0, err
+    assert quantities["lowest"] == pytest.approx(-0.05, rel=1e-6)
+    assert quantities["touching"] / 400 == pytest.approx(1 - 2 * 0.1**0.5, abs=0.01)
+    assert starting(*solve[:1], "mine/n=1/primal", *solve[2:])[2] == (
+        "mortarbench: mine: n = 1; expected at least 2\n"
+    )
+
+
+def test_a_new_suite_is_one_of_known_solvers_and_cases(starting):
+    starting("new", "suite", "mine")
+    registries = Registries()
+    suite = load_suite(Path("mine.toml"), registries.families, registries.solvers)
+
+    assert suite.name == "mine"
+    assert len(suite.cases) == 4
+    assert [s.label for s in suite.solvers] == ["smalbe", "osqp", "clarabel-50"]
+
+
+@pytest.mark.slow
+def test_a_new_suite_runs(starting):
+    starting("new", "suite", "mine")
+
+    assert starting("run", "mine.toml", "--repeats", "1")[0] == 0
+    assert {str(r.verdict) for r in read_journal(Path("out/mine"))} <= {
+        "verified", "declined", "inaccurate"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["solver", "problem", "suite"])
+def test_nothing_is_written_over(starting, tmp_path, kind):
+    name = "mine.toml" if kind == "suite" else "mine.py"
+    (tmp_path / name).write_text("precious")
+    (tmp_path / "other.py").symlink_to("gone")
+    code, out, err = starting("new", kind, "mine")
+
+    assert (code, out) == (2, "")
+    assert err == (
+        f"mortarbench: {name} exists; expected another name, or no such file\n"
+    )
+    assert (tmp_path / name).read_text() == "precious"
+    assert starting("new", "solver", "other")[0] == 2
+    assert not (tmp_path / "gone").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("solver", "osqp"), "there is a solver 'osqp'; expected a name of its own"),
+        (
+            ("problem", "obstacle"),
+            "there is a problem 'obstacle'; expected a name of its",
+        ),
+        (("suite", "demo"), "there is a suite 'demo'; expected a name of its own"),
+        (("solver", "a/b"), "name 'a/b'; expected letters, digits, '-' and '_'"),
+        (("solver", "../b"), "name '../b'; expected letters"),
+        (("solver", ""), "name ''; expected letters"),
+        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', a lett"),
+        (("familie", "b"), "argument kind: invalid choice: 'familie' (choose from"),
+    ],
+)
+def test_a_name_that_is_none_is_refused(starting, tmp_path, words, message):
+    code, _, err = starting("new", *words)
+
+    assert code == 2
+    assert err.startswith(f"mortarbench: {message}")
+    assert [*tmp_path.iterdir()] == []

@@ -1,0 +1,134 @@
+"""Loads that nothing balances, against what plain mechanics and linprog say of them."""
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from harness import InputError
+from problems.contact.balance import check_balance
+from problems.contact.bodies import ContactPair, assemble
+from problems.contact.linearise import linearisation
+from problems.fem.elasticity import Material
+from problems.fem.mesh import join, prefixed, rectangle
+
+
+def blocks(*, fixed, forces, gap=0.0):
+    """A block of 2 m × 1 m on one of 4 m × 1 m, which is (−2, −1) … (2, 0).
+
+    fixed : (body, side or corner, "x" or "xy")
+    forces : (body, corner, [x, y]) in N/m
+    """
+    lower = rectangle((-2.0, -1.0), (4.0, 1.0), (8, 2))
+    upper = rectangle((-1.0, gap), (2.0, 1.0), (6, 3))
+    mesh, body = join((prefixed(lower, "lower_"), prefixed(upper, "upper_")))
+    sides = mesh.boundaries
+
+    def nodes(body, place):
+        first, _, second = place.partition(" ")
+        found = sides[f"{body}_{first}"]
+        return np.intersect1d(found, sides[f"{body}_{second}"]) if second else found
+
+    load = np.zeros((len(mesh.points), 2))
+    for b, corner, force in forces:
+        load[nodes(b, corner)] += force
+    held = [
+        2 * nodes(b, place) + "xy".index(c) for b, place, axes in fixed for c in axes
+    ]
+    bodies = assemble(
+        mesh, body, names=("lower", "upper"), materials=(Material(1e9, 0.3),) * 2,
+        plane="strain", units=(4.0, 1e6), fixed=np.unique(np.concatenate(held)),
+        load=load.ravel(),
+        pairs=(ContactPair(sides["upper_bottom"], sides["lower_top"]),),
+    )  # fmt: skip
+    rows = linearisation(bodies, "nts", "dual")(np.zeros(mesh.dofs))
+    return bodies, rows.B
+
+
+HELD = ("lower", "bottom", "xy")
+DOWN = [("upper", "top left", [0, -1e6]), ("upper", "top right", [0, -1e6])]
+
+
+def test_what_presses_down_within_the_support_is_balanced():
+    for share in (0.5, 0.01, 0.99, 1.0):  # up to its very edge
+        forces = [
+            ("upper", "top left", [0, -2e6 * share]),
+            ("upper", "top right", [0, -2e6 * (1 - share)]),
+        ]
+        check_balance(*blocks(fixed=[HELD], forces=forces))
+
+
+@pytest.mark.parametrize(
+    ("fixed", "forces", "told"),
+    [
+        ([HELD], [*DOWN, ("upper", "top left", [10, 0])],
+         "body 'upper': nothing balances its load in x; expected a support"),
+        ([HELD], [("upper", "top left", [0, 5]), ("upper", "top right", [0, 5])],
+         "body 'upper': nothing balances its load in y;"),
+        ([HELD], [("upper", "top left", [-3, 5])],
+         "body 'upper': nothing balances its load in x and y;"),
+        ([("lower", "bottom", "y")], [*DOWN, ("lower", "top left", [9, 0])],
+         "body 'lower': nothing balances its load in x;"),
+        ([HELD], [*DOWN, ("upper", "top left", [0, 1.5e6])],
+         "body 'upper': nothing balances the moment of its load: it can turn about "
+         "(1, "),
+        ([HELD, ("upper", "bottom left", "xy")], [("upper", "bottom right", [0, 7])],
+         "body 'upper': nothing balances the moment of its load: it can turn about "
+         "(-1, 0) m;"),
+        ([("upper", "top left", "xy"), ("upper", "top right", "y"),
+          ("lower", "left", "x")], [("lower", "top left", [0, -9])],
+         "body 'lower': nothing balances its load in y;"),
+    ],
+)  # fmt: skip
+def test_a_load_that_nothing_balances_is_named(fixed, forces, told):
+    with pytest.raises(InputError) as e:
+        check_balance(*blocks(fixed=fixed, forces=forces))
+
+    assert str(e.value).startswith(told)
+
+
+def test_bodies_that_can_only_move_together_are_both_named():
+    """The lower one is pushed up against the upper one, which nothing holds down."""
+    fixed = [("lower", "left", "x"), ("upper", "left", "x")]
+    forces = [("lower", "bottom left", [0, 4]), ("lower", "bottom right", [0, 4])]
+    with pytest.raises(InputError) as e:
+        check_balance(*blocks(fixed=fixed, forces=forces))
+
+    assert str(e.value).startswith(
+        "bodies 'lower' and 'upper': nothing balances their load in y;"
+    )
+
+
+def test_bodies_that_supports_hold_need_no_contact():
+    bodies, rows = blocks(
+        fixed=[HELD, ("upper", "top", "xy")], forces=[("upper", "bottom left", [5, 5])]
+    )
+    check_balance(bodies, rows[:0])
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_refused_is_what_a_linear_program_finds_a_free_motion_for(seed):
+    """max fᵀr over rigid r with B_D r = 0, B r ≤ 0 and components of at most 1."""
+    rng = np.random.default_rng(seed)
+    places = ("left", "bottom", "top", "right", "top left", "bottom right")
+    fixed = [
+        (b, places[rng.integers(6)], ("x", "y", "xy")[rng.integers(3)])
+        for b in ("lower", "upper")
+        for _ in range(rng.integers(1, 3))
+    ]
+    forces = [
+        (b, f"{v} {h}", rng.integers(-3, 2, 2) * 1e6 * (rng.random(2) < 0.6))
+        for b in ("lower", "upper")
+        for v in ("top", "bottom")
+        for h in ("left", "right")
+    ]
+    bodies, B = blocks(fixed=fixed, forces=forces)
+    R = bodies.rigid
+    found = linprog(
+        -(R.T @ bodies.f), A_ub=B @ R, b_ub=np.zeros(B.shape[0]),
+        A_eq=bodies.B_D @ R, b_eq=np.zeros(bodies.B_D.shape[0]), bounds=(-1, 1),
+    )  # fmt: skip
+    if -found.fun > 1e-4:
+        with pytest.raises(InputError, match="nothing balances"):
+            check_balance(bodies, B)
+    else:
+        check_balance(bodies, B)

@@ -1,0 +1,126 @@
+"""What is told of each contact pair, against forces in equilibrium and Hertz."""
+
+import numpy as np
+import pytest
+
+from harness import Solution, Status
+from problems.contact.bodies import ContactPair
+from problems.contact.linearise import linearisation
+from problems.contact.sides import contact_sides, rows_of_pairs
+from problems.duality.stepping import primal_qp
+from problems.families.hertz import HertzPlane
+from problems.families.patch import ContactPatch
+from problems.fem.mesh import nodal_lengths
+from problems.models.patch import PRESSURE, model
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
+from tests.support.held_by_contact import PRESSURE as PRESS
+from tests.support.held_by_contact import disc_between_plates
+
+METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
+
+
+@pytest.mark.parametrize(("contact", "basis"), METHODS[1:])
+def test_a_uniform_pressure_is_uniform_along_the_side(contact, basis):
+    given = {**ContactPatch().defaults, "contact": contact, "basis": basis}
+    case = ContactPatch().build("primal", given, reference_solution)
+    (side,) = case.fields(Clarabel().prepare(case.qp, 1e-12)()).contacts
+
+    assert side.name == "upper on lower"
+    assert side.pressure == pytest.approx(np.full(len(side.nodes), PRESSURE), rel=1e-6)
+    assert side.length.sum() == pytest.approx(1.0)
+    assert np.abs(side.gap).max() <= 1e-9
+    np.testing.assert_allclose(side.force[:, 1], PRESSURE * side.length, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("contact", "basis"), METHODS)
+@pytest.mark.parametrize("disc_is_slave", [True, False])
+def test_each_pair_of_a_disc_between_plates_carries_the_load(
+    contact, basis, disc_is_slave
+):
+    case = disc_between_plates(
+        8, contact=contact, basis=basis, disc_is_slave=disc_is_slave
+    )
+    s = Clarabel().prepare(case.qp, 1e-10)()
+    found, sides = case.quantities(s)["contacts"], case.fields(s).contacts
+    on = ("disc on {}", "{} on disc")[not disc_is_slave]
+    total = 3 * PRESS
+
+    assert list(found) == [on.format("lower"), on.format("upper")]
+    for (name, pair), plate, sign in zip(
+        found.items(), ("lower", "upper"), (-1, 1), strict=True
+    ):
+        assert pair["force"][plate] == pytest.approx(
+            [0, sign * total], abs=3e-5 * total
+        )
+        assert pair["force"]["disc"] == pytest.approx(
+            [0, -sign * total], abs=3e-5 * total
+        )
+        assert abs(pair["smallest_gap"]) < 1e-7
+        (side,) = [side for side in sides if side.name == name]
+        assert pair["largest_pressure"] == side.pressure.max()
+        assert 0 < pair["half_width"] < 0.7
+        apart = side.gap[np.abs(side.pressure) < 1e-3 * side.pressure.max()]
+        assert np.nanmin(apart) >= -1e-9
+        assert np.nanmax(side.gap) > 0.01  # the disc curves away
+
+
+def test_hertz_is_found_along_the_side():
+    case = HertzPlane().build("primal", HertzPlane().defaults, reference_solution)
+    s = Clarabel().prepare(case.qp, 1e-10)()
+    found = case.quantities(s)
+    pair = found["contacts"]["cylinder on rigid"]
+
+    assert pair["force"] == {"cylinder": pytest.approx([0, 1e7], rel=1e-6, abs=1e-2)}
+    assert pair["largest_pressure"] == pytest.approx(found["p_max"], rel=1e-4)
+    assert pair["half_width"] == pytest.approx(0.68078e-3, abs=0.68078e-3 / 10)
+
+
+def test_a_node_that_faces_nothing_has_no_gap_and_no_pressure():
+    """The blocks moved by half their width: half the slave side is beside the other."""
+    bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
+    bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
+    rows = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    s = Solution(
+        status=Status.SOLVED, x=np.zeros(bodies.mesh.dofs), y=0 * primal.b,
+        z=np.ones(primal.h.size), z_box=np.zeros(bodies.mesh.dofs),
+    )  # fmt: skip
+    (side,) = contact_sides(bodies, primal, s)
+    x = bodies.mesh.points[side.nodes, 0]
+
+    beside = x > 1.2  # the lower block ends at 1 m
+
+    np.testing.assert_array_equal(np.isnan(side.gap[x < 0.9]), False)
+    assert np.isnan(side.gap[beside]).all()
+    assert not side.pressure[beside].any()
+    assert side.pressure[x < 0.9].min() > 0
+
+
+def test_pairs_that_share_a_slave_side_are_told_apart():
+    bodies = model({**ContactPatch().defaults, "lower": 6, "upper": 4})
+    (pair,) = bodies.pairs
+    left, right = pair.master[:3], pair.master[2:]
+    object.__setattr__(
+        bodies, "pairs",
+        (ContactPair(pair.slave, left), ContactPair(pair.slave, right)),
+    )  # fmt: skip
+    for contact, basis in METHODS:
+        rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
+        one, two = rows_of_pairs(rows.B, bodies)
+        n = rows.B.shape[0]
+
+        assert (one.start, one.stop, two.stop) == (0, two.start, n)
+        if contact == "nts":
+            assert one.stop == len(pair.slave)
+        for part, master in ((one, left), (two, right)):
+            held = np.concatenate([pair.slave, master])
+            assert set(rows.B[part].indices // 2) <= set(held.tolist())
+
+
+def test_lengths_are_those_of_the_undeformed_side():
+    case = disc_between_plates(4)
+    s = Clarabel().prepare(case.qp, 1e-9)()
+    for side in case.fields(s).contacts:
+        points = case.fields(s).points[side.nodes]
+        np.testing.assert_array_equal(side.length, nodal_lengths(points))

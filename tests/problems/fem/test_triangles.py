@@ -1,0 +1,128 @@
+"""Linear triangles, as cells of which two corners are one: against exact elasticity."""
+
+import numpy as np
+import pytest
+from scipy.sparse.linalg import spsolve
+from skfem import Basis, ElementTriP1, ElementVector, MeshTri
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from problems.contact.linearise import linearisation
+from problems.duality.stepping import primal_qp
+from problems.families.patch import ContactPatch
+from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
+from problems.fem.mesh import (
+    as_vectors,
+    boundary_edges,
+    dofs_of,
+    half_ring,
+    rectangle,
+    triangular,
+)
+from problems.fem.stress import centre_stress, recover
+from problems.models.patch import PRESSURE, model
+from solvers.adapters.clarabel_ import Clarabel
+from tests.support.triangles import halved, of_triangles
+
+STEEL = Material(E=200e9, nu=0.3)
+MESHES = [rectangle((0, 0), (2, 1), (6, 4)), half_ring((1, 0), (0.3, 0.5), (12, 3))]
+
+
+@pytest.mark.parametrize("quads", MESHES, ids=["block", "ring"])
+def test_the_stiffness_is_that_of_linear_triangles_of_another_code(quads):
+    mesh = halved(quads)
+    other = Basis(
+        MeshTri(mesh.points.T.copy(), mesh.cells[:, :3].T.copy()),
+        ElementVector(ElementTriP1()),
+    )
+    expected = linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(other)
+    K = stiffness(mesh, elasticity_matrix(STEEL, "strain"))
+
+    assert triangular(mesh.cells).all()
+    assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
+    assert abs(K @ rigid_modes(mesh.points)).max() <= 1e-12 * abs(K).max()
+
+
+@pytest.mark.parametrize("quads", MESHES, ids=["block", "ring"])
+def test_a_constant_strain_has_its_stress_at_centres_and_at_every_node(quads):
+    mesh, D = halved(quads), elasticity_matrix(STEEL, "strain")
+    x, y = mesh.points.T
+    u = np.column_stack([1e-3 * x + 2e-3 * y, 1e-3 * x - 2e-3 * y]).ravel()
+    expected = D @ [1e-3, -2e-3, 3e-3]
+    stress = centre_stress(mesh, D, u)
+
+    assert stress == pytest.approx(np.tile(expected, (len(mesh.cells), 1)))
+    assert recover(mesh, stress) == pytest.approx(np.tile(expected, (len(x), 1)))
+
+
+def test_a_linear_stress_is_recovered_from_the_centroids():
+    """The centroid of a triangle is not the mean of its four listed corners."""
+    mesh = halved(rectangle((0, 0), (1, 1), (5, 4)))
+    centroid = mesh.points[mesh.cells[:, :3]].mean(axis=1)
+    linear = np.array([[1.0, 2.0, 0.5], [-3.0, 1.0, 2.0]])
+
+    assert recover(mesh, centroid @ linear) == pytest.approx(mesh.points @ linear)
+
+
+def test_the_boundary_of_triangles_is_that_of_their_quadrilaterals():
+    for quads in MESHES:
+        one, two = (
+            {tuple(edge) for edge in boundary_edges(m.cells).tolist()}
+            for m in (quads, halved(quads))
+        )
+        assert one == two
+
+
+def bending(n):
+    """Solve pure bending of a plate of n × n halved squares; Dirichlet all around.
+
+    Plane stress, E = 1: u = (xy, −(x² + νy²)/2), σ_x = y, no other stress, no load.
+    """
+    mesh = halved(rectangle((0, -0.5), (1, 1), (n, n)))
+    D = elasticity_matrix(Material(E=1.0, nu=0.3), "stress")
+    K = stiffness(mesh, D)
+    x, y = mesh.points.T
+    u = np.column_stack([x * y, -(x**2 + 0.3 * y**2) / 2]).ravel()
+    held = dofs_of(np.unique(boundary_edges(mesh.cells)))
+    free = np.setdiff1d(np.arange(mesh.dofs), held)
+    u[free] = spsolve(K[free][:, free], -K[free][:, held] @ u[held])
+    exact = np.column_stack([y, 0 * y, 0 * y])
+    stress = recover(mesh, centre_stress(mesh, D, u))
+    return 0.5 * u @ K @ u, np.sqrt(np.mean((stress - exact) ** 2))
+
+
+def test_energies_converge_with_the_square_of_the_size_and_stresses_with_the_size():
+    """½∫y² = 1/24; the strain of a linear triangle has an error of first order."""
+    (e1, s1), (e2, s2), (e4, s4) = (bending(n) for n in (8, 16, 32))
+    excess = np.array([e1, e2, e4]) - 1 / 24
+
+    assert (excess > 0).all()
+    assert excess[:-1] / excess[1:] == pytest.approx([4, 4], rel=0.1)
+    assert [s1 / s2, s2 / s4] == pytest.approx([2, 2], rel=0.1)
+
+
+def pressed(which, **given):
+    """Solve the contact patch test, bodies of `which` made of triangles."""
+    p = {**ContactPatch().defaults, "lower": 7, "upper": 5, **given}
+    bodies = of_triangles(model(p), np.array(which))
+    rows = linearisation(bodies, p["contact"], p["basis"])(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    s = Clarabel().prepare(primal, 1e-12)()
+    stress = centre_stress(bodies.mesh, bodies.D, s.x * bodies.length)
+    return bodies, primal, s, np.abs(stress - [0, -PRESSURE, 0]).max() / PRESSURE
+
+
+@pytest.mark.parametrize("which", [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize("basis", ["dual", "standard"])
+def test_mortar_passes_the_patch_test_on_triangles(which, slave, basis):
+    assert pressed(which, slave=slave, basis=basis)[-1] <= 1e-8
+
+
+def test_node_to_segment_fails_it_on_triangles_too_but_passes_the_whole_force():
+    bodies, primal, s, error = pressed((True, True), contact="nts")
+    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force)
+
+    assert error > 0.05
+    assert forces[bodies.body_of_node == 0].sum(axis=0) == pytest.approx(
+        [0, -PRESSURE], abs=1
+    )

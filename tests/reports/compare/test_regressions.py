@@ -1,0 +1,171 @@
+"""What a CI fails on: no more than one alarm in twenty, and regressions are found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from harness import Record, Verdict
+from reports.compare.changes import compare
+from reports.compare.conclusions import verdict_lines
+from reports.compare.regressions import CELLS, regressions
+from reports.data.evidence import Evidence, arrange
+
+SOLVERS = ("one", "two", "three")
+
+
+def record(solver, case, repeat, seconds, **changes):
+    defaults = dict(
+        run_id=f"{solver}-{case}-{repeat}", case=f"box/n={case}/dual", family="box",
+        params={"n": case}, form="dual", sizes={}, solver=solver, options={}, tol=1e-6,
+        repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
+        total_seconds=seconds, environment="e",
+    )  # fmt: skip
+    return Record(**(defaults | changes))
+
+
+def session(rng, name, *, draw, cases=8, repeats=4, slower=None, solvers=SOLVERS):
+    """Measure once; what slows the session, a case or a block down is common to all.
+
+    draw : logarithms that scatter by about one tenth, of a shape
+    slower : factors by solver, or by solver and case
+    """
+    slower = slower or {}
+    drift = draw(rng)
+    made = []
+    for case in range(cases):
+        while_case = draw(rng)
+        for repeat in range(repeats):
+            while_block = draw(rng)
+            for solver in solvers:
+                factor = slower.get(solver, 1.0) * slower.get((solver, case), 1.0)
+                noise = drift + while_case + while_block + 0.5 * draw(rng)
+                seconds = 1e-3 * 2.0**case * factor * np.exp(noise)
+                made.append(record(solver, case, repeat, seconds, session=name))
+    return made
+
+
+@pytest.fixture
+def changed(tmp_path):
+    def make(before, after):
+        one, two = (
+            Evidence(directory=tmp_path / n, records=arrange(r))
+            for n, r in (("a", before), ("b", after))
+        )
+        return compare(one, two)
+
+    return make
+
+
+def normal(rng):
+    return rng.normal(0, 0.1)
+
+
+def heavy(rng):
+    """Student's with three degrees of freedom."""
+    return 0.1 * rng.standard_t(3) / np.sqrt(3)
+
+
+def skewed(rng):
+    """Nothing most of the time, and now and then half as long again."""
+    return rng.exponential(0.1) + 0.4 * (rng.random() < 0.05)
+
+
+@pytest.mark.parametrize(
+    ("draw", "shape"), [(normal, (8, 3, 3)), (heavy, (10, 3, 2)), (skewed, (3, 2, 2))]
+)
+def test_equal_runs_alarm_at_most_once_in_twenty(changed, draw, shape):
+    """No more often than is likely where every twentieth pair of runs alarms."""
+    cases, repeats, solvers = shape
+    rng = np.random.default_rng(662607)
+    shape = dict(cases=cases, repeats=repeats, solvers=SOLVERS[:solvers])
+    pairs = 40
+    alarms = sum(
+        bool(
+            regressions(
+                changed(
+                    session(rng, "a", draw=draw, **shape),
+                    session(rng, "b", draw=draw, **shape),
+                )
+            ).slower
+        )
+        for _ in range(pairs)
+    )
+    assert alarms <= binom.ppf(0.99, pairs, 0.05)
+
+
+def test_a_solver_that_takes_half_as_long_again_is_found_and_nobody_else(changed):
+    rng = np.random.default_rng(314159)
+    slower = session(rng, "b", draw=normal, slower={"two": 1.5})
+    c = changed(session(rng, "a", draw=normal), slower)
+    found = regressions(c)
+
+    assert {one.solver for one in found.slower} == {"two"}
+    over = next(one for one in found.slower if not one.case)
+    assert over.relative.low < 1.5 < over.relative.high
+    assert (found.solvers, found.cells) == (3, 24)
+    said = "Slower, beyond chance and the machine: two 1."
+    assert any(line.startswith(said) for line in verdict_lines(c))
+    back = regressions(changed(slower, session(rng, "c", draw=normal))).slower
+    assert "two" not in {one.solver for one in back}
+
+
+def test_a_single_case_that_takes_much_longer_is_found_by_itself(changed):
+    rng = np.random.default_rng(141421)
+    after = session(rng, "b", draw=normal, slower={("two", 3): 4.0})
+    found = regressions(changed(session(rng, "a", draw=normal), after)).slower
+
+    assert [(one.solver, one.case) for one in found] == [("two", "box/n=3/dual")]
+
+
+def test_what_slows_all_solvers_down_is_the_machine(changed):
+    rng = np.random.default_rng(271828)
+    twice = dict.fromkeys(SOLVERS, 2.0)
+    c = changed(
+        session(rng, "a", draw=normal), session(rng, "b", draw=normal, slower=twice)
+    )
+    assert not regressions(c).slower
+
+
+def test_who_only_falls_behind_others_that_became_faster_is_not_slower(changed):
+    rng = np.random.default_rng(173205)
+    faster = {"two": 0.3, "three": 0.3}
+    c = changed(
+        session(rng, "a", draw=normal), session(rng, "b", draw=normal, slower=faster)
+    )
+    assert not regressions(c).slower
+
+
+def test_the_more_folders_are_compared_the_wider_are_the_intervals(changed):
+    rng = np.random.default_rng(223606)
+    after = session(rng, "b", draw=normal, slower={"two": 2.0})
+    c = changed(session(rng, "a", draw=normal), after)
+    one, many = (regressions(replace(c, folders=n)).slower[0] for n in (1, 10))
+
+    assert many.relative.value == one.relative.value
+    assert many.relative.low < one.relative.low
+    assert many.ratio.high > one.ratio.high
+
+
+def test_where_nothing_can_be_judged_it_is_said_why(changed):
+    rng = np.random.default_rng(244948)
+
+    def why(after_too=lambda made: made, **shape):
+        before = session(rng, "a", draw=normal, **shape)
+        found = regressions(
+            changed(before, after_too(session(rng, "b", draw=normal, **shape)))
+        )
+        assert not found.slower
+        return found.why_not
+
+    def elsewhere(made):
+        return [r.but(environment="f") for r in made]
+
+    assert why(solvers=("one",)).endswith("add one that does not change")
+    assert why(repeats=1) == "no cell has two verified repeats in both folders"
+    assert why(elsewhere) == "no cell was measured on equal machines in both folders"
+    assert (
+        why(cases=2) == f"fewer than 3 cases of a solver, and of {CELLS} cells in all"
+    )
+    assert why(cases=3) == ""
