@@ -95,7 +95,7 @@ def prepared(
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
         solve=solve, solver=solver, history=history,
-        start=_start(problem, options, carry, tol),
+        start=_start(problem, options, carry, tol, solver),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -136,14 +136,21 @@ def _lanczos_steps(options: Options, n: int) -> int:
 
 
 def _start(
-    problem: Projected, options: Options, carry: Carry | None, tol: float
+    problem: Projected,
+    options: Options,
+    carry: Carry | None,
+    tol: float,
+    solver: compiled.Solver | None,
 ) -> Iterate:
     """Start from zero, or from where the problem before ended."""
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), np.zeros(len(C))
     if carry is not None:
         x, mu = carry.x, C @ carry.force / problem.spectrum.norm
-    return first_iterate(problem, x, mu, M=options.M, rho=_penalty(options, tol))
+    rho = _penalty(options, tol)
+    if solver is None:
+        return first_iterate(problem, x, mu, M=options.M, rho=rho)
+    return Iterate(*solver.begin(x, mu, rho), mu, options.M, rho)
 
 
 def _penalty(options: Options, tol: float) -> float:
@@ -195,7 +202,7 @@ def _compiled_loop(
     at: Iterate,
 ) -> Iterate:
     nu, g, mu, M, rho, done, status = solver.smalbe(
-        constants, tol, at, partial(infeasible, problem),
+        constants, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
     outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
@@ -308,9 +315,10 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
     qp = task.qp
     if task.solver is not None and task.eliminated is None:
-        bound: float = task.solver.residual_bound(
-            point.x, point.y, point.z_box, Fx, qp.lb, qp.ub, task.problem.rows.G, qp.b
-        )
+        bound = compiled.residual_bound(
+            qp.q, task.problem.diagonal, point.x, point.y, point.z_box, Fx,
+            qp.lb, qp.ub, qp.b, G=task.problem.rows.G,
+        )  # fmt: skip
         if bound <= enough:
             return bound
     task.problem.F.count += 1
