@@ -74,6 +74,8 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     An active row sticks up to the slip that the rest of its bound would bring about on
     the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
     """
+    if not friction.bound.size:
+        return np.zeros(0, dtype=np.str_)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
