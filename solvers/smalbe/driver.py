@@ -51,6 +51,7 @@ class Carry(NamedTuple):
     """What one problem of a sequence leaves for the next."""
 
     x: Vector  #: (n,)
+    side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper one, else 0
     force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
     spectrum: Spectrum
     block: FreeBlock | None
@@ -142,11 +143,18 @@ def _start(
     tol: float,
     solver: compiled.Solver | None,
 ) -> Iterate:
-    """Start from zero, or from where the problem before ended."""
+    """Start from zero, or from where the problem before ended.
+
+    What was at a bound there begins at that bound here, wherever it is now: rows that
+    slip go on slipping when their friction changes.
+    """
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), np.zeros(len(C))
     if carry is not None:
-        x, mu = carry.x, C @ carry.force / problem.spectrum.norm
+        lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
+        x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
+        x = np.where(np.isfinite(x), x, carry.x)
+        mu = C @ carry.force / problem.spectrum.norm
     rho = _penalty(options, tol)
     if solver is None:
         return first_iterate(problem, x, mu, M=options.M, rho=rho)
@@ -262,8 +270,13 @@ def _nothing() -> None:
 
 def _carry(task: _Task, at: Iterate) -> Carry:
     problem, eliminated = task.problem, task.eliminated
+    lower, upper = problem.bounds
+    side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
+    held = lower == upper
+    side[held] = -np.sign(at.g[held])  # where it would go
     return Carry(
         x=problem.rows.x_tilde + at.nu,
+        side=side,
         force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
         spectrum=problem.spectrum,
         block=eliminated and eliminated.block,

@@ -67,7 +67,7 @@ class Spectrum(NamedTuple):
         if self.ritz is None:
             return self
         V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
-        vectors = (V * np.sign(np.diag(R))).T
+        vectors = np.ascontiguousarray((V * np.sign(np.diag(R))).T)
         return self._replace(ritz=self.ritz._replace(vectors=vectors))
 
 
