@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from harness import Case
-from problems.contact.bodies import ContactPair, assemble, clamped, floating, supported
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
 from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
@@ -18,9 +25,7 @@ from solvers.reference.solve import reference_solution
 WEIGHT = 1e5  #: G, N/m
 
 
-def block_on_incline(
-    ratio: float, law: FrictionLaw, *, slope: float = 0.1, form: str = "dual"
-) -> Case:
+def incline(ratio: float, slope: float = 0.1) -> Bodies:
     """Push a block of weight G up an incline by the horizontal force ratio·G.
 
     Drawn with the incline along x; nothing but contact and friction holds the block.
@@ -36,13 +41,18 @@ def block_on_incline(
     of_block = np.unique(mesh.cells[body == 1])
     load[of_block] = np.array([along, -onto]) * WEIGHT / of_block.size
     held = sides["base_bottom"]
-    bodies = assemble(
+    return assemble(
         mesh, body, names=("base", "block"),
         materials=(Material(2e9, 0.3), Material(1e9, 0.3)), plane="strain",
         units=(1.0, WEIGHT), fixed=np.concatenate([2 * held, 2 * held + 1]),
         load=load.ravel(),
         pairs=(ContactPair(sides["block_bottom"], sides["base_top"]),),
     )  # fmt: skip
+
+
+def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
+    """Emit the QP of the block under a law of friction, in one form."""
+    bodies = incline(ratio)
     linearise = linearisation(bodies, "mortar", "dual", (law,))
     primal, friction = single_load(
         bodies, linearise, (law,),

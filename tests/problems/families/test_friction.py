@@ -4,10 +4,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.sparse import vstack
 
 from harness import InputError, kkt_residuals
 from harness.names import parse
 from problems import PROBLEMS
+from problems.contact.balance import check_balance
 from problems.contact.bodies import ContactPair, assemble, clamped
 from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
@@ -17,7 +19,7 @@ from problems.fem.elasticity import Material
 from problems.fem.mesh import dofs_of, rectangle
 from problems.models.patch import model
 from solvers.reference.solve import reference_solution
-from tests.support.incline import WEIGHT, block_on_incline
+from tests.support.incline import WEIGHT, block_on_incline, incline
 
 SMALL = "beam-ring/Nr=3/Nh=2/steps=1"
 
@@ -160,6 +162,16 @@ def test_a_block_on_an_incline_slips_at_its_limit():
     assert across / -onto == pytest.approx(0.3, abs=1e-3)
     with pytest.raises(InputError, match="no equilibrium was found with the"):
         block_on_incline(limit + 4e-4, COULOMB)
+
+
+def test_loads_are_balanced_where_friction_may_hold_them():
+    """As `bodies:` ask before they solve; without friction the block slides."""
+    bodies = incline(0.3)
+    rows = linearisation(bodies, "nts", "dual", (COULOMB,))(np.zeros(bodies.mesh.dofs))
+
+    check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+    with pytest.raises(InputError, match="'block': nothing balances its load in x"):
+        check_balance(bodies, rows.B)
 
 
 @pytest.mark.parametrize("push", [0.2, -0.1])
