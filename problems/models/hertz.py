@@ -40,6 +40,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Friction, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
@@ -146,8 +147,8 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     load = pressed(mesh, sides["upper_flat"], exact.P)
     if p["peak"]:
         load += pressed(mesh, flat, -exact.P)
-        centre = flat[flat.size // 2]
-        fixed = np.array([2 * centre, 2 * centre + 1, 2 * flat[0] + 1])
+        axis = _on_axis(mesh, "lower_")  # supports that bend no symmetry
+        fixed = np.append(2 * axis, 2 * flat[flat.size // 2] + 1)
     else:
         fixed = np.concatenate([
             2 * _on_axis(mesh, "upper_"), 2 * _on_axis(mesh, "lower_"), 2 * flat + 1
@@ -159,6 +160,18 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
                else ContactPair(lower, upper),),
     )  # fmt: skip
     return bodies, exact
+
+
+def kept_on_axis(bodies: Bodies) -> Bodies:
+    """Add supports u_x = 0 on the axis of the upper one, which P does not load.
+
+    Two cylinders without friction roll on each other almost freely: nothing but the
+    polygons that their arcs are resists. The slip of the next step would begin there,
+    and Q would do work on it.
+    """
+    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh, "upper_"))
+    rows = eye_array(bodies.mesh.dofs, format="csr")[held]
+    return replace(bodies, B_D=csr_array(rows))
 
 
 def sheared(mesh: Mesh) -> Vector:
@@ -182,8 +195,9 @@ def _friction_path(
     law, mesh = law_of(p), bodies.mesh
     linearise = linearisation(bodies, p["contact"], p["basis"], (law,))
     rows = linearise(np.zeros(mesh.dofs))
+    guided = kept_on_axis(bodies)
     path = LoadPath(
-        bodies, lambda u: rows, floating(bodies), reference, steps=1,
+        bodies, lambda u: rows, floating(guided), reference, steps=1,
         transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
     )  # fmt: skip
     if not p["peak"]:
@@ -197,7 +211,7 @@ def _friction_path(
     else:
         loads = [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
     part = loads[0][0]  # of P in the step before, whose normal forces grow with P
-    pressing = replace(bodies, f=part * bodies.f)
+    pressing = replace(guided, f=part * bodies.f)
     smooth = linearisation(bodies, p["contact"], p["basis"])
     u, pressed = replace(path, bodies=pressing, linearise=smooth, laws=()).state(1)
     if static or together:
