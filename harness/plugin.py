@@ -85,6 +85,9 @@ class ContactSide:
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
     friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
+    #: (k, 3) of the exact solution, where it is known: distance along the side from its
+    #: middle, m, pressure and shear, Pa
+    exact: NDArray[Any] | None = None
 
     def pressed(self, least: float) -> NDArray[Any]:
         """Tell which nodes (s,) press on the other side.
