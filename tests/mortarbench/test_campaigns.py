@@ -15,6 +15,7 @@ from harness.files.reading import read_toml
 from harness.files.store import is_stored
 from harness.results.folder import environment_of
 from harness.results.journal import Journal, read_journal
+from mortarbench import reporting
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from reports.data.evidence import read_evidence
@@ -335,7 +336,12 @@ def cli(tmp_path, capsys, monkeypatch):
     return cli
 
 
-def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(cli, tmp_path):
+def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
+    cli, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        reporting, "report", lambda *_, **__: reporting.Report(files=())
+    )
     asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
     (tmp_path / "s.toml").write_text(
         suite('"exact", "picky", "liar", "lost"', depths="2")
