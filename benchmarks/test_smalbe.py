@@ -22,7 +22,9 @@ PERMON = {
     (30, 15, 1): (132, 204), (30, 15, 5): (129, 214), (30, 15, 10): (176, 255),
 }  # fmt: skip
 TOLERANCES = (1e-6, 1e-8)
-OURS = ("smalbe", "smalbe-condensed", "pdas", "projected-gradient", "bvls")
+OURS = (
+    "smalbe", "smalbe-direct", "smalbe-condensed", "pdas", "projected-gradient", "bvls",
+)  # fmt: skip
 
 
 def dual(Nr, Nh, step, form="dual"):

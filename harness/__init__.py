@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from harness.errors import InputError
     from harness.files.qpfile import save_qp
     from harness.limits import memory_limit_mib, too_large
-    from harness.mechanics import Grid, Mechanics
+    from harness.mechanics import Friction, Grid, Mechanics
     from harness.plugin import (
         About,
         Case,
@@ -37,6 +37,7 @@ _MODULES = {
     "Family": "harness.plugin",
     "ContactSide": "harness.plugin",
     "Fields": "harness.plugin",
+    "Friction": "harness.mechanics",
     "Grid": "harness.mechanics",
     "InputError": "harness.errors",
     "Matrix": "harness.qp",
@@ -80,6 +81,7 @@ __all__ = [
     "ContactSide",
     "Family",
     "Fields",
+    "Friction",
     "Grid",
     "InputError",
     "Matrix",

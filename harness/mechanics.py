@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
 
-from harness.qp import QP, Matrix, Vector
+from harness.qp import QP, Matrix, Vector, no_rows
 from harness.solution import Solution
 
 #: extended where the machine has it (x86: 64-bit mantissa), so that residuals near the
@@ -45,15 +45,124 @@ class Inverse(Protocol):
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n)."""
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Friction:
+    """Friction with a given bound, as Tresca's law has it; none without rows.
+
+    ::
+
+        Σ gᵢ|Tᵢu − sᵢ|  joins the energy;  its multipliers are  |λᵢ| ≤ gᵢ
+
+    T u is the tangential motion of the slave against the master, and s is where it
+    began: zero for one static load, and T u of the step before for slip increments. A
+    contact row may have several rows, one for each tangential direction, in turn.
+
+    The law of the row says what the bound should be, g = cohesion + mu·λ_n with the
+    multiplier λ_n of its contact row: Tresca's has no mu, Coulomb's no cohesion.
+    """
+
+    T: csr_array  #: (k, n) tangential rows
+    bound: Vector  #: (k,) g ≥ 0, a force
+    start: Vector  #: (k,) s, a length
+    row: NDArray[np.int64]  #: (k,) the contact row of each
+    cohesion: Vector  #: (k,) a force
+    mu: Vector  #: (k,) coefficient of friction
+
+    def demanded(self, normal: Vector) -> Vector:
+        """Return cohesion + mu·λ_n (k,), never negative, for normal forces (m,)."""
+        return np.asarray(self.cohesion + self.mu * np.maximum(normal[self.row], 0.0))
+
+    def residual(self, normal: Vector) -> float:
+        """Return ‖g − (cohesion + mu·λ_n)‖/‖g‖, absolute where g vanishes."""
+        off = float(np.linalg.norm(self.bound - self.demanded(normal)))
+        return off / (float(np.linalg.norm(self.bound)) or 1.0)
+
+    def __getitem__(self, kept: NDArray[Any]) -> Friction:
+        """Keep some of the rows."""
+        data = {name: value[kept] for name, value in vars(self).items()}
+        return Friction(**data)
+
+
+_NOTHING = np.zeros(0)
+NO_FRICTION = Friction(
+    T=no_rows(0), bound=_NOTHING, start=_NOTHING, row=np.zeros(0, dtype=np.int64),
+    cohesion=_NOTHING, mu=_NOTHING,
+)  # fmt: skip
+
+
+def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
+    """Stack the rows of contact and friction:  B (m + k, n)  and  c (m + k,)."""
+    B = csr_array(primal.G)
+    if not friction.bound.size:
+        return B, primal.h
+    return csr_array(vstack([B, friction.T])), np.append(primal.h, friction.start)
+
+
+def with_friction(primal: QP, friction: Friction) -> QP:
+    """Emit the problem with friction as a QP: of each |·| one more variable.
+
+    ::
+
+        min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
+                                              Tu − t ≤ s,  −Tu − t ≤ −s
+
+    of the rows with g > 0; the point is (u, t), and λ_t is the difference of the
+    multipliers of the last two rows. Without such rows it is `primal` itself.
+    """
+    moving = friction[friction.bound > 0]
+    k, n = moving.T.shape
+    if not k:
+        return primal
+    one = eye_array(k)
+    return QP(
+        P=csc_array(block_array([[primal.P, None], [None, csc_array((k, k))]])),
+        q=np.append(primal.q, moving.bound),
+        A=csr_array(block_array([[primal.A, csr_array((primal.b.size, k))]])),
+        b=primal.b,
+        G=csr_array(block_array([
+            [primal.G, None], [moving.T, -one], [-moving.T, -one],
+        ])),
+        h=np.concatenate([primal.h, moving.start, -moving.start]),
+        lb=np.full(n + k, -np.inf), ub=np.full(n + k, np.inf),
+    )  # fmt: skip
+
+
 class Exact(NamedTuple):
-    """The data of the primal QP in extended precision."""
+    """The data of the contact problem in extended precision.
+
+    The rows are those of the contact and, below them, those of the friction. With
+    v = Bu − c all have one law: the multiplier is between its bounds, v = 0 where it is
+    strictly between them, v ≤ 0 at the lower and v ≥ 0 at the upper one.
+    """
 
     K: Any  #: (n, n) sparse
     f: Extended  #: (n,)
-    B: Any  #: (m, n) sparse contact rows
+    B: Any  #: (m, n) sparse, contact and friction
     c: Extended  #: (m,)
+    lower: Extended  #: (m,) 0 of contact, −g of friction
+    upper: Extended  #: (m,) ∞ of contact, g of friction
     held: NDArray[np.int64]  #: prescribed components
     loose: Extended  #: (m,) estimate of the compliance of each row, B_i diag(K)⁻¹B_iᵀ
+
+    @property
+    def contact(self) -> NDArray[np.bool_]:
+        """Which rows are of the contact, (m,)."""
+        return np.asarray(np.isinf(self.upper))
+
+    def motion(self, u: Extended) -> Extended:
+        """Return v = Bu − c (m,): penetration, and slip of the friction rows."""
+        return np.asarray(self.B @ u - self.c)
+
+    def friction_work(self, u: Extended) -> Extended:
+        """Return g|v| (m,); zero of contact rows, whose v must not be positive."""
+        bound = np.where(self.contact, 0, self.upper)
+        return np.asarray(bound * np.abs(self.motion(u)))
+
+    def interior(self, multipliers: Extended) -> Extended:
+        """Return the distance (m,) of multipliers from their bounds; λ of contact."""
+        return np.asarray(
+            np.minimum(multipliers - self.lower, self.upper - multipliers)
+        )
 
 
 class RigidMotions(NamedTuple):
@@ -90,11 +199,14 @@ class Mechanics:
     ::
 
         min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
+
+    and with friction, what its rows add to the energy.
     """
 
     #: P = K, q = −f, A has one unit entry per prescribed component, b = 0, G = B, h = c
     primal: QP
-    back: Callable[[Solution], Solution]  #: of the emitted QP → of `primal`
+    #: of the emitted QP → x = u, y of the supports, z of contact and friction rows
+    back: Callable[[Solution], Solution]
     factorise: Callable[[], Inverse]  #: called once, if at all
     mesh_size: float  #: of the contact side, in the lengths of `primal`
     #: rigid motions of single bodies (n, r), supports or not: to balance forces with
@@ -105,6 +217,27 @@ class Mechanics:
     grid: Grid | None = (
         None  #: to compare meshes, see `harness.crossval.discretisation`
     )
+    friction: Friction = NO_FRICTION
+
+    @cached_property
+    def rows(self) -> csr_array:
+        """All rows B (m, n): of the contact, then of the friction."""
+        return contact_rows(self.primal, self._carrying)[0]
+
+    @cached_property
+    def program(self) -> QP:
+        """The problem as a QP, see `with_friction`; `primal` without friction."""
+        return with_friction(self.primal, self.friction)
+
+    def multipliers(self, s: Solution) -> Vector:
+        """Return λ (m,) of `rows` from a solution that `back` gives."""
+        contact = self.primal.h.size
+        return np.append(s.z[:contact], s.z[contact:][self.friction.bound > 0])
+
+    @cached_property
+    def _carrying(self) -> Friction:
+        """The friction that there is: rows of bound zero neither carry nor cost."""
+        return self.friction[self.friction.bound > 0]
 
     @cached_property
     def inverse(self) -> Inverse:
@@ -114,19 +247,27 @@ class Mechanics:
     @cached_property
     def exact(self) -> Exact:
         """The data in extended precision."""
-        K, B = csr_array(self.primal.P), csr_array(self.primal.G)
+        K, B = csr_array(self.primal.P), self.rows
+        c = contact_rows(self.primal, self._carrying)[1]
+        bound, contact = self._carrying.bound.astype(Real), self.primal.h.size
         held = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(K.diagonal() > 0, K.diagonal(), np.inf)
         softness[held] = 0
         return Exact(
             K=K.astype(Real), f=-self.primal.q.astype(Real), B=B.astype(Real),
-            c=self.primal.h.astype(Real), held=held,
+            c=c.astype(Real), held=held,
+            lower=np.append(np.zeros(contact, dtype=Real), -bound),
+            upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
             loose=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 
     def energy(self, u: Extended) -> float:
-        """Return the potential energy of `u` (n,), SI, summed in extended precision."""
+        """Return the potential energy of `u` (n,), SI, summed in extended precision.
+
+        The work of friction is a part of it.
+        """
         objective = 0.5 * (u @ (self.exact.K @ u)) - self.exact.f @ u
+        objective = objective + self.exact.friction_work(u).sum()
         return float(self.scale * objective + self.constant)
 
     @cached_property
@@ -137,7 +278,7 @@ class Mechanics:
     @cached_property
     def motions(self) -> RigidMotions:
         """These motions, split by whether contact feels them."""
-        exact, B, R = self.exact, csr_array(self.primal.G), self.inverse.kernel
+        exact, B, R = self.exact, self.rows, self.inverse.kernel
         turn, p = felt_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
         felt = turned[:, :p]
@@ -159,7 +300,7 @@ class Mechanics:
         A displacement v without rigid motion changes the gap of row i by no more than
         this times ‖v‖_K.
         """
-        B, R = csr_array(self.primal.G), self.inverse.kernel
+        B, R = self.rows, self.inverse.kernel
         squares = np.zeros(B.shape[0])
         moved = np.stack([self.inverse(r) for r in R.T], axis=1) if R.size else R
         G, G_moved, RKR = B @ R, B @ moved, R.T @ moved

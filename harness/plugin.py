@@ -83,6 +83,8 @@ class ContactSide:
     force: NDArray[Any]  #: (s, 2) on each node by this contact, N/m
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
+    shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
+    friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 #: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {
     "energy": "J/m",
+    "dissipation": "J/m",
     "tip": "m",
     "contact_force": "N/m",
     "multiplier_sum": "N/m",

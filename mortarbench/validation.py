@@ -16,7 +16,7 @@ from harness.crossval.summary import as_data
 from harness.crossval.validation import validated
 from harness.errors import InputError
 from harness.files.durable import full_disk_told, replace_file
-from harness.names import assemble
+from harness.names import CaseId, assemble
 from harness.results.journal import read_journal
 from mortarbench.arguments import budget as checked_budget
 from mortarbench.progress import ignore
@@ -117,9 +117,17 @@ def _meshes(
         if r.family in families:
             with suppress(InputError):  # of another version: listed as not validated
                 case = assemble(families[r.family], r.params, r.form)
-                if case.family.refined(case.params) is not None:
+                if _refines(case):
                     cases.append(case)
     return discretisation_errors(cases, registries.reference, folder, seconds, progress)
+
+
+def _refines(case: CaseId) -> bool:
+    """Whether its family says what a finer mesh is, or why there is none."""
+    try:
+        return case.family.refined(case.params) is not None
+    except InputError:  # which is told of the case
+        return True
 
 
 def _mesh(d: Discretisation) -> str:

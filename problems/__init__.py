@@ -9,6 +9,8 @@ PROBLEMS: Registry[Family] = Registry(
         "contact-patch": entry("problems.families.patch", "ContactPatch"),
         "hertz-plane": entry("problems.families.hertz", "HertzPlane"),
         "hertz-cylinder": entry("problems.families.hertz", "HertzCylinder"),
+        "half-plane": entry("problems.families.half_plane", "HalfPlane"),
+        "greco": entry("problems.families.greco", "Greco"),
         "obstacle": entry("problems.families.obstacle", "Obstacle"),
         "string": entry("problems.families.variational", "String"),
         "journal-bearing": entry("problems.families.variational", "JournalBearing"),

@@ -17,10 +17,22 @@ CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 #: values of the keys that choose the method; node-to-segment takes no notice of basis
 METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
 PLANES = {"plane": ("strain", "stress")}
+#: the keys of friction with their defaults; -1 is no bound and no mu
+LAW: Mapping[str, Value] = {
+    "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static"
+}  # fmt: skip
+FRICTION: Mapping[str, Value] = {**LAW, "iterate": 0}
 #: what the name of a case of bodies may set, with the value where its file says nothing
 SETTINGS: Mapping[str, Value] = {
-    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1
+    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1, **LAW
 }  # fmt: skip
+#: the laws of friction, each with the key that it needs
+LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
+LOADINGS = {"loading": ("quasi-static", "static")}
+NEEDED = {
+    "bound": "a traction of 0 or more, Pa",
+    "mu": "a coefficient of friction of 0 or more",
+}
 LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
 MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
 COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
@@ -86,6 +98,61 @@ def fits(family: str, components: int) -> None:
         )
 
 
+def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) -> None:
+    """Raise InputError unless the keys of friction fit together.
+
+    elsewhere : whether pairs of sides may have laws of their own
+    """
+    one_of(family, params, {"friction": tuple(LAWS), **LOADINGS})
+    law = str(params["friction"])
+    for key, what in NEEDED.items():
+        value = float(params[key])
+        if key != LAWS[law] and value != FRICTION[key]:
+            (user,) = (other for other, needed in LAWS.items() if needed == key)
+            raise InputError(
+                f"{family}: {key}={value:g} is not used by friction={law}; expected "
+                f"no {key}, or friction={user}"
+            )
+        if key == LAWS[law] and value == FRICTION[key] and not elsewhere:
+            raise InputError(f"{family}: friction={law} needs {key}, {what}")
+        if value != FRICTION[key] and not (value == 0 or LEAST <= value <= MOST):
+            raise InputError(f"{family}: {key}={value:g}; expected {what}")
+    at_least(0, family, params, ("iterate",))
+    if law == "none" and not elsewhere and params["loading"] != FRICTION["loading"]:
+        raise InputError(
+            f"{family}: loading={params['loading']} is not used by friction=none; "
+            "expected no loading, or friction=tresca or friction=coulomb"
+        )
+    if law != "coulomb" and not elsewhere and params["iterate"]:
+        raise InputError(
+            f"{family}: iterate={params['iterate']} is not used by friction={law}; "
+            "expected friction=coulomb, whose fixed point has iterates"
+        )
+
+
+def without_friction(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError where there is friction on sides that halving bends."""
+    if params["friction"] != "none":
+        raise InputError(
+            f"{family}: friction={params['friction']} on curved sides, whose slip is "
+            "another on finer meshes; expected friction=tresca on flat sides"
+        )
+
+
+def tangential(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak: parts of μP, no sliding."""
+    Q, peak = float(params["Q"]), float(params["peak"])
+    if not 0 < peak < 1:
+        key = "Q" if peak == Q else "peak"
+        raise InputError(
+            f"{family}: {key}={params[key]} must be between 0 and 1, a part of μP"
+        )
+    if abs(Q) > peak:
+        raise InputError(
+            f"{family}: Q={params['Q']} must be between -peak and peak={params['peak']}"
+        )
+
+
 def one_of(
     family: str, params: Mapping[str, Value], known: Mapping[str, tuple[Value, ...]]
 ) -> None:
@@ -101,3 +168,14 @@ def one_of(
 def doubled(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
     """Return the integer `keys`, numbers of cells, twice as large."""
     return {key: 2 * int(params[key]) for key in keys}
+
+
+def fits_dense(family: str, n: int) -> None:
+    """Raise InputError for a full matrix of n² numbers that cannot fit into memory."""
+    needed, limit = 8 * n**2 / 2**20, case_limit_mib()
+    if needed > limit:
+        raise InputError(
+            f"{family}: a full matrix of {n} rows takes {needed:.2g} MiB of memory; "
+            f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
+            "what there is"
+        )

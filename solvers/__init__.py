@@ -7,6 +7,7 @@ SOLVERS: Registry[Solver] = Registry(
     {
         "smalbe": entry("solvers.smalbe.solver", "SMALBE"),
         "smalbe-condensed": entry("solvers.smalbe.solver", "CONDENSED"),
+        "smalbe-direct": entry("solvers.smalbe.direct", "Direct"),
         "smalbe-permon": entry("solvers.smalbe.solver", "PERMON"),
         "smalbe-espreso": entry("solvers.smalbe.solver", "ESPRESO"),
         "smalbe-paper": entry("solvers.smalbe.solver", "PAPER"),

@@ -23,6 +23,7 @@ MODULES = {
     "problems.fem.elimination": ["-ffp-contract=off"],
     # sums may be vectorised, which needs another order; inf and NaN are kept
     "solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
+    "solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],
 }
 
 

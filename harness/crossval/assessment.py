@@ -48,7 +48,8 @@ class Assessment:
     balance: float | None  #: worst force or moment left on a body, of those on it
     active: int | None  #: rows that are closed
     rows: tuple[int, ...] = ()  #: closed in truth and open here, or the reverse
-    pulls: tuple[int, ...] = ()  #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ
+    #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ, or exceeds the bound of friction so
+    pulls: tuple[int, ...] = ()
 
 
 class Deviation(NamedTuple):
@@ -67,32 +68,34 @@ def energy_allowed(tol: float) -> float:
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
 ) -> tuple[Assessment, Deviation]:
-    """Measure `s`, a finite point of ``mechanics.primal``, against its solution.
+    """Measure `s`, a finite point as ``mechanics.back`` gives it, against the solution.
 
     Where that is zero, against what the load would do without contact.
     """
-    exact, primal = mechanics.exact, mechanics.primal
-    u, lam = s.x.astype(Real), s.z.astype(Real)
-    gap = exact.c - exact.B @ u
+    exact = mechanics.exact
+    u, lam = s.x.astype(Real), mechanics.multipliers(s).astype(Real)
+    gap, contact = -exact.motion(u), exact.contact
     at_rest, _ = equilibrium(mechanics, exact.f - exact.B.T @ lam)
     off, off_rest = u - truth.u, at_rest - truth.equilibrium
     slope = exact.K @ truth.u - exact.f
-    energy = float(slope @ off + 0.5 * (off @ (exact.K @ off)))
+    rubbed = exact.friction_work(u) - exact.friction_work(truth.u)
+    energy = float(slope @ off + 0.5 * (off @ (exact.K @ off)) + rubbed.sum())
     length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
     small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
     closed, strict = _closed(exact, lam, gap, small)
-    true_gap = exact.c - exact.B @ truth.u
+    true_gap = -exact.motion(truth.u)
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
-    contradicted = (closed != true_closed) & strict & true_strict
+    contradicted = (closed != true_closed) & strict & true_strict & contact
+    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.loose
     assessment = Assessment(
         error=_over(mechanics.norm(off), length),
         equilibrium_error=_over(mechanics.norm(off_rest), length),
         energy=_over(energy, 0.5 * length**2),
-        penetration=float((-gap).max(initial=Real(0)) / mechanics.mesh_size),
-        balance=_balance(mechanics.rigid, primal, s),
-        active=int(closed.sum()),
+        penetration=float((-gap[contact]).max(initial=Real(0)) / mechanics.mesh_size),
+        balance=_balance(mechanics, s),
+        active=int(closed[contact].sum()),
         rows=_numbers(contradicted),
-        pulls=_numbers(lam * exact.loose < -small),
+        pulls=_numbers(beyond > small),
     )
     scale = length or 1.0
     return assessment, Deviation(
@@ -154,11 +157,13 @@ def _closed(
     return force > gap, np.maximum(force, gap) > small
 
 
-def _balance(R: NDArray[np.float64], primal: QP, s: Solution) -> float | None:
+def _balance(mechanics: Mechanics, s: Solution) -> float | None:
     """Return the worst |Rᵀ(f − B_Eᵀy − B_Iᵀz)| of a body, relative to its forces."""
+    R, primal = mechanics.rigid, mechanics.primal
     if not R.shape[1]:
         return None
-    forces = (-primal.q, -(primal.A.T @ s.y), -(primal.G.T @ s.z))
+    pressing = mechanics.rows.T @ mechanics.multipliers(s)
+    forces = (-primal.q, -(primal.A.T @ s.y), -pressing)
     left = np.abs(R.T @ np.sum(forces, axis=0))
     acting = np.abs(R).T @ np.sum(np.abs(forces), axis=0)
     overlap = csr_array(np.abs(R).T @ np.abs(R))

@@ -103,7 +103,7 @@ def compared(
 ) -> Problem:
     """Judge all answers to one problem.
 
-    given : of one problem: equal ``mechanics.primal``, or one QP without mechanics
+    given : of one problem: equal ``mechanics.program``, or one QP without mechanics
     solve : the reference solve
     references : folder that keeps reference points
     """

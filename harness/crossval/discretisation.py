@@ -208,7 +208,11 @@ class _Halving:
         form = "primal" if "primal" in self._family.forms else case.form
         sizes: list[int] = []
         seconds = 0.0
-        params = None if self._family.refined(case.params) is None else case.params
+        try:
+            params = None if self._family.refined(case.params) is None else case.params
+        except InputError as e:
+            self.why = str(e)
+            return
         while len(sizes) < LEVELS:
             if params is None:
                 self.why = "its family does not say which mesh is the next finer one"

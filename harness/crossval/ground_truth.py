@@ -20,6 +20,7 @@ from harness.plugin import Case, Reference
 from harness.qp import Matrix
 from harness.record import Record
 from harness.solution import Solution
+from harness.verify.active_set_refinement import suggested
 from harness.verify.certificate import UncertifiableError, certify
 from harness.verify.kkt import Residuals, kkt_residuals
 from harness.verify.references import ReferencePoint, UnsolvedError, reference_point
@@ -75,11 +76,11 @@ def ground_truth_of(
         return assess(mechanics, point, at, g.record.tol)
 
     exact = mechanics.exact
-    gap = exact.c - exact.B @ point.u
-    closed = int((point.multipliers * exact.loose > gap).sum())
+    contact = exact.contact
+    closed = (point.multipliers * exact.loose > -exact.motion(point.u))[contact]
     kernel = mechanics.inverse.kernel
     P = mechanics.primal.P
-    return GroundTruth(name, point.bound, closed, assessed, P, kernel, why)
+    return GroundTruth(name, point.bound, int(closed.sum()), assessed, P, kernel, why)
 
 
 def _elastic_truth(
@@ -112,7 +113,7 @@ def _best_certified(
     c, g = min(found, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
         u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
-        active=np.asarray(c.multipliers > 0), norm=c.norm, bound=c.bound,
+        states=suggested(mechanics, c.u, c.multipliers), norm=c.norm, bound=c.bound,
     )  # fmt: skip
     return point, _who(g)
 

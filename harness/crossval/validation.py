@@ -269,7 +269,7 @@ def _numbers(g: Given) -> str:
     """Name the problem that an answer is to: equal numbers, whatever the form."""
     if g.case.mechanics is None:
         return g.record.case
-    return qp_digest(g.case.mechanics.primal)
+    return qp_digest(g.case.mechanics.program)
 
 
 def _called(name: str, given: Sequence[Given], problems: int) -> str:

@@ -31,6 +31,7 @@ _OPTIONAL = ("contact_nodes", "contact_forces")
 _NODAL = "nodal_"
 _SIDE = "side_{}_"  #: of the contact of that number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
+_ROUGH = ("shear", "friction")  #: of contacts with friction
 _HISTORY = "history_"
 
 
@@ -77,7 +78,8 @@ def field_arrays(fields: Fields) -> Arrays:
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
     for i, side in enumerate(fields.contacts):
         arrays |= {
-            _SIDE.format(i) + name: getattr(side, name) for name in ("name", *_ALONG)
+            _SIDE.format(i) + name: getattr(side, name)
+            for name in ("name", *_ALONG, *_ROUGH)
         }
     return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
@@ -105,7 +107,9 @@ def _sides(arrays: Arrays) -> Iterator[ContactSide]:
         if not set(side) >= {"name", *_ALONG}:
             return
         yield ContactSide(
-            name=str(side["name"]), **{name: side[name] for name in _ALONG}
+            name=str(side["name"]),
+            **{name: side[name] for name in _ALONG},
+            **{name: side[name] for name in _ROUGH if name in side},
         )
 
 

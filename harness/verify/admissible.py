@@ -38,8 +38,10 @@ def admissible(
     û = u − K⁺B_Vᵀμ + Rα,  F_VV μ = (Bu − c)_V + B_V Rα  is nearest in the energy norm
     with equality on the rows V; these are the closed ones, the violated ones, and those
     that get violated meanwhile. It aims inside by some units of the last place. Where
-    that does not end, θu with θ < 1 is admissible while c > 0.
+    that does not end, θu with θ < 1 is admissible while c > 0. Rows of friction, which
+    any u satisfies, are held only where they are closed, which means that they stick.
     """
+    contact = mechanics.exact.contact
     B, c = mechanics.exact.B, mechanics.exact.c
     held = np.zeros_like(closed)
     moved, step = u, None
@@ -48,24 +50,26 @@ def admissible(
         size = np.abs(moved).max(initial=Real(0))  # of what is added up to get there
         reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
         inside = _EPS * (reach + 16 * np.abs(c))
-        wanted = held | closed | (gap < 0)
+        wanted = held | closed | (contact & (gap < 0))
         if not wanted.any():
             return u
         if (wanted != held).any():
             held = wanted
             step = _nearest(mechanics, held)
-        elif (gap >= 0).all() and (gap[held] <= 4 * inside[held]).all():
+        elif (gap[contact | held] >= 0).all() and (gap[held] <= 4 * inside[held]).all():
             return moved
         assert step is not None
         moved = moved + step((inside - gap)[held].astype(np.float64))
         if not np.isfinite(moved).all():
             return _shrunk(mechanics, u)
-    return moved if (c - B @ moved >= 0).all() else _shrunk(mechanics, u)
+    inside = (c - B @ moved)[contact]
+    return moved if (inside >= 0).all() else _shrunk(mechanics, u)
 
 
 def _shrunk(mechanics: Mechanics, u: Extended) -> Extended | None:
     """Return θu with the largest θ that is admissible for sure."""
-    B, c = mechanics.exact.B, mechanics.exact.c
+    contact = mechanics.exact.contact
+    B, c = mechanics.exact.B[contact], mechanics.exact.c[contact]
     if (c < 0).any():
         return None
     reach = B @ u
@@ -82,7 +86,7 @@ def _nearest(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
     """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t."""
-    B_V = csr_array(mechanics.primal.G)[np.flatnonzero(rows)]
+    B_V = mechanics.rows[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
     felt = mechanics.motions.felt.astype(np.float64)
 
@@ -113,7 +117,7 @@ def closing(
     V = np.flatnonzero(rows)
     loose = exact.loose[V].astype(np.float64)
     scale = 1 / np.sqrt(np.where(loose > 0, loose, 1.0))
-    B_V = csr_array(diags_array(scale) @ csr_array(mechanics.primal.G)[V])
+    B_V = csr_array(diags_array(scale) @ mechanics.rows[V])
     R = motions.felt.toarray().astype(np.float64)
     turn, p = felt_first(B_V, R)
     U, T = np.linalg.qr((B_V @ R) @ turn[:, :p])
@@ -160,10 +164,12 @@ def _compliance(
 
 
 def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
-    """Find λ̂ ≥ 0 near `multipliers` ≥ 0 with Rᵀ(f − Bᵀλ̂ − Ku) = 0; R is what is felt.
+    """Find λ̂ near `multipliers` with Rᵀ(f − Bᵀλ̂ − Ku) = 0; R is what is felt.
 
-    Nearest relative to their sizes, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ with wᵢ ≈ λᵢ: what balances the
-    load must not act across wide gaps, where it would do work. Along motions that λ
+    Both are within their bounds: λ̂ ≥ 0 of contact, |λ̂| ≤ g of friction. Nearest
+    relative to their distance from these, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, wᵢ ≈ λᵢ of contact: what
+    balances the load must not act across wide gaps or against a slip, where it would do
+    work. Along motions that λ
     does not hold, see `held_and_loose`, the load has to vanish up to its rounding, or
     else all rows have to help, in the end each as much as any other.
 
@@ -186,14 +192,19 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
         motions.felt.T @ exact.f,
         motions.largest.T @ np.abs(exact.f),
         motions.KR.T @ u,
+        exact.lower,
+        exact.upper,
     )
-    w = relative(multipliers)
+    w = relative(exact.interior(multipliers))
     for shares in (w, w + 1e-6, np.ones_like(w)):
         if (found := problem.solved(multipliers, shares)) is not None:
             return found
     raise UncertifiableError(
         "contact would have to pull to balance the load: some body is driven away "
         "from all that touches it, and no support holds it"
+        if exact.contact.all()
+        else "contact would have to pull, or friction to exceed its bound, to balance "
+        "the load: some body is driven away, or along, and no support holds it"
     )
 
 
@@ -245,31 +256,40 @@ class _Balance(NamedTuple):
     load: Extended  #: (p,)
     load_terms: Extended  #: (p,)
     bent: Extended  #: (p,)  (KR)ᵀu
+    lower: Extended  #: (m,) of λ
+    upper: Extended  #: (m,)
 
     def solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Balance by the rows with w > 0; None where that is impossible.
 
-        λ̂ = (λ + WGν)₊, where ν minimises a convex function of as many variables as
-        there are motions.
+        λ̂ is λ + WGν cut off at its bounds, where ν minimises a convex function of as
+        many variables as there are motions.
         """
         held, loose = held_and_loose(self.G, w)
         on = w > 0
         basis = held @ _whitening((np.sqrt(w)[:, None] * self.G) @ held)
+
+        def merged(lam: Extended) -> Extended:
+            whole = multipliers.copy()
+            whole[on] = lam
+            return whole
+
+        load = self.load - self.bent - self.G[~on].T @ multipliers[~on]
         found = _newton(
             multipliers[on], w[on], self.G[on] @ basis,
-            basis.T @ (self.load - self.bent),
-            lambda lam: np.abs(basis).T @ self._terms(on, lam),
+            np.asarray(basis.T @ load, dtype=Real),
+            (self.lower[on], self.upper[on]),
+            lambda lam: np.abs(basis).T @ self._terms(merged(lam)),
         )  # fmt: skip
         if found is None:
             return None
-        lam = np.zeros_like(multipliers)
-        lam[on] = found
+        lam = merged(found)
         missing = np.abs(loose.T @ (self.load - self.G.T @ lam))
-        total = np.abs(loose).T @ self._terms(on, found)
+        total = np.abs(loose).T @ self._terms(lam)
         return lam if (missing <= ROUNDED * total).all() else None
 
-    def _terms(self, on: NDArray[np.bool_], lam: Extended) -> Extended:
-        return np.asarray(self.load_terms + self.G_terms[on].T @ lam)
+    def _terms(self, lam: Extended) -> Extended:
+        return np.asarray(self.load_terms + self.G_terms.T @ np.abs(lam))
 
 
 def _whitening(M: Extended) -> NDArray[np.float64]:
@@ -280,13 +300,14 @@ def _whitening(M: Extended) -> NDArray[np.float64]:
 
 def _newton(
     multipliers: Extended, w: Extended, G: Extended, load: Extended,
-    terms: Callable[[Extended], Extended],
+    bounds: tuple[Extended, Extended], terms: Callable[[Extended], Extended],
 ) -> Extended | None:  # fmt: skip
     """Minimise for positive weights and GᵀWG = 1; None where nothing balances."""
 
     def shifted(nu: Extended) -> tuple[Extended, Any]:
-        lam = np.maximum(multipliers + w * (G @ nu), 0)
-        return lam, 0.5 * (lam @ (lam / w)) - load @ nu
+        free = multipliers + w * (G @ nu)
+        lam = np.clip(free, *bounds)
+        return lam, (lam / w) @ (free - 0.5 * lam) - load @ nu
 
     nu = np.zeros(load.size, dtype=Real)
     lam, value = shifted(nu)
@@ -294,7 +315,7 @@ def _newton(
         missing = load - G.T @ lam
         if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
-        on = lam > 0
+        on = (lam > bounds[0]) & (lam < bounds[1])
         hessian = (G[on].T @ (w[on, None] * G[on])).astype(np.float64)
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))

@@ -12,6 +12,12 @@ nonnegative, so that the right, which needs no solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
+Friction with a bound, Σ g|v| with the slip v = Tu − s, has multipliers |λ̂_t| ≤ g and
+adds to (1) its own terms, none of them negative either: Σ(g|v*| − λ̂_t v*) and
+Σ(g|v̂| − λ_t* v̂) on the left, and on the right Σ(g|v̂| − λ̂_t v̂), the work that friction
+would do less if it were as λ̂_t says. Of Coulomb's law the bounds g are given here: what
+is proven is about the last problem of its fixed point.
+
 (Subtracting J and D would lose everything below 1e-8: they agree to as many digits as
 the answer.) A point u that is neither of the two lies near their midpoint M, since (2)
 says that  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²,  hence
@@ -51,8 +57,11 @@ from harness.mechanics import Extended, Mechanics, Real
 from harness.qp import Vector
 from harness.solution import Solution
 from harness.verify.active_set_refinement import (
+    CLOSED,
+    at_bounds,
     equilibrium,
     exchanged,
+    suggested,
     unconstrained_guess,
 )
 from harness.verify.admissible import (
@@ -80,11 +89,12 @@ class Certificate:
     """
 
     u: Extended  #: û (n,)
-    multipliers: Extended  #: λ̂ (m,)
+    multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
     equilibrium: Extended  #: u_λ (n,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
-    work: float  #: λ̂ᵀ(c − Bû) ≥ 0
+    work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
+    sliding: float  #: the second term alone
     rounding: float  #: charged for KR ≠ 0 and an imperfect balance, in (4)
     claimed: float  #: bound (3) of the answer itself
     least: float  #: lower bound of ‖u*‖
@@ -123,6 +133,7 @@ class Certificate:
             "work": float(np.sqrt(2 * max(self.work, 0.0))),
             "answer": self.claimed,
             "moved": self.moved,
+            "friction": float(np.sqrt(2 * max(self.sliding, 0.0))),
         }
         relative = {name: self._relative(value) for name, value in lengths.items()}
         return relative | {"seminorm": float(self.seminorm)}
@@ -135,7 +146,7 @@ class Certificate:
 
 @np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
-    """Bound the error of `s`, a point of ``mechanics.primal`` with its multipliers.
+    """Bound the error of `s`, as ``mechanics.back`` gives it.
 
     The pair is the answer's own, mended as little as possible. Where most of g is work,
     as with an interior point, whose multipliers and gaps are all positive, a pair with
@@ -163,9 +174,9 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
 
 def _least_norm(mechanics: Mechanics) -> float:
     """Bound ‖u*‖ from below by a pair that owes nothing to an answer."""
-    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
+    u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
-        return proof(mechanics, u, u, lam, active).least
+        return proof(mechanics, u, u, lam, states == CLOSED).least
     except UncertifiableError:
         return 0.0
 
@@ -175,22 +186,24 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     exact, claimed = mechanics.exact, s.x.astype(Real)
     u = claimed.copy()
     u[exact.held] = 0
-    multipliers = np.maximum(s.z.astype(Real), 0)
-    own = _proved(mechanics, claimed, u, multipliers, np.zeros(s.z.size, dtype=bool))
+    multipliers = mechanics.multipliers(s).astype(Real)
+    multipliers = np.clip(multipliers, exact.lower, exact.upper)
+    none = np.zeros(multipliers.size, dtype=bool)
+    own = _proved(mechanics, claimed, u, multipliers, none)
     yield own
     if _sharp(own):
         return
-    closed = multipliers * exact.loose > exact.c - exact.B @ u
-    tidied = np.where(closed, multipliers, 0)
-    other = _proved(mechanics, claimed, u, tidied, closed)
+    states = suggested(mechanics, u, multipliers)
+    tidied = at_bounds(mechanics, states, multipliers)
+    other = _proved(mechanics, claimed, u, tidied, states == CLOSED)
     yield other
     proven = min(
         (c.bound for c in (own, other) if isinstance(c, Certificate)), default=np.inf
     )
     floats = mechanics.inverse.kernel.shape[1] > 0
     if floats and GOOD < proven <= NEAR and not _sharp(other):
-        v, mu, active = exchanged(mechanics, closed, EXCHANGES)
-        yield _proved(mechanics, claimed, v, mu, active)
+        v, mu, states = exchanged(mechanics, states, EXCHANGES)
+        yield _proved(mechanics, claimed, v, mu, states == CLOSED)
 
 
 def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
@@ -224,7 +237,7 @@ def proof(
     feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
-    gaps = exact.c - exact.B @ feasible
+    gaps = -exact.motion(feasible)
     lam = balanced(mechanics, multipliers, feasible)
     alpha = motions.felt.T @ feasible
     force = exact.f - exact.B.T @ lam - motions.KR @ alpha
@@ -232,10 +245,11 @@ def proof(
     at_rest = deformed + motions.felt @ alpha
     apart = mechanics.norm(feasible - at_rest)
     total, nearest = apart + left, apart - left
-    work = float(lam @ gaps)
+    works = exact.friction_work(feasible) + lam * gaps
+    work, sliding = float(works.sum()), float(works[~exact.contact].sum())
     square = total * total + 2 * work
     unbalanced = motions.felt.T @ force - motions.KR.T @ deformed
-    held, _ = held_and_loose(motions.G, relative(lam))
+    held, _ = held_and_loose(motions.G, relative(exact.interior(lam)))
     rounding = _rounding(
         mechanics, _reach(mechanics, held, lam, gaps, square), unbalanced, left, square
     )
@@ -246,7 +260,7 @@ def proof(
     pair = np.sqrt(2 * gap)
     found = Certificate(
         u=feasible, multipliers=lam, equilibrium=at_rest, norm=norms[0],
-        distance=total, work=work, rounding=rounding,
+        distance=total, work=work, sliding=sliding, rounding=rounding,
         claimed=_length(mechanics, claimed - middle, held) + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
         moved=mechanics.norm(claimed - feasible),
@@ -315,24 +329,29 @@ def _reach(
     """Bound the rigid part γ of û − u* by what contact allows.
 
     Rows of u* are not violated, −Gγ ≤ c − Bû + φ‖û − u*‖, and those that λ̂ presses are
-    nearly closed,  Gγ ≤ φ‖û − u*‖ + square/2λ̂,  since λ̂ᵀ(c − Bu*) ≤ square/2.
-    Nonnegative combinations of these inequalities that yield ±γₖ bound it; any will do,
-    and what seems cheap at `square` is preferred. Motions that λ̂ does not hold are left
-    aside as those that contact does not feel: what rounding makes of K along them is
-    not part of the problem.
+    nearly closed,  Gγ ≤ φ‖û − u*‖ + square/2λ̂,  since λ̂ᵀ(c − Bu*) ≤ square/2. Rows of
+    friction are bounded likewise on both sides, by square/2 over what λ̂ lacks to either
+    bound: (g − λ̂) v* ≤ square/2 where v* > 0, and (g + λ̂)(−v*) where not. Nonnegative
+    combinations of these inequalities that yield ±γₖ bound it; any will do, and what
+    seems cheap at `square` is preferred. Motions that λ̂ does not hold are left aside as
+    those that contact does not feel: what rounding makes of K along them is not part of
+    the problem.
     """
     if not held.shape[1]:
         return _Reach(held, *np.zeros((3, 0)))
+    exact, tiny = mechanics.exact, np.finfo(float).tiny
     G, phi = mechanics.motions.G.astype(np.float64), mechanics.compliance
-    pressed = lam > 0
-    force = np.maximum(lam[pressed].astype(np.float64), np.finfo(float).tiny)
+    down, up = lam > exact.lower, lam < exact.upper
+    below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
+    above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
+    open_by = np.maximum(np.where(exact.contact, 0, -gaps)[down], 0)
     parts = np.stack([
-        np.append(gaps.astype(np.float64), np.zeros(force.size)),
-        np.append(phi, phi[pressed]),
-        np.append(np.zeros(len(G)), 0.5 / force),
+        np.append(np.maximum(gaps, 0)[up], open_by).astype(np.float64),
+        np.append(phi[up], phi[down]),
+        np.append(0.5 / above, 0.5 / below),
     ])  # fmt: skip
     cost = np.array([1.0, np.sqrt(square), square]) @ parts + np.finfo(float).tiny
-    columns = (np.vstack([-G, G[pressed]]) / cost[:, None]).T
+    columns = (np.vstack([-G[up], G[down]]) / cost[:, None]).T
     size = np.abs(columns).max()
     found = np.zeros((3, held.shape[1]))
     for k, motion in enumerate(held.T):

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from harness.errors import InputError
 from harness.files.qpfile import qp_digest
@@ -23,7 +22,14 @@ from harness.files.store import read_arrays, write_arrays
 from harness.mechanics import Extended, Mechanics
 from harness.plugin import Reference
 from harness.qp import QP, no_rows
-from harness.verify.active_set_refinement import exchanged, unconstrained_guess
+from harness.verify.active_set_refinement import (
+    CLOSED,
+    UPPER,
+    States,
+    exchanged,
+    predicted,
+    unconstrained_guess,
+)
 from harness.verify.admissible import DENSE
 from harness.verify.certificate import UncertifiableError, proof
 
@@ -36,14 +42,19 @@ class UnsolvedError(Exception):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReferencePoint:
-    """A solution of ``mechanics.primal``, and the proof of its error."""
+    """A solution of the elastic problem, and the proof of its error."""
 
     u: Extended  #: (n,) admissible
-    multipliers: Extended  #: (m,) of the contact rows, ≥ 0
+    multipliers: Extended  #: (m,) of the rows of contact and friction
     equilibrium: Extended  #: u_λ (n,)
-    active: NDArray[np.bool_]  #: (m,) rows that were closed
+    states: States  #: (m,) which rows were closed, and at which bound the others are
     norm: float  #: ‖u‖_K
     bound: float  #: certified relative error, as `Certificate.bound`
+
+    @property
+    def active(self) -> NDArray[np.bool_]:
+        """Which rows are closed, (m,)."""
+        return np.asarray(self.states == CLOSED)
 
 
 def reference_point(
@@ -51,8 +62,9 @@ def reference_point(
 ) -> ReferencePoint:
     """Solve the elastic problem behind a case, or look the solution up.
 
-    solve : identifies the active rows, on  min ½λᵀFλ − dᵀλ,  λ ≥ 0,  RᵀBᵀλ = Rᵀf
-    folder : keeps the closed rows, one file under the digest of each problem
+    solve : identifies the closed rows, on  min ½λᵀFλ − dᵀλ,  RᵀBᵀλ = Rᵀf,  where λ ≥ 0
+        of the contact and |λ| ≤ g of the friction
+    folder : keeps the states of the rows, one file under the digest of each problem
 
     Raises
     ------
@@ -60,8 +72,8 @@ def reference_point(
         When no admissible pair was found, or `solve` failed.
 
     """
-    path = folder / f"{qp_digest(mechanics.primal)}.npz" if folder else None
-    rows = mechanics.primal.h.size
+    path = folder / f"{qp_digest(mechanics.program)}.npz" if folder else None
+    rows = mechanics.exact.c.size
     stored = _stored(path, rows) if path is not None and path.exists() else None
     if stored is not None:
         point = _solved(mechanics, stored)
@@ -70,48 +82,53 @@ def reference_point(
     point = _solved(mechanics, _identified(mechanics, solve))
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_arrays(path, {"active": point.active})
+        write_arrays(path, {"states": point.states})
     return point
 
 
-def _stored(path: Path, rows: int) -> NDArray[np.bool_] | None:
-    """Read the closed rows of a solution; None where the file is not what it was."""
+def _stored(path: Path, rows: int) -> States | None:
+    """Read the states of the rows; None where the file is not what it was."""
     try:
-        active = read_arrays(path, ("active",))["active"]
+        states = read_arrays(path, ("states",))["states"]
     except InputError:
         return None
-    fits = active.dtype == np.bool_ and active.shape == (rows,)
-    return active if fits else None
+    fits = states.dtype == np.int8 and states.shape == (rows,)
+    return states if fits and (np.abs(states) <= 1).all() else None
 
 
-def _solved(mechanics: Mechanics, guess: NDArray[np.bool_]) -> ReferencePoint:
-    u, lam, active = exchanged(mechanics, guess)
+def _solved(mechanics: Mechanics, guess: States) -> ReferencePoint:
+    exact = mechanics.exact
+    guess = np.where(exact.contact & (guess == UPPER), CLOSED, guess).astype(np.int8)
+    u, lam, states = exchanged(mechanics, guess)
     try:
-        found = proof(mechanics, u, u, lam, active)
+        found = proof(mechanics, u, u, lam, states == CLOSED)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"
         ) from None
     return ReferencePoint(
         u=found.u, multipliers=found.multipliers, equilibrium=found.equilibrium,
-        active=active, norm=found.norm, bound=found.bound,
+        states=states, norm=found.norm, bound=found.bound,
     )  # fmt: skip
 
 
-def _identified(mechanics: Mechanics, solve: Reference) -> NDArray[np.bool_]:
-    """Guess the active rows; of very many, those that bodies alone would violate."""
+def _identified(mechanics: Mechanics, solve: Reference) -> States:
+    """Guess the states of the rows; of very many, from the bodies alone."""
     inverse = mechanics.inverse
-    R, m = mechanics.motions.felt.toarray().astype(np.float64), mechanics.primal.h.size
-    f, B = -mechanics.primal.q, csr_array(mechanics.primal.G)
+    R, exact = mechanics.motions.felt.toarray().astype(np.float64), mechanics.exact
+    f, B = -mechanics.primal.q, mechanics.rows
+    lb, ub = (v.astype(np.float64) for v in (exact.lower, exact.upper))
+    m = exact.c.size
     if m > DENSE and not R.shape[1]:
         return unconstrained_guess(mechanics)
     qp = QP(
-        P=inverse.congruence(B), q=mechanics.primal.h - B @ inverse(f),
+        P=inverse.congruence(B), q=exact.c.astype(np.float64) - B @ inverse(f),
         A=np.ascontiguousarray((B @ R).T) if R.shape[1] else no_rows(m), b=R.T @ f,
-        G=no_rows(m), h=np.zeros(0), lb=np.zeros(m), ub=np.full(m, np.inf),
+        G=no_rows(m), h=np.zeros(0), lb=lb, ub=ub,
     )  # fmt: skip
     try:
         s = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:
         raise UnsolvedError(f"the reference solve failed: {e}") from None
-    return np.asarray(s.x * np.maximum(qp.P.diagonal(), 0) > -s.z_box)
+    softness = np.maximum(qp.P.diagonal(), 0)
+    return predicted((s.x - lb, ub - s.x), softness, s.z_box)

@@ -119,8 +119,8 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     energy_bound covers the answer itself, û and u_λ of `harness.verify.certificate`.
     certificate: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)),
     `answer` (the bound of the answer alone) and `moved` = ‖u − û‖, all relative to a
-    lower bound of ‖u*‖, and `seminorm`, 1 where bodies can move rigidly, which nothing
-    bounds.
+    lower bound of ‖u*‖; `friction`, the part that friction has in `work`; `seminorm`, 1
+    where bodies can move rigidly, which nothing bounds.
     """
     if case.mechanics is None or not has_point(s):
         return {}, ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,27 +11,47 @@ from scipy.sparse import csr_array, vstack
 
 from harness import InputError, Vector
 from problems.contact.bodies import Bodies
+from problems.contact.friction import FrictionLaw
 from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import ContactRows, node_to_segment
 
 
 def linearisation(
-    bodies: Bodies, contact: str, basis: Any
+    bodies: Bodies, contact: str, basis: Any, laws: Sequence[FrictionLaw] = ()
 ) -> Callable[[Vector], ContactRows]:
     """Return the map from a displacement (n,) in m to the rows of all pairs.
 
     It raises InputError where at u = 0 there is no row at all.
+
+    laws : of friction, one per pair; none for no friction at all
     """
     rows = node_to_segment if contact == "nts" else partial(mortar, basis=basis)
+    rough = [law.acts for law in laws] or [False] * len(bodies.pairs)
 
     def linearise(u: Vector) -> ContactRows:
-        parts = [rows(bodies.mesh.points, u, *pair) for pair in bodies.pairs]
+        parts = [
+            rows(bodies.mesh.points, u, *pair, tangential=tangential)
+            for pair, tangential in zip(bodies.pairs, rough, strict=True)
+        ]
         B = csr_array(vstack([part.B for part in parts]))
         if not B.shape[0] and not u.any():
             raise InputError(
                 "no node of a slave side faces its master within reach; expected two "
                 "sides that face each other, each with its body on the left"
             )
-        return ContactRows(B, np.concatenate([part.c for part in parts]))
+        before = np.cumsum([0, *(part.c.size for part in parts)])
+        chains = np.cumsum([0, *(pair.slave.size for pair in bodies.pairs)])
+        return ContactRows(
+            B=B,
+            c=np.concatenate([part.c for part in parts]),
+            T=csr_array(vstack([part.T for part in parts])),
+            row=np.concatenate(
+                [p.row + k for p, k in zip(parts, before, strict=False)]
+            ),
+            share=np.concatenate([part.share for part in parts]),
+            place=np.concatenate(
+                [p.place + k for p, k in zip(parts, chains, strict=False)]
+            ),
+        )
 
     return linearise

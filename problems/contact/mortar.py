@@ -33,6 +33,9 @@ v of ξ over the covered part, and N̄_j = N_j(ξ̄), the one linear solution is
 
 (for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
 
+The tangential rows of friction are the same with t = (−n_y, n_x) for n, and a constant
+bound g of the traction makes ∫ Φ_j g = g ∫ N_j of each row, with either basis.
+
 Each row is divided by ∫ N_j over the covered part, D_jj of the dual basis: so B is
 dimensionless, g̃ a length, and λ a nodal force per thickness as with node-to-segment.
 Forces Bᵀλ of a row are in equilibrium, their moment only up to O(h²) on curved sides.
@@ -48,7 +51,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from harness import Vector
-from problems.contact.node_to_segment import ContactRows
+from problems.contact.node_to_segment import ContactRows, tangent
 from problems.contact.polyline import Points, Polyline, cross, current_polyline, unit
 from problems.contact.segment_search import Reach, facing
 from problems.fem.mesh import Nodes
@@ -97,6 +100,7 @@ def mortar(
     *,
     basis: Basis = "dual",
     reach: Reach = Reach(),  # noqa: B008 - frozen
+    tangential: bool = False,
 ) -> ContactRows:
     """Linearise the weak non-penetration of two sides at u; one row per covered node.
 
@@ -109,6 +113,7 @@ def mortar(
     reach : which integration segments count. Without the limit on the angle, rays that
         graze a far master give the dual basis, which is negative in places, negative
         weighted gaps between bodies that are apart
+    tangential : whether friction needs tangential rows
 
     Raises
     ------
@@ -120,11 +125,15 @@ def mortar(
     m = current_polyline(points, u, master, "master")
     integrals = integrate(s, m, basis, reach)
     j = np.flatnonzero(integrals.cover)
-    scale = 1 / integrals.cover[j]
-    rows = _normal_rows(
-        integrals, j, s.node_normal[j] * scale[:, None], (slave, master), points.size
-    )
-    return ContactRows(rows, integrals.gap[j] * scale + rows @ u)
+    held = j if tangential else j[:0]
+    scale, sides = 1 / integrals.cover[j], (slave, master)
+    normal = s.node_normal[j] * scale[:, None]
+    B = _rows_along(integrals, j, normal, sides, points.size)
+    T = _rows_along(integrals, held, tangent(normal[: held.size]), sides, points.size)
+    return ContactRows(
+        B, integrals.gap[j] * scale + B @ u,
+        T, np.arange(held.size), integrals.cover[j], j,
+    )  # fmt: skip
 
 
 def integrate(slave: Polyline, master: Polyline, basis: Basis, reach: Reach) -> Mortar:
@@ -250,7 +259,7 @@ def _sum(
     return csr_array(coo_array((values.ravel(), (i.ravel(), j.ravel())), shape))
 
 
-def _normal_rows(
+def _rows_along(
     integrals: Mortar, j: Nodes, normal: Points, sides: tuple[Nodes, Nodes], size: int
 ) -> csr_array:
     """Build n_jᵀ [(D u_s)_j − (M u_m)_j] for the slave nodes j as a matrix on u."""

@@ -16,6 +16,12 @@ contact patch test; problems.contact.mortar passes it). The normal is
 * "averaged": interpolated between the averaged normals of the segment's ends,
   n ∥ Σ N_a n_a, which does not jump when a node slides over a vertex.
 
+Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
+
+    T u,    T = [−t at s, +N_a t at a],
+
+so that −Tᵀλ_t are the forces of friction where −Bᵀλ are those of the contact.
+
 Beyond the end of the master its last node is the closest point, with the normal of the
 last segment.
 """
@@ -38,7 +44,7 @@ from problems.contact.polyline import (
     unit,
 )
 from problems.contact.segment_search import Reach, nearest
-from problems.fem.mesh import Nodes
+from problems.fem.mesh import Nodes, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 
@@ -46,10 +52,14 @@ Normals = Literal["segment", "averaged"]
 
 
 class ContactRows(NamedTuple):
-    """The linear inequalities B u ≤ c on the total displacement u."""
+    """The linear inequalities B u ≤ c on the total displacement u, and its slip T u."""
 
     B: csr_array  #: (m_I, 2N) dimensionless
     c: Vector  #: (m_I,) m
+    T: csr_array  #: (k, 2N) tangential rows, of d − 1 directions each; often none
+    row: Nodes  #: (k,) the contact row that each of them belongs to
+    share: Vector  #: (m_I,) of the slave side that a row stands for, ∫N_j, m
+    place: Nodes  #: (m_I,) number of its node in the slave chain
 
 
 class ClosestPoints(NamedTuple):
@@ -68,6 +78,7 @@ def node_to_segment(
     *,
     normals: Normals = "segment",
     reach: Reach | None = None,
+    tangential: bool = False,
 ) -> ContactRows:
     """Linearise the non-penetration of the slave nodes into the master boundary at u.
 
@@ -80,6 +91,7 @@ def node_to_segment(
     normals : "segment" or "averaged", of the master
     reach : drops the nodes that do not face their closest point or are too far from
         it; None keeps a row for every slave node
+    tangential : whether friction needs tangential rows
 
     Raises
     ------
@@ -97,12 +109,15 @@ def node_to_segment(
 
     node = np.column_stack([slave, master[ends]])  # s, 1, 2
     weight = np.column_stack([-np.ones(len(slave)), N])
-    rows = normal_rows(node, weight, at.normal, points.size)
-    c = gap + rows @ u
-    if reach is None:
-        return ContactRows(rows, c)
-    kept = _in_reach(polyline(x, "slave"), line, at, foot, reach)
-    return ContactRows(rows[kept], c[kept])
+    kept = np.arange(len(slave))
+    if reach is not None:
+        kept = np.flatnonzero(_in_reach(polyline(x, "slave"), line, at, foot, reach))
+    held = kept if tangential else kept[:0]
+    B = rows_along(node[kept], weight[kept], at.normal[kept], points.size)
+    T = rows_along(node[held], weight[held], tangent(at.normal[held]), points.size)
+    return ContactRows(
+        B, gap[kept] + B @ u, T, np.arange(held.size), nodal_lengths(x)[kept], kept
+    )
 
 
 def closest_points(
@@ -123,15 +138,20 @@ def closest_points(
     return ClosestPoints(first, xi, normal)
 
 
-def normal_rows(node: Nodes, weight: Vector, normal: Points, size: int) -> csr_array:
-    """Build the rows of B that weight the normal displacements of equally many nodes.
+def tangent(normal: Points) -> Points:
+    """Turn outward unit normals (…, 2) to the unit tangents (−n_y, n_x)."""
+    return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
 
-    Row r is Σ_a weight_ra · normal_r at the components of node_ra: node and weight are
-    (m, k), normal is (m, 2), the result (m, size) without stored zeros.
+
+def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
+    """Build rows that weight the displacements of equally many nodes along a direction.
+
+    Row r is Σ_a weight_ra · direction_r at the components of node_ra: node and weight
+    are (m, k), direction is (m, 2), the result (m, size) without stored zeros.
     """
     m, k = node.shape
     columns = np.stack([2 * node, 2 * node + 1], axis=-1)
-    values = weight[:, :, None] * normal[:, None, :]
+    values = weight[:, :, None] * direction[:, None, :]
     indptr = 2 * k * np.arange(m + 1)
     B = csr_array((values.ravel(), columns.ravel(), indptr), shape=(m, size))
     B.sum_duplicates()

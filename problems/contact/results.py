@@ -7,27 +7,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import QP, Fields, Solution, Vector
+from harness import QP, Fields, Friction, Solution, Vector
+from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
-from problems.contact.sides import bodies_of, contact_sides
+from problems.contact.sides import ACTIVE, active, bodies_of, contact_sides, states
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
 
-ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
-
-def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
+def quantities(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> dict[str, Any]:
     """Report counts, energy, contact forces and stresses.
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
-    its slave where the master is rigid), −ΣBᵀλ, N/m. max_von_mises: per body, of the
-    patch-recovered stress, Pa. contacts: per pair, see `pair_results`.
+    its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
+    max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
+    `pair_results`. With friction those of `frictional`, too.
     """
     l, F = bodies.length, bodies.force
     slave, master = bodies.pairs[0]
     side = master if master.size else slave
     held = bodies.body_of_node == bodies.body_of_node[side[0]]
-    forces = contact_forces(bodies, primal, s)
+    forces = contact_forces(bodies, primal, s, friction)
+    normal = s.z[: primal.h.size]
     stress = nodal_stresses(bodies, s.x * l)["von_mises"]
     return {
         "nodes": len(bodies.mesh.points),
@@ -35,19 +38,41 @@ def quantities(bodies: Bodies, primal: QP, s: Solution) -> dict[str, Any]:
         "dofs": bodies.mesh.dofs,
         "equality_rows": primal.b.size,
         "contact_rows": primal.h.size,
-        "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
+        "active": int(active(normal).sum()),
         "energy": primal.objective(s.x) * F * l,
         "contact_force": forces[held].sum(axis=0).tolist(),
-        "multiplier_sum": float(s.z.sum() * F),
+        "multiplier_sum": float(normal.sum() * F),
         "max_von_mises": {
             name: float(stress[bodies.body_of_node == b].max())
             for b, name in enumerate(bodies.names)
         },
-        "contacts": pair_results(bodies, primal, s),
-    }
+        "contacts": pair_results(bodies, primal, s, friction),
+    } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
 
 
-def pair_results(bodies: Bodies, primal: QP, s: Solution) -> dict[str, dict[str, Any]]:
+def frictional(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction
+) -> dict[str, Any]:
+    """Report what friction does.
+
+    open, stick, slip: numbers of rows of pairs with friction, which are not active, or
+    active and below the bound, or at it. friction_residual: ‖g − mu·λ_n‖/‖g‖ of
+    Coulomb's law, 0 of Tresca's. dissipation: Σ g|Tu − s|, the work of the friction in
+    this step, J/m.
+    """
+    state = states(primal, s, friction)
+    slip = friction.T @ s.x - friction.start
+    return {
+        **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
+        "friction_residual": friction.residual(s.z[: primal.h.size]),
+        "dissipation": float(friction.bound @ np.abs(slip))
+        * bodies.force * bodies.length,
+    }  # fmt: skip
+
+
+def pair_results(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> dict[str, dict[str, Any]]:
     """Report each contact pair by its name.
 
     force: on each of its bodies, N/m. largest_pressure: at a slave node, Pa.
@@ -55,7 +80,8 @@ def pair_results(bodies: Bodies, primal: QP, s: Solution) -> dict[str, dict[str,
     undeformed slave side that belongs to nodes under pressure, m.
     """
     found = {}
-    for pair, side in zip(bodies.pairs, contact_sides(bodies, primal, s), strict=True):
+    sides = contact_sides(bodies, primal, s, friction)
+    for pair, side in zip(bodies.pairs, sides, strict=True):
         slave, master = bodies_of(bodies, pair)
         total = side.force.sum(axis=0)
         force = {slave: total.tolist()}
@@ -74,7 +100,9 @@ def pair_results(bodies: Bodies, primal: QP, s: Solution) -> dict[str, dict[str,
     return found
 
 
-def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
+def fields(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> Fields:
     """Collect the deformed state for pictures."""
     u = s.x * bodies.length
     slaves = np.concatenate([pair.slave for pair in bodies.pairs])
@@ -85,14 +113,17 @@ def fields(bodies: Bodies, primal: QP, s: Solution) -> Fields:
         displacement=as_vectors(u),
         nodal=nodal_stresses(bodies, u),
         contact_nodes=slaves,
-        contact_forces=contact_forces(bodies, primal, s)[slaves],
-        contacts=contact_sides(bodies, primal, s),
+        contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
+        contacts=contact_sides(bodies, primal, s, friction),
     )
 
 
-def contact_forces(bodies: Bodies, primal: QP, s: Solution) -> NDArray[np.float64]:
-    """Return the contact forces −Bᵀλ on the nodes (N, 2), N/m."""
-    return as_vectors(-(primal.G.T @ s.z) * bodies.force)
+def contact_forces(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> NDArray[np.float64]:
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, 2), N/m."""
+    B, _ = contact_rows(primal, friction)
+    return as_vectors(-(B.T @ s.z) * bodies.force)
 
 
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:

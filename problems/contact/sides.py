@@ -12,23 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import QP, ContactSide, Solution
+from harness import QP, ContactSide, Friction, Solution, Vector
+from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import Bodies, ContactPair
+from problems.contact.node_to_segment import tangent
 from problems.contact.polyline import current_polyline
 from problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 
 RIGID = "rigid"  #: name of a master that is no body
+ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
 
-def contact_sides(bodies: Bodies, primal: QP, s: Solution) -> tuple[ContactSide, ...]:
+def contact_sides(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+) -> tuple[ContactSide, ...]:
     """Evaluate every pair along its slave side; SI units.
 
-    The pressure at a node is the normal part of the contact force on it over the length
-    of the undeformed side that belongs to it, ∫N_j ds; the normal is that of the
-    deformed side. The gap is the slack of the node's row, c − Bu: with mortar contact
-    the mean of the gap around the node, weighted as its row is.
+    The force on a node is that of contact and friction. The pressure is its normal part
+    over the length of the undeformed side that belongs to the node, ∫N_j ds; the normal
+    is that of the deformed side. The gap is the slack of the node's row, c − Bu: with
+    mortar contact the mean of the gap around the node, weighted as its row is. Where
+    there is friction, the shear is along the tangent (−n_y, n_x), and a node is open,
+    sticks or slips.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
+    tangential, state = s.z[primal.h.size :], states(primal, s, friction)
     points, u = bodies.mesh.points, s.x * l
     slack = (primal.h - B @ s.x) * l
     found = []
@@ -36,18 +44,50 @@ def contact_sides(bodies: Bodies, primal: QP, s: Solution) -> tuple[ContactSide,
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
         force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)
+        rough = (friction.row >= rows.start) & (friction.row < rows.stop)
+        if rough.any():
+            force -= as_vectors(friction.T[rough].T @ tangential[rough]) * F
         side = current_polyline(points, u, pair.slave, "slave")
         length = nodal_lengths(points[pair.slave])
         normal = np.einsum("sx,sx->s", force[pair.slave], side.node_normal)
         gap = np.full(len(pair.slave), np.nan)
-        gap[slave_places(B[rows], pair.slave)] = slack[rows]
+        place = slave_places(B[rows], pair.slave)
+        gap[place] = slack[rows]
+        t = tangent(side.node_normal)
+        told = np.full(len(pair.slave), "open", dtype="U5")
+        told[place[friction.row[rough] - rows.start]] = state[rough]
         found.append(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
                 force=force[pair.slave], pressure=(0.0 - normal) / length, gap=gap,
+                shear=np.einsum("sx,sx->s", force[pair.slave], t) / length
+                if rough.any() else None,
+                friction=told if rough.any() else None,
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
+    """Tell of each friction row (k,) whether its contact is open, sticks or slips.
+
+    An active row sticks up to the slip that the rest of its bound would bring about on
+    the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
+    """
+    if not friction.bound.size:
+        return np.zeros(0, dtype=np.str_)
+    normal, tangential = np.split(s.z, [primal.h.size])
+    diagonal = csr_array(primal.P).diagonal()
+    softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
+    slip = np.abs(friction.T @ s.x - friction.start)
+    sticks = (friction.bound - np.abs(tangential)) * softness >= slip
+    closed = active(normal)[friction.row]
+    return np.where(closed, np.where(sticks, "stick", "slip"), "open")
+
+
+def active(normal: Vector) -> NDArray[np.bool_]:
+    """Tell which contact rows (m,) press."""
+    return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
 
 
 def pair_names(bodies: Bodies) -> list[str]:

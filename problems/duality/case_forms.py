@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Case, Grid, Mechanics, Solution
+from harness import QP, Case, Friction, Grid, Mechanics, Solution
+from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.contact.results import fields
-from problems.duality.dualisation import Transformed, dual_bounds, dualise
+from problems.duality.dualisation import dual_bounds, dualise, posed
 from problems.fem.inverse import GeneralisedInverse
 
 FORMS = ("primal", "dual", "dual-bounds")
@@ -29,6 +30,7 @@ def contact_case(
     clamped: Factorise,
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
+    friction: Friction = NO_FRICTION,
 ) -> Case:
     """Emit the primal QP of a contact problem in one of FORMS.
 
@@ -38,26 +40,30 @@ def contact_case(
         components; called where the form needs it
     supported : as clamped, but of bodies, too, that contact alone holds; called when an
         answer is to be certified
-    quantities : physical results from a solution of the primal QP
+    quantities : physical results from a solution of the primal problem; its z holds
+        the multipliers of the contact rows, then those of the friction
+    friction : with a given bound; its work is a part of the energy that the objective
+        stands for
 
     """
     matrices: Mapping[str, Any] = {}
     seconds = None
     if form == "primal":
-        new = Transformed(primal, lambda s: s, 1.0, 0.0, lambda s: s.x)
+        new = posed(primal, friction)
     else:
         inverse = floating() if form == "dual" else clamped()
         start = perf_counter()
-        new = (dualise if form == "dual" else dual_bounds)(primal, inverse)
+        transform = dualise if form == "dual" else dual_bounds
+        new = transform(primal, inverse, friction=friction)
         # the factor may be there already, from another load step: it is charged for
         seconds = inverse.seconds + perf_counter() - start
-        matrices = _paper(new.qp, primal, form, inverse)
+        matrices = _paper(new.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x * bodies.length,
         quantities=lambda s: quantities(new.recover(s)),
-        fields=lambda s: fields(bodies, primal, new.recover(s)),
+        fields=lambda s: fields(bodies, primal, new.recover(s), friction),
         scale=new.sign * energy,
         constant=new.constant * energy,
         matrices=matrices,
@@ -69,15 +75,16 @@ def contact_case(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
+            friction=friction,
         ),
     )  # fmt: skip
 
 
 def _paper(
-    dual: QP, primal: QP, form: str, inverse: GeneralisedInverse
+    dual: QP, primal: QP, friction: Friction, form: str, inverse: GeneralisedInverse
 ) -> dict[str, Any]:
     """Name the matrices of the dual as the paper does, (2)-(5)."""
-    B, c = csr_array(primal.G), primal.h
+    B, c = contact_rows(primal, friction)
     if form == "dual":
         B, c = csr_array(vstack([primal.A, B])), np.append(primal.b, c)
     return {"F": dual.P, "d": -dual.q, "B": B, "c": c, "R": inverse.kernel}

@@ -3,6 +3,10 @@
 The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I.  Each transform
 returns the new problem together with a function that takes a solution of the new
 problem to a solution (point and all multipliers) of the old one.
+
+Friction with a given bound adds Σ g|Tu − s| to the objective. Its rows come last in B
+and c, with T and s, and their multipliers are bounded, |λ_t| ≤ g: of boxes a dual
+remains a QP, and z of the old problem holds them below those of the contact.
 """
 
 from __future__ import annotations
@@ -14,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Solution, Structure, Vector, no_rows
+from harness import QP, Friction, Solution, Structure, Vector, no_rows
+from harness.mechanics import NO_FRICTION, contact_rows, with_friction
 from problems.fem.inverse import GeneralisedInverse
 
 
@@ -29,8 +34,32 @@ class Transformed(NamedTuple):
     touched: Callable[[Solution], Vector]
 
 
+def posed(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
+    """Pose the problem as the QP that it is itself, with the work of the friction.
+
+    Its way back drops the variables of `harness.mechanics.with_friction` and takes λ_t
+    from the two rows of each; where the bound is zero, there is no force.
+    """
+    qp, n, m = with_friction(primal, friction), primal.q.size, primal.h.size
+    if not friction.bound.size:
+        return Transformed(qp, lambda s: s, 1.0, 0.0, lambda s: s.x)
+    moving = friction.bound > 0
+
+    def recover(s: Solution) -> Solution:
+        tangential = np.zeros(friction.bound.size)
+        forwards, backwards = s.z[m:].reshape(2, -1)
+        tangential[moving] = forwards - backwards
+        z = np.append(s.z[:m], tangential)
+        return replace(s, x=s.x[:n], z=z, z_box=np.zeros(n))
+
+    return Transformed(qp, recover, 1.0, 0.0, lambda s: s.x[:n])
+
+
 def dualise(
-    primal: QP, inverse: GeneralisedInverse, free: Vector | None = None
+    primal: QP,
+    inverse: GeneralisedInverse,
+    free: Vector | None = None,
+    friction: Friction = NO_FRICTION,
 ) -> Transformed:
     """Turn the primal QP into its dual, equations (2)-(5) of the paper.
 
@@ -48,15 +77,19 @@ def dualise(
     primal : P = K; no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
     free : K⁺f (n,), where it is known already
+    friction : with a given bound; its rows follow those of the contact
 
     """
     f, m_E = -primal.q, primal.b.size
-    B, c = csr_array(vstack([primal.A, primal.G])), np.append(primal.b, primal.h)
+    B_I, c_I = contact_rows(primal, friction)
+    B, c = csr_array(vstack([primal.A, B_I])), np.append(primal.b, c_I)
     R = inverse.kernel
     free = inverse(f) if free is None else free
     structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
-    lb = np.where(np.arange(c.size) < m_E, -np.inf, 0.0)
-    qp = _dual(structure, c, inverse, free, lb)
+    lb, ub = _bounds(primal, friction)
+    everything = np.full(m_E, np.inf)
+    lb, ub = np.append(-everything, lb), np.append(everything, ub)
+    qp = _dual(structure, c, inverse, free, lb, ub)
     if R.shape[1]:
         qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
 
@@ -74,7 +107,10 @@ def dualise(
 
 
 def dual_bounds(
-    primal: QP, clamped: GeneralisedInverse, free: Vector | None = None
+    primal: QP,
+    clamped: GeneralisedInverse,
+    free: Vector | None = None,
+    friction: Friction = NO_FRICTION,
 ) -> Transformed:
     """Dualise the contact rows alone: λ ≥ 0 is the only constraint.
 
@@ -90,13 +126,15 @@ def dual_bounds(
     primal : its equality rows hold single components at zero, by unit entries
     clamped : K⁺ that is zero on these components
     free : K⁺f (n,), where it is known already
+    friction : with a given bound; its rows follow those of the contact
 
     """
-    f, B = -primal.q, csr_array(primal.G)
+    f = -primal.q
+    B, c = contact_rows(primal, friction)
     free = clamped(f) if free is None else free
     held = np.unique(csr_array(primal.A).indices).astype(np.int64)
     structure = Structure(K=primal.P, B=B, fixed=held)
-    qp = _dual(structure, primal.h, clamped, free, np.zeros(primal.h.size))
+    qp = _dual(structure, c, clamped, free, *_bounds(primal, friction))
 
     def recover(s: Solution) -> Solution:
         u = clamped(f - B.T @ s.x)
@@ -109,17 +147,38 @@ def dual_bounds(
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
 
 
+def bounded(dual: QP, friction: Friction) -> QP:
+    """Return a dual with other bounds of its friction; the way back is the same."""
+    g = friction.bound
+    if not g.size:
+        return dual
+    contact = slice(0, -g.size)
+    return replace(
+        dual, lb=np.append(dual.lb[contact], -g), ub=np.append(dual.ub[contact], g)
+    )
+
+
+def _bounds(primal: QP, friction: Friction) -> tuple[Vector, Vector]:
+    """Bound the multipliers:  λ_n ≥ 0,  −g ≤ λ_t ≤ g."""
+    m = primal.h.size
+    return (
+        np.append(np.zeros(m), -friction.bound),
+        np.append(np.full(m, np.inf), friction.bound),
+    )
+
+
 def _dual(
     structure: Structure,
     c: Vector,
     inverse: GeneralisedInverse,
     free: Vector,
     lb: Vector,
+    ub: Vector,
 ) -> QP:
-    """Emit  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  λ ≥ lb."""
+    """Emit  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  lb ≤ λ ≤ ub."""
     m, B = c.size, structure.B
     return QP(
         P=inverse.congruence(B), q=c - B @ free,
         A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=lb, ub=np.full(m, np.inf), structure=structure,
+        lb=lb, ub=ub, structure=structure,
     )  # fmt: skip

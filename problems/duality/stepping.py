@@ -7,46 +7,86 @@ With relin = 1 this is the paper's scheme, of first order in 1/steps.
 Contact rows are linearised at displacements of the contact sides: those of a step are
 had from its dual solution by one small product, and only displacements that are asked
 for are recovered everywhere, by one solve with the factor of K each.
+
+With friction, slip is that of the load step (``quasi-static``: T(u − u_prev), which
+depends on the path), or of the whole load at once (``static``: T u). Coulomb's law is
+the fixed point of problems with a given bound, g ← mu·λ_n from the solution of the one
+before on; each linearisation is settled, and the emitted QP is the last of its last. It
+begins from the normal forces of the step before, in the first one without friction.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
-from harness import QP, Reference, Solution, Vector, kkt_residuals
+from harness import (
+    QP,
+    Friction,
+    InputError,
+    Reference,
+    Solution,
+    Vector,
+    kkt_residuals,
+)
 from problems.contact.bodies import Bodies
+from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.node_to_segment import ContactRows
-from problems.duality.dualisation import Transformed, dual_bounds
+from problems.duality.dualisation import Transformed, bounded, dual_bounds, dualise
 from problems.fem.inverse import GeneralisedInverse
+from problems.fem.mesh import Nodes
 
 Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
-Transform = Callable[[QP, GeneralisedInverse, Vector], Transformed]
+Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
 
 #: residual that a reference solve may leave: the next step is linearised there
 REFERENCE = 1e-6
+SETTLED = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
+MOST_ITERATES = 1000  #: Tresca problems of a fixed point
+PATIENCE = 30  #: of them that need not come nearer to it
 
 
 @dataclass(frozen=True, eq=False)
-class _Solved:
-    """A transformed QP and its solution."""
+class ContactProblem:
+    """A linearised contact problem, with its solution once that is asked for."""
 
-    transformed: Transformed
-    solution: Solution
+    primal: QP  #: (1) of the paper
+    friction: Friction
+    place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
+    dual: Callable[[], Transformed]  #: of these rows, whatever the bounds of friction
+    solve: Callable[[QP], Solution]
+
+    @cached_property
+    def _solution(self) -> Solution:
+        return self.solve(bounded(self.dual().qp, self.friction))
 
     @cached_property
     def on_sides(self) -> Vector:
         """Displacement u (n,), right on the contact sides."""
-        return self.transformed.touched(self.solution)
+        return self.dual().touched(self._solution)
 
     @cached_property
     def answer(self) -> Solution:
-        """Solution of the primal QP."""
-        return self.transformed.recover(self.solution)
+        """Solution of the primal problem."""
+        return self.dual().recover(self._solution)
+
+    @property
+    def normal(self) -> Vector:
+        """Multipliers λ_n (m,) of the contact rows; those of friction follow them."""
+        m, k = self.place.size, self.friction.bound.size
+        return self._solution.x[-m - k :][:m]
+
+
+class State(NamedTuple):
+    """Where a load step begins."""
+
+    u: Vector  #: (n,) displacement, right on the contact sides
+    pressed: Vector  #: (places,) normal force of each slave node
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +97,9 @@ class LoadPath:
     ------
     ArithmeticError
         When a reference solve is not accurate.
+    InputError
+        When a fixed point of Coulomb's law does not settle, has less iterates, or comes
+        to bounds that hold no equilibrium.
 
     """
 
@@ -67,47 +110,166 @@ class LoadPath:
     steps: int
     relin: int = 1
     transform: Transform = dual_bounds
-    _solved: list[_Solved] = field(default_factory=list)  #: steps 1, 2, …
+    laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
+    quasi_static: bool = True  #: whether slip is that of the step
+    #: normal force of each slave node that the very first bound of Coulomb's law is of
+    pressed: float = 0.0
+    begin: State | None = None  #: where the first step begins; none: at rest
+    #: 1, 2, …
+    _steps: list[list[ContactProblem]] = field(default_factory=list, init=False)
 
     def primal(self, k: int) -> QP:
-        """Emit the QP of step k (1 … steps), as last linearised."""
-        u = self._step(k - 1).on_sides if k > 1 else np.zeros(self.bodies.mesh.dofs)
-        for _ in range(self.relin - 1):
-            u = self._solve(self._linearised(u, k), k / self.steps).on_sides
-        return self._linearised(u, k)
+        """Emit the QP of step k (1 … steps), as last linearised, without friction."""
+        return self.problem(k).primal
+
+    def problem(self, k: int, iterate: int = 0) -> ContactProblem:
+        """Pose step k (1 … steps), as last linearised.
+
+        iterate : which problem of the fixed point of Coulomb's law, 1, 2, …; 0: the
+            last one
+        """
+        while len(self._steps) < k:
+            self._steps.append(self._posed(len(self._steps) + 1))
+        sequence = self._steps[k - 1]
+        if iterate > len(sequence):
+            raise InputError(
+                f"iterate={iterate}: the fixed point of step {k} has {len(sequence)} "
+                "problems; expected at most that, or 0 for the last"
+            )
+        return sequence[iterate - 1]
+
+    def iterates(self, k: int) -> int:
+        """Count the problems of the fixed point of step k; 1 without Coulomb's law."""
+        self.problem(k)
+        return len(self._steps[k - 1])
+
+    def state(self, k: int) -> State:
+        """Return what step k leaves to the next one; for k = 0 what it begins from."""
+        if k:
+            last = self.problem(k)
+            return State(last.on_sides, self._pressed(last))
+        if self.begin is not None:
+            return self.begin
+        rest = np.zeros(self.bodies.mesh.dofs)
+        return State(rest, np.full(self._places, self.pressed))
 
     def answer(self, k: int) -> Solution:
-        """Return the solution of the primal QP of step k (1 … steps)."""
-        return self._step(k).answer
+        """Return the solution of the primal problem of step k (1 … steps)."""
+        return self.problem(k).answer
 
     def solution(self, k: int) -> Vector:
         """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
         return self.answer(k).x if k else np.zeros(self.bodies.mesh.dofs)
 
-    def _step(self, k: int) -> _Solved:
-        while len(self._solved) < k:
-            j = len(self._solved) + 1
-            self._solved.append(self._solve(self.primal(j), j / self.steps))
-        return self._solved[k - 1]
+    def _posed(self, k: int) -> list[ContactProblem]:
+        """Pose step k from the one before: the problems of its last fixed point."""
+        u, pressed = self.state(k - 1)
+        before = u if self.quasi_static else np.zeros_like(u)
+        for _ in range(self.relin - 1):
+            *_, last = self._fixed_point(u, k, before, pressed)
+            u, pressed = last.on_sides, self._pressed(last)
+        return self._fixed_point(u, k, before, pressed)
 
-    def _linearised(self, u: Vector, k: int) -> QP:
+    def _fixed_point(
+        self, u: Vector, k: int, before: Vector, pressed: Vector
+    ) -> list[ContactProblem]:
+        """Pose the problem linearised at u; by Coulomb's law, until its bound settles.
+
+        before : (n,) displacement where the slip begins
+        pressed : (places,) normal forces that the first bound is of
+        """
         rows = self.linearise(u * self.bodies.length)
-        return primal_qp(self.bodies, rows, k / self.steps)
+        primal = primal_qp(self.bodies, rows, k / self.steps)
+        coulomb = any(law.mu for law in self.laws)
+        first = friction_of(self.bodies, rows, self.laws, before, pressed)
 
-    def _solve(self, primal: QP, load_factor: float) -> _Solved:
-        dual = self.transform(primal, self.inverse, self._free * load_factor)
-        s = self.reference(dual.qp)
-        if not (worst := kkt_residuals(dual.qp, s).worst) <= REFERENCE:
+        @cache
+        def dual() -> Transformed:
+            free = self._free * (k / self.steps)
+            return self.transform(primal, self.inverse, free, first)
+
+        solve = partial(self._solve, load_factor=k / self.steps)
+        found, friction = list[ContactProblem](), first
+        residuals: list[float] = []
+        while len(found) < MOST_ITERATES:
+            found.append(ContactProblem(primal, friction, rows.place, dual, solve))
+            if not coulomb:
+                return found
+            try:
+                normal = found[-1].normal
+            except ArithmeticError as e:
+                raise InputError(
+                    f"load step {k}: no equilibrium was found with the {len(found)}. "
+                    "bound of Coulomb's law; expected supports or friction that hold "
+                    f"the bodies: {e}"
+                ) from None
+            residuals.append(friction.residual(normal))
+            if residuals[-1] <= SETTLED:
+                return found
+            if len(found) - int(np.argmin(residuals)) > PATIENCE:
+                break
+            friction = replace(friction, bound=friction.demanded(normal))
+        raise InputError(
+            f"the friction of load step {k} does not settle: after {len(found)} Tresca "
+            f"problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
+            f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
+        )
+
+    @property
+    def _places(self) -> int:
+        return sum(pair.slave.size for pair in self.bodies.pairs)
+
+    def _pressed(self, problem: ContactProblem) -> Vector:
+        """Return the normal force (places,) of each slave node; zero without a row."""
+        force = np.zeros(self._places)
+        force[problem.place] = np.maximum(problem.normal, 0.0)
+        return force
+
+    def _solve(self, dual: QP, load_factor: float) -> Solution:
+        s = self.reference(dual)
+        if not (worst := kkt_residuals(dual, s).worst) <= REFERENCE:
             raise ArithmeticError(
                 f"the reference solve at load factor {load_factor:g} left a residual "
                 f"of {worst:.1e}, more than {REFERENCE:g}"
             )
-        return _Solved(dual, s)
+        return s
 
     @cached_property
     def _free(self) -> Vector:
         """K⁺f: the full load without contact."""
         return self.inverse(self.bodies.f)
+
+
+def single_load(
+    bodies: Bodies,
+    linearise: Linearise,
+    laws: tuple[FrictionLaw, ...],
+    *,
+    factorise: Callable[[], GeneralisedInverse],
+    reference: Reference,
+    steps: int = 1,
+    iterate: int = 0,
+) -> tuple[QP, Friction]:
+    """Pose the first load step of bodies that contact alone may hold.
+
+    As friction may have to hold them, Coulomb's fixed point begins at bounds that let
+    it: each node is taken to be pressed by the whole load.
+
+    factorise : K with its rigid modes; called where Coulomb's law needs solutions
+    steps, iterate : as of `LoadPath`
+    """
+    if any(law.mu for law in laws):
+        path = LoadPath(
+            bodies, linearise, factorise(), reference, steps,
+            transform=dualise, laws=laws, pressed=float(np.abs(bodies.f).sum()),
+        )  # fmt: skip
+        problem = path.problem(1, iterate)
+        return problem.primal, problem.friction
+    at_rest = np.zeros(bodies.mesh.dofs)
+    rows = linearise(at_rest)
+    pressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
+    friction = friction_of(bodies, rows, laws, at_rest, pressed)
+    return primal_qp(bodies, rows, 1 / steps), friction
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:

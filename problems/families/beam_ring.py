@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from harness import Family, InputError
 from problems.ranges import (
     CONTACT_FORMS,
+    FRICTION,
     METHODS,
     MOST_STEPS,
     PLANES,
@@ -18,6 +19,8 @@ from problems.ranges import (
     doubled,
     fits,
     one_of,
+    rough,
+    without_friction,
 )
 
 if TYPE_CHECKING:
@@ -28,13 +31,14 @@ MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 @dataclass(frozen=True)
 class BeamRing(Family):
-    """The paper's benchmark: beam on a half ring, plane elasticity, frictionless."""
+    """The paper's benchmark: beam on a half ring, plane elasticity."""
 
     name: str = "beam-ring"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "Nr": 10, "Nh": 5, "radial": 0, "steps": 10, "step": 0,
             "contact": "nts", "basis": "dual", "relin": 1, "plane": "strain",
+            **FRICTION,
         }),
         hash=False,
     )  # fmt: skip
@@ -66,12 +70,14 @@ class BeamRing(Family):
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
         one_of(self.name, p, METHODS | PLANES)
+        rough(self.name, p)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved; its load steps are linearised anew.
 
         The arcs of the ring are other polygons.
         """
+        without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 
     def build(

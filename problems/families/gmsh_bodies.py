@@ -9,9 +9,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from harness import Family, InputError
+from harness.checked import located
 from problems.files.file_digest import check_digest, digest
 from problems.ranges import (
     CONTACT_FORMS,
+    LAW,
     METHODS,
     MOST_STEPS,
     PLANES,
@@ -19,6 +21,7 @@ from problems.ranges import (
     at_least,
     at_most,
     one_of,
+    rough,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +40,7 @@ class GmshBodies(Family):
     path_suffix: str = ".toml"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType(
-            {"path": "", "sha256": "", **SETTINGS, "step": 0}
+            {"path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0}
         ),
         hash=False,
     )
@@ -62,7 +65,7 @@ class GmshBodies(Family):
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range and the files are there."""
-        from problems.models.description import read_description
+        from problems.models.description import pair_laws, read_description
 
         p: Any = params
         if not p["path"]:
@@ -75,7 +78,12 @@ class GmshBodies(Family):
             )
         one_of(self.name, params, METHODS | PLANES)
         path = Path(p["path"])
-        mesh = path.parent / read_description(path)["mesh"]
+        table = read_description(path)
+        own = any(key in entry for entry in table["contacts"] for key in LAW)
+        rough(self.name, p, elsewhere=own)
+        with located(str(path)):
+            pair_laws(table["contacts"], params)
+        mesh = path.parent / table["mesh"]
         check_digest(p["path"], p["sha256"], digest(path, mesh))
 
     def build(

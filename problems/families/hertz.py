@@ -7,15 +7,20 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family
+from harness import Family, InputError
 from problems.ranges import (
+    FRICTION,
     METHODS,
+    MOST_STEPS,
     PLANES,
     at_least,
     at_most,
     fits,
     one_of,
     positive,
+    rough,
+    tangential,
+    without_friction,
 )
 
 if TYPE_CHECKING:
@@ -68,14 +73,21 @@ class HertzCylinder(Family):
         default_factory=lambda: MappingProxyType({
             "n": 10, "m": 8, "load": 1.0, "radius": 1.0, "ratio": 1.0,
             "slave": "upper", "contact": "mortar", "basis": "dual", "plane": "strain",
-            "halvings": 0,
+            "halvings": 0, **FRICTION, "Q": 0.0, "peak": 0.0,
+            "programme": "normal-first", "steps": 20,
         }),
         hash=False,
     )  # fmt: skip
     forms: tuple[str, ...] = ("primal", "dual")
 
+    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Let the tangential force never have been larger than it is."""
+        return {**self.defaults, "peak": given.get("Q", 0.0), **given}
+
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range."""
+        """Raise InputError unless every key is in its range, and used."""
+        rough(self.name, params)
+        self._check_tangential(params)
         at_least(1, self.name, params, ("n", "m"))
         at_least(0, self.name, params, ("halvings",))
         at_most(30, self.name, params, ("halvings",))
@@ -85,8 +97,40 @@ class HertzCylinder(Family):
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
 
+    def _check_tangential(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless the keys of the tangential force fit together."""
+        one_of(self.name, params, {"programme": ("normal-first", "proportional")})
+        sheared = bool(params["Q"] or params["peak"])
+        together = params["programme"] == "proportional"
+        if sheared:
+            for key, value in (("friction", "coulomb"), ("ratio", 1.0)):
+                if params[key] != value:
+                    raise InputError(
+                        f"{self.name}: {key}={params[key]} with a tangential force; "
+                        f"expected {key}={value}, or no Q and no peak"
+                    )
+            tangential(self.name, params)
+            positive(self.name, params, ("mu",))
+        if params["loading"] == "static" and params["Q"] != params["peak"]:
+            raise InputError(
+                f"{self.name}: peak={params['peak']} is not used by loading=static; "
+                "expected loading=quasi-static, which unloads"
+            )
+        if together and not (sheared and params["Q"] == params["peak"]):
+            raise InputError(
+                f"{self.name}: programme=proportional needs Q, and no peak above it"
+            )
+        if params["steps"] != self.defaults["steps"] and not together:
+            raise InputError(
+                f"{self.name}: steps={params['steps']} is not used by "
+                f"programme={params['programme']}; expected programme=proportional"
+            )
+        at_least(1, self.name, params, ("steps",))
+        at_most(MOST_STEPS, self.name, params, ("steps",))
+
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved; the arcs are other polygons."""
+        without_friction(self.name, params)
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
@@ -95,6 +139,6 @@ class HertzCylinder(Family):
         """Emit the QP, with contact linearised at the undeformed state, in one form."""
         from problems.models.hertz import cylinder_on_cylinder
 
-        del reference
+        params = self.complete(params)
         self.check(params)
-        return cylinder_on_cylinder(form, params)
+        return cylinder_on_cylinder(form, params, reference)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family
+from harness import Family, InputError
 from problems.ranges import (
+    FRICTION,
     METHODS,
     PLANES,
     at_least,
@@ -16,6 +17,7 @@ from problems.ranges import (
     fits,
     one_of,
     positive,
+    rough,
 )
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ class ContactPatch(Family):
         default_factory=lambda: MappingProxyType({
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
+            **FRICTION,
         }),
         hash=False,
     )  # fmt: skip
@@ -44,9 +47,18 @@ class ContactPatch(Family):
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
+        rough(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return the case with every cell halved; the odd row of cells is not."""
+        """Return the case with every cell halved; the odd row of cells is not.
+
+        Coulomb's law is refused: its solutions minimise nothing.
+        """
+        if params["friction"] == "coulomb":
+            raise InputError(
+                f"{self.name}: friction=coulomb minimises no energy on any mesh; "
+                "expected friction=tresca"
+            )
         return {**params, **doubled(params, "lower", "upper")}
 
     def build(
@@ -55,6 +67,5 @@ class ContactPatch(Family):
         """Emit the QP in one form."""
         from problems.models.patch import two_blocks
 
-        del reference  # the gap is linear in u, there is nothing to linearise at
         self.check(params)
-        return two_blocks(form, params)
+        return two_blocks(form, params, reference)

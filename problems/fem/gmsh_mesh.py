@@ -194,7 +194,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
         x, y = points[cells[flat.argmax()]].mean(axis=0)
         raise InputError(
             f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected corners "
-            "that are apart"
+            "that are apart, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     corners = _cross(np.roll(edges, 1, axis=1), edges)

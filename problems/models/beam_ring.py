@@ -20,6 +20,7 @@ import numpy as np
 
 from harness import Case, Reference, Value
 from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
+from problems.contact.friction import FrictionLaw, law_of
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
@@ -40,8 +41,12 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     bodies = model(*geometry)
     method = (p["contact"], p["basis"])
-    path = _path(geometry, method, p["steps"], p["relin"], reference)
-    primal = path.primal(p["step"])
+    path = _path(
+        geometry, method, p["steps"], p["relin"], law_of(params),
+        p["loading"] == "quasi-static", reference,
+    )  # fmt: skip
+    problem = path.problem(p["step"], p["iterate"])
+    primal, friction = problem.primal, problem.friction
     sides = bodies.mesh.boundaries
     tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
     return contact_case(
@@ -49,8 +54,9 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
-        quantities=lambda s: quantities(bodies, primal, s)
+        quantities=lambda s: quantities(bodies, primal, s, friction)
         | {"tip": (s.x[tip] * LENGTH).tolist()},
+        friction=friction,
     )  # fmt: skip
 
 
@@ -87,9 +93,12 @@ def _path(
     method: tuple[Any, Any],
     steps: int,
     relin: int,
+    law: FrictionLaw,
+    quasi_static: bool,
     reference: Reference,
 ) -> LoadPath:
-    linearise = linearisation(model(*geometry), *method)
+    linearise = linearisation(model(*geometry), *method, [law])
     return LoadPath(
-        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin
-    )
+        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin,
+        laws=(law,), quasi_static=quasi_static,
+    )  # fmt: skip

@@ -28,6 +28,9 @@
     [[contacts]]
     slave = "arc"              # its nodes must not enter the master
     master = "bottom"
+    friction = "coulomb"       # or "tresca" with a bound in Pa; this pair's own law
+    mu = 0.3
+
 
 Whatever the length unit is, everything in this file is in SI units, and so are results:
 E and tractions in Pa, forces in N/m, units.length in m.
@@ -35,12 +38,14 @@ E and tractions in Pa, forces in N/m, units.length in m.
 Length unit, plane, contact, basis, steps and relin may be left out for the values
 above; bodies that contact alone holds need ``steps = 1`` and have no form dual-bounds.
 So may units, for the larger side of the box around the mesh and the sum of |load| over
-nodes.
+nodes. Without a law of its own a pair has that of the keys friction, bound and mu,
+which the file may set at its top: none by default. There, ``loading = "static"`` makes
+the slip that of the whole load.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,11 +57,22 @@ from harness.checked import located
 from harness.errors import shown, unknown
 from harness.files.reading import read_toml
 from problems.contact.bodies import Bodies, ContactPair, assemble
+from problems.contact.friction import FrictionLaw, law_of
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
-from problems.ranges import METHODS, MOST_STEPS, PLANES, SETTINGS, physical
+from problems.ranges import (
+    LAWS,
+    LOADINGS,
+    METHODS,
+    MOST_STEPS,
+    NEEDED,
+    PLANES,
+    SETTINGS,
+    physical,
+)
 
+_SIDES = ("slave", "master")
 #: names of units of length, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -100,6 +116,9 @@ def read_description(path: Path) -> dict[str, Any]:
             value = checked.text(key, table.get(key, SETTINGS[key]))
             if value not in known:
                 raise unknown(f"value of {key}", value, known)
+        for entry in checked.filled_list("contacts", table["contacts"]):
+            checked.table("contacts", entry)
+        _friction(table)
     return table
 
 
@@ -222,10 +241,52 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     return np.outer(weights, vector)
 
 
+def _friction(entry: Mapping[str, Any]) -> None:
+    """Check the values of what an entry says of friction."""
+    for key, known in {"friction": tuple(LAWS), **LOADINGS}.items():
+        if key in entry and checked.text(key, entry[key]) not in known:
+            raise unknown(f"value of {key}", entry[key], known)
+    for key, what in NEEDED.items():
+        if key in entry and physical(key, entry[key]) < 0:
+            raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
+
+
+def pair_laws(
+    contacts: Sequence[Mapping[str, Any]], params: Mapping[str, Any]
+) -> tuple[FrictionLaw, ...]:
+    """Find the law of each pair: what its entry says, else what the keys say.
+
+    Raises
+    ------
+    InputError
+        When a law lacks what it needs, or an entry says what its law does not use.
+
+    """
+    return tuple(
+        _each({"contacts": list(contacts)}, "contacts", lambda e: _law(e, params))
+    )
+
+
+def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
+    _friction(entry)
+    law = entry.get("friction", params["friction"])
+    needed = LAWS[law]
+    for key in NEEDED:
+        if key in entry and key != needed:
+            raise InputError(f"{key} is not used by friction {law!r}; expected none")
+    given = {"friction": law, "bound": 0.0, "mu": 0.0}
+    if needed:
+        given[needed] = entry.get(needed, params[needed])
+        if given[needed] < 0:
+            raise InputError(f"friction {law!r} needs {needed}, {NEEDED[needed]}")
+    return law_of(given)
+
+
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    _keys(entry, ("slave", "master"))
+    checked.only_keys(entry, ("slave", "master", "friction", *NEEDED))
+    _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
-    for side in ("slave", "master"):
+    for side in _SIDES:
         name = _one_of(named.curves, "physical curve", entry, side)
         sides[side] = _chain(f"{side} {name!r}", named.curves[name])
     if np.intersect1d(sides["slave"], sides["master"]).size:

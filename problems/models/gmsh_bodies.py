@@ -12,17 +12,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import vstack
 
-from harness import QP, Case, InputError, Reference, Value
+from harness import QP, Case, Friction, InputError, Reference, Value
 from harness.checked import located
 from problems.contact.balance import check_balance
 from problems.contact.bodies import Bodies, clamped, floating, supported
+from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
-from problems.duality.stepping import LoadPath, primal_qp
+from problems.duality.stepping import LoadPath, single_load
 from problems.fem.inverse import GeneralisedInverse
-from problems.models.description import described_bodies, remarks
+from problems.models.description import (
+    described_bodies,
+    pair_laws,
+    read_description,
+    remarks,
+)
 
 
 def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
@@ -30,27 +37,38 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     p: Any = params
     source = (p["path"], p["sha256"], p["plane"])
     bodies = model(*source)
-    primal = _primal(source, p, reference)
+    primal, friction = _posed(source, p, reference)
     case = contact_case(
         bodies, primal, form,
         floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
         supported=lambda: _supported(*source),
-        quantities=lambda s: quantities(bodies, primal, s),
+        quantities=lambda s: quantities(bodies, primal, s, friction),
+        friction=friction,
     )  # fmt: skip
     return replace(case, remarks=remarks(Path(p["path"])))
 
 
-def _primal(source: tuple[str, str, Any], p: Any, reference: Reference) -> QP:
+def _posed(
+    source: tuple[str, str, Any], p: Any, reference: Reference
+) -> tuple[QP, Friction]:
     """Linearise the contact where the load path is; at first, that is u = 0."""
-    bodies = model(*source)
+    laws = pair_laws(read_description(Path(source[0]))["contacts"], p)
+    method = (p["contact"], p["basis"])
     if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
-        linearise = linearisation(bodies, p["contact"], p["basis"])
+        bodies = model(*source)
+        linearise = linearisation(bodies, *method, laws)
         rows = linearise(np.zeros(bodies.mesh.dofs))
-        with located(source[0]):
-            check_balance(bodies, rows.B)
-        return primal_qp(bodies, rows, 1 / p["steps"])
-    path = _path(source, p["contact"], p["basis"], p["steps"], p["relin"], reference)
-    return path.primal(p["step"])
+        with located(source[0]):  # friction may hold either way
+            check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+        return single_load(
+            bodies, linearise, laws,
+            factorise=lambda: _floating(*source), reference=reference,
+            steps=p["steps"], iterate=p["iterate"],
+        )  # fmt: skip
+    quasi_static = p["loading"] == "quasi-static"
+    path = _path(source, method, p["steps"], p["relin"], laws, quasi_static, reference)
+    problem = path.problem(p["step"], p["iterate"])
+    return problem.primal, problem.friction
 
 
 @lru_cache(maxsize=4)
@@ -77,8 +95,8 @@ def _supported(*source: Any) -> GeneralisedInverse:
 
 @lru_cache(maxsize=4)
 def _path(
-    source: tuple[str, str, Any], contact: str, basis: str, steps: int, relin: int,
-    reference: Reference,
+    source: tuple[str, str, Any], method: tuple[str, str], steps: int, relin: int,
+    laws: tuple[FrictionLaw, ...], quasi_static: bool, reference: Reference,
 ) -> LoadPath:  # fmt: skip
     bodies = model(*source)
     try:
@@ -88,5 +106,7 @@ def _path(
             f"{source[0]}: the supports leave a rigid motion of some body, which load "
             "steps and re-linearisations do not allow; expected steps=1 and relin=1"
         ) from None
-    linearise = linearisation(bodies, contact, basis)
-    return LoadPath(bodies, linearise, inverse, reference, steps, relin)
+    return LoadPath(
+        bodies, linearisation(bodies, *method, laws), inverse, reference, steps, relin,
+        laws=laws, quasi_static=quasi_static,
+    )  # fmt: skip

@@ -15,6 +15,17 @@ whatever their number. Every one of `halvings` halves all cells.
 R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark of the literature; it gives no units,
 here they are mm, GPa and MN/m. It has a = 0.68078 mm and p₀ = 9.3514 GPa.
 
+A tangential force Q on two cylinders of one material acts on the flat sides, as shear
+tractions ±Q and, so that no support takes their moment, normal ones that grow linearly
+along the side. Both bodies are loaded and deformed alike: the upper one is held by
+contact and friction alone, the lower one without reactions. The tractions are those of
+`problems.models.line_contact`. The load comes
+
+* normal-first: P without friction, then Q, and Q down from its peak, one step each;
+* proportional: both in steps with friction, P ∝ k² so that a grows evenly. Then the
+  traction is (Q/P)p and nothing slips, where slip is that of each step (quasi-static).
+  Of a single static load it is as if Q had come last.
+
 What no mesh removes: the bodies are finite (0.1 %), and a/R is not zero. Two cylinders
 are in contact as linearised at the undeformed state, along normals that differ from the
 vertical by up to a/R; the difference from Hertz is of order a²/R² ∝ P, 1 % at P = 10.
@@ -24,13 +35,13 @@ Their load is therefore smaller unless it is set.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_array
 
-from harness import QP, Case, Solution, Value, Vector
+from harness import QP, Case, Friction, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -39,13 +50,17 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
+from problems.contact.friction import law_of
 from problems.contact.linearise import linearisation
 from problems.contact.node_to_segment import ContactRows
 from problems.contact.results import contact_forces, quantities
+from problems.contact.rigid_plane import above_plane
 from problems.duality.case_forms import contact_case
-from problems.duality.stepping import primal_qp
+from problems.duality.dualisation import dualise
+from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
+from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
 MATERIAL = Material(E=200e9, nu=0.3)
@@ -53,29 +68,6 @@ UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
 GROWTH = 1.15  #: of neighbouring cells away from the contact
 UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
-
-
-@dataclass(frozen=True)
-class LineContact:
-    """Hertz's solution for a force per thickness."""
-
-    P: float  #: N/m
-    R: float  #: relative radius, m
-    E_star: float  #: contact modulus, Pa
-
-    @property
-    def a(self) -> float:
-        """Half width of the contact, m."""
-        return float(np.sqrt(4 * self.P * self.R / (np.pi * self.E_star)))
-
-    @property
-    def p0(self) -> float:
-        """Peak pressure, Pa."""
-        return 2 * self.P / (np.pi * self.a)
-
-    def pressure(self, x: Vector) -> Vector:
-        """Return p(x), Pa; zero outside the contact."""
-        return np.asarray(self.p0 * np.sqrt(np.maximum(1 - (x / self.a) ** 2, 0)))
 
 
 def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
@@ -92,22 +84,48 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    return _case(bodies, above_plane(mesh), form, exact)
+    return _case(bodies, above_plane(mesh, mesh.boundaries["arc"]), form, exact)
 
 
-def cylinder_on_cylinder(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP, with contact linearised at the undeformed state, in one form."""
-    bodies, exact = two_cylinders(params)
+def cylinder_on_cylinder(
+    form: str, params: Mapping[str, Value], reference: Reference
+) -> Case:
+    """Emit the QP, with contact linearised at the undeformed state, in one form.
+
+    With friction it is the last of the last step, unless another iterate is asked for.
+    """
     p: Any = params
-    linearise = linearisation(bodies, p["contact"], p["basis"])
-    return _case(bodies, linearise(np.zeros(bodies.mesh.dofs)), form, exact)
+    if p["friction"] == "none":
+        bodies, exact = two_cylinders(params)
+        linearise = linearisation(bodies, p["contact"], p["basis"])
+        return _case(bodies, linearise(np.zeros(bodies.mesh.dofs)), form, exact)
+    same_path = {**params, "iterate": 0}
+    path, exact = _friction_path(tuple(same_path.items()), reference)
+    bodies, problem = path.bodies, path.problem(1, p["iterate"])
+    primal, friction = problem.primal, problem.friction
+
+    def results(s: Solution) -> dict[str, Any]:
+        found = quantities(bodies, primal, s, friction)
+        found |= pressure_quantities(bodies, primal, exact, s)
+        if p["peak"]:
+            found |= shear_quantities(bodies, primal, exact, s, friction, params)
+        if p["friction"] == "coulomb":
+            found["tresca_problems"] = path.iterates(1)
+        return found
+
+    return contact_case(
+        bodies, primal, form,
+        floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies), quantities=results, friction=friction,
+    )  # fmt: skip
 
 
 def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     """Mesh and assemble the cylinders, n cells per a on the upper and m on the lower.
 
     The upper one has R = 8 mm, E = 200 GPa, the lower one `radius` and `ratio` times
-    that.
+    that. The load is P alone. Where there is a tangential force, the supports are those
+    that take no part in it.
     """
     p: Any = params
     below = Material(p["ratio"] * MATERIAL.E, MATERIAL.nu)
@@ -122,19 +140,73 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     )
     mesh, body = join((prefixed(halves[0], "upper_"), prefixed(halves[1], "lower_")))
     sides = mesh.boundaries
-    upper, lower = sides["upper_arc"], sides["lower_arc"]
-    fixed = np.concatenate([
-        2 * _on_axis(mesh, "upper_"), 2 * _on_axis(mesh, "lower_"),
-        2 * sides["lower_flat"] + 1,
-    ])  # fmt: skip
+    upper, lower, flat = (
+        sides[side] for side in ("upper_arc", "lower_arc", "lower_flat")
+    )
+    load = pressed(mesh, sides["upper_flat"], exact.P)
+    if p["peak"]:
+        load += pressed(mesh, flat, -exact.P)
+        centre = flat[flat.size // 2]
+        fixed = np.array([2 * centre, 2 * centre + 1, 2 * flat[0] + 1])
+    else:
+        fixed = np.concatenate([
+            2 * _on_axis(mesh, "upper_"), 2 * _on_axis(mesh, "lower_"), 2 * flat + 1
+        ])  # fmt: skip
     bodies = assemble(
         mesh, body, names=("upper", "lower"), materials=(MATERIAL, below),
-        plane=p["plane"], units=(RADIUS, exact.P),
-        fixed=fixed, load=pressed(mesh, sides["upper_flat"], exact.P),
+        plane=p["plane"], units=(RADIUS, exact.P), fixed=fixed, load=load,
         pairs=(ContactPair(upper, lower) if p["slave"] == "upper"
                else ContactPair(lower, upper),),
     )  # fmt: skip
     return bodies, exact
+
+
+def sheared(mesh: Mesh) -> Vector:
+    """Return the nodal forces (2N,) of Q = 1 N/m on both flat sides, without moment."""
+    load = np.zeros(mesh.dofs)
+    for name, Q in (("upper_flat", 1.0), ("lower_flat", -1.0)):
+        flat = mesh.boundaries[name]
+        share, (x, y) = nodal_lengths(mesh.points[flat]), mesh.points[flat].T
+        load[2 * flat] = Q * share / share.sum()
+        load[2 * flat + 1] = Q * y[0] * share * x / (share @ x**2)
+    return load
+
+
+@lru_cache(maxsize=2)
+def _friction_path(
+    items: tuple[tuple[str, Any], ...], reference: Reference
+) -> tuple[LoadPath, LineContact]:
+    """Prepare the load steps with friction, whose last one is emitted."""
+    p = dict(items)
+    bodies, exact = two_cylinders(p)
+    law, mesh = law_of(p), bodies.mesh
+    linearise = linearisation(bodies, p["contact"], p["basis"], (law,))
+    rows = linearise(np.zeros(mesh.dofs))
+    path = LoadPath(
+        bodies, lambda u: rows, floating(bodies), reference, steps=1,
+        transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
+    )  # fmt: skip
+    if not p["peak"]:
+        return path, exact
+    static, together = not path.quasi_static, p["programme"] == "proportional"
+    if static:
+        loads = [(1.0, p["Q"])]
+    elif together:
+        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a grows evenly
+        loads = [(part, part * p["Q"]) for part in parts]
+    else:
+        loads = [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
+    part = loads[0][0]  # of P in the step before, whose normal forces grow with P
+    pressing = replace(bodies, f=part * bodies.f)
+    smooth = linearisation(bodies, p["contact"], p["basis"])
+    u, pressed = replace(path, bodies=pressing, linearise=smooth, laws=()).state(1)
+    if static or together:
+        u = np.zeros(mesh.dofs)
+    for P, Q in loads:
+        both = replace(bodies, f=P * bodies.f + Q * p["mu"] * sheared(mesh))
+        path = replace(path, bodies=both, begin=State(u, P / part * pressed))
+        (u, pressed), part = path.state(1), P
+    return path, exact
 
 
 def lower_half(h: float, a: float, halvings: int) -> Mesh:
@@ -171,14 +243,6 @@ def halved(x: Vector, times: int) -> Vector:
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
-def above_plane(mesh: Mesh) -> ContactRows:
-    """Keep the nodes of the arc above the rigid plane y = 0:  −u_y ≤ y, exactly."""
-    arc = mesh.boundaries["arc"]
-    one = np.full(arc.size, -1.0)
-    B = csr_array((one, (np.arange(arc.size), 2 * arc + 1)), (arc.size, mesh.dofs))
-    return ContactRows(B, mesh.points[arc, 1])
-
-
 def pressed(mesh: Mesh, flat: Nodes, P: float) -> Vector:
     """Return the nodal forces (2N,) of P spread evenly over the flat side, N/m."""
     share = nodal_lengths(mesh.points[flat])
@@ -198,7 +262,8 @@ def pressure_quantities(
     slave = bodies.pairs[0].slave
     x = bodies.mesh.points[slave, 0]
     width = nodal_lengths(x[:, None])
-    force = np.abs(contact_forces(bodies, primal, s)[slave, 1])
+    pressure = replace(s, z=s.z[: primal.h.size])
+    force = np.abs(contact_forces(bodies, primal, pressure)[slave, 1])
     p, hertz = force / width, exact.pressure(x)
     half_width = np.sqrt(4 * force @ x**2 / exact.P)
     return {
@@ -211,6 +276,58 @@ def pressure_quantities(
         "half_width": float(half_width),
         "half_width_error": float(half_width / exact.a - 1),
     }
+
+
+def shear_quantities(
+    bodies: Bodies,
+    primal: QP,
+    exact: LineContact,
+    s: Solution,
+    friction: Friction,
+    params: Mapping[str, Value],
+) -> dict[str, Any]:
+    """Compare the shear traction on the slave side with the exact one.
+
+    Nodal traction: horizontal friction force on the node / ∫N_j dx. Errors are
+    relative, that of the force to the largest before. shear_centre: at x = 0.
+    stick_half_width: of a traction with this ∫x²q under pressures with this ∫x²p, so
+    that what finite bodies do to both does not matter; of proportional steps there is
+    none, as nothing slips.
+    """
+    p: Any = params
+    slave, upper = bodies.pairs[0].slave, p["slave"] == "upper"
+    x = bodies.mesh.points[slave, 0]
+    width = nodal_lengths(x[:, None])
+    normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
+    pressing = np.abs((primal.G.T @ normal)[2 * slave + 1])
+    force = (friction.T.T @ tangential)[2 * slave] * (1.0 if upper else -1.0)
+    mindlin = TangentialContact(exact, p["mu"], p["Q"], p["peak"])
+    Q = p["Q"] * p["mu"] * exact.P
+    together = p["programme"] == "proportional" and p["loading"] == "quasi-static"
+    if together:
+        expected, centre = exact.pressure(x) * Q / exact.P, exact.p0 * Q / exact.P
+    else:
+        expected = mindlin.traction(x)
+        centre = float(mindlin.traction(np.zeros(1))[0])
+    q = force / width
+    at_centre = float(np.interp(0.0, np.sort(x), q[np.argsort(x)]))
+    found = {
+        "tangential_force": float(force.sum()),
+        "tangential_force_error": float(
+            (force.sum() - Q) / (p["peak"] * p["mu"] * exact.P)
+        ),
+        "shear_centre": at_centre,
+        "shear_centre_error": at_centre / centre - 1,
+        "shear_l2_error": float(
+            np.sqrt(width @ (q - expected) ** 2 / (width @ expected**2))
+        ),
+    }
+    if together:
+        return found
+    c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
+    return found | {
+        "stick_half_width": c, "stick_half_width_error": c / mindlin.c - 1,
+    }  # fmt: skip
 
 
 def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> Case:

@@ -47,7 +47,7 @@ from harness import (
     Vector,
     no_rows,
 )
-from problems.contact.results import ACTIVE
+from problems.contact.sides import ACTIVE
 from problems.duality.dualisation import Transformed, dual_bounds
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 

@@ -1,25 +1,27 @@
 """The contact patch test: a uniform pressure must pass through a non-matching joint.
 
-Two blocks of 1 m × ½ m lie on each other, without friction and without a gap, each on
-rollers at its left side, the lower one on rollers at its bottom; the pressure p acts on
-the top. The exact solution is linear in each block, so bilinear elements contain it:
+Two blocks of 1 m × ½ m lie on each other without a gap, with or without friction, each
+on rollers at its left side, the lower one on rollers at its bottom; the pressure p acts
+on the top. The exact solution is linear in each block, so bilinear elements contain it:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
 A contact discretisation that reproduces it transfers constant pressures exactly (Taylor
 and Papadopoulos 1991). Mortar methods do, node-to-segment contact in one pass does not:
-its error in σ_y is of order one and does not vanish with the mesh size. Contact alone
-holds the upper block up, so that ``dual-bounds`` does not exist.
+its error in σ_y is of order one and does not vanish with the mesh size. Friction makes
+no difference while the blocks are of one material. Contact alone holds the upper block
+up, so that ``dual-bounds`` does not exist.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from harness import Case, Solution, Value
+from harness import Case, Reference, Solution, Value
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -28,10 +30,11 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
+from problems.contact.friction import law_of
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
-from problems.duality.stepping import primal_qp
+from problems.duality.stepping import single_load
 from problems.fem.elasticity import Material
 from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 from problems.fem.stress import gauss_stress
@@ -41,18 +44,24 @@ PRESSURE = 1e6  #: p, Pa
 E_UPPER, NU = 10e6, 0.3  #: Pa
 
 
-def two_blocks(form: str, params: Mapping[str, Value]) -> Case:
+def two_blocks(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     """Emit the QP in one form."""
     p: Any = params
     bodies = model(params)
-    linearise = linearisation(bodies, p["contact"], p["basis"])
-    primal = primal_qp(bodies, linearise(np.zeros(bodies.mesh.dofs)))
+    laws = (law_of(params),)
+    linearise = linearisation(bodies, p["contact"], p["basis"], laws)
+    factorised = cache(lambda: floating(bodies))
+    primal, friction = single_load(
+        bodies, linearise, laws,
+        factorise=factorised, reference=reference, iterate=p["iterate"],
+    )  # fmt: skip
     return contact_case(
         bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+        floating=factorised, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s)
+        quantities=lambda s: quantities(bodies, primal, s, friction)
         | {"stress_error": stress_error(bodies, s)},
+        friction=friction,
     )  # fmt: skip
 
 

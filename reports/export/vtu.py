@@ -18,6 +18,7 @@ from harness import ContactSide, Fields, InputError, Vector
 from harness.files.durable import replacing
 
 IN_CONTACT = 1e-6  #: a node is in contact where its force exceeds this · the largest
+STATES = ("open", "stick", "slip")  #: of friction, as VTU files number them
 
 
 def write_vtu(fields: Fields, path: Path) -> list[Path]:
@@ -69,14 +70,26 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
 
 
 def _along_sides(fields: Fields) -> dict[str, Vector]:
-    """Put pressures and gaps at the nodes (N,); of several, the tightest."""
+    """Put pressures and gaps at the nodes (N,); of several, the tightest.
+
+    With friction the shear, too, and 0, 1, 2 where a node is open, sticks or slips.
+    """
     if not fields.contacts:
         return {}
     pressure, gap = np.zeros(len(fields.points)), np.full(len(fields.points), np.nan)
     for side in fields.contacts:
         np.maximum.at(pressure, side.nodes, side.pressure)
         np.fmin.at(gap, side.nodes, side.gap)
-    return {"pressure": pressure, "gap": gap}
+    rough = [side for side in fields.contacts if side.friction is not None]
+    if not rough:
+        return {"pressure": pressure, "gap": gap}
+    shear, state = np.zeros(len(fields.points)), np.zeros(len(fields.points))
+    for side in rough:
+        assert side.shear is not None
+        shear[side.nodes] += side.shear
+        codes = [STATES.index(str(told)) for told in np.asarray(side.friction)]
+        np.maximum.at(state, side.nodes, codes)
+    return {"pressure": pressure, "gap": gap, "shear": shear, "friction": state}
 
 
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
@@ -95,6 +108,8 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
         "force_y_N_per_m": side.force[:, 1],
         "pressure_Pa": side.pressure,
         "gap_m": side.gap,
+        **({} if side.shear is None else {"shear_Pa": side.shear}),
+        **({} if side.friction is None else {"friction": side.friction}),
     }
     rows = zip(*(values.tolist() for values in columns.values()), strict=True)
     lines = [",".join(columns), *(",".join(map(_number, row)) for row in rows), ""]
@@ -106,8 +121,10 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     return path
 
 
-def _number(value: float) -> str:
+def _number(value: float | str) -> str:
     """Write a number with all its digits; what there is none of is left empty."""
+    if isinstance(value, str):
+        return value
     return "" if value != value else repr(value)
 
 

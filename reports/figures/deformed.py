@@ -30,6 +30,8 @@ _MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
 _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
+#: arrows of nodes by what friction does; of pairs without it they are dark
+_FRICTION = {"stick": ("#0b5fa5", "blue"), "slip": ("#b3261e", "red")}
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
 _FLAT = 0.34  #: height over width of the enlargement
@@ -52,6 +54,7 @@ class _Loaded(NamedTuple):
     name: str  #: of the pair; empty where the fields tell of no pairs
     nodes: NDArray[np.int64]  #: (k,)
     forces: Points  #: on them, N/m
+    friction: NDArray[np.str_]  #: (k,) "stick", "slip" or "open"; "" without friction
 
 
 def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
@@ -230,15 +233,18 @@ def _listed(*words: str) -> str:
 
 def _loaded(fields: Fields) -> list[_Loaded]:
     """List the contacts that carry load; all as one where they are not told apart."""
-    told = [(side.name, side.nodes, side.force) for side in fields.contacts]
+    told = [
+        (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
+    ]
     if not told and fields.contact_nodes is not None:
         assert fields.contact_forces is not None
-        told = [("", fields.contact_nodes, fields.contact_forces)]
+        told = [("", fields.contact_nodes, fields.contact_forces, None)]
     found = []
-    for name, nodes, forces in told:
+    for name, nodes, forces, friction in told:
+        states = np.full(len(nodes), "") if friction is None else friction
         size = np.hypot(*forces.T)
         if (active := size > _ACTIVE * size.max(initial=0.0)).any():
-            found.append(_Loaded(name, nodes[active], forces[active]))
+            found.append(_Loaded(name, nodes[active], forces[active], states[active]))
     return found
 
 
@@ -257,15 +263,25 @@ def _enlarged(
     forces, (low, high) = contact.forces, _window(tips, span)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
-    arrows = Vectors(
-        feet=tips - drawn, vectors=drawn, width=0.0032 if len(tips) < 25 else 0.002,
-        colour=_ARROW, cased=True,
-    )  # fmt: skip
+    arrows = [
+        Vectors(
+            feet=(tips - drawn)[of], vectors=drawn[of],
+            width=0.0032 if len(tips) < 25 else 0.002, cased=True,
+            colour=_FRICTION[state][0] if state in _FRICTION else _ARROW,
+        )
+        for state in np.unique(contact.friction)
+        if (of := contact.friction == state).any()
+    ]  # fmt: skip
+    counts = [
+        f"{state}: {name} ({int((contact.friction == state).sum())})"
+        for state, (_, name) in _FRICTION.items()
+    ]
+    key = f"\n{', '.join(counts)}" if contact.friction.any() else ""
     factor, prefix = _prefixed(largest)
     return FieldPanel(
-        low=_pair(low), high=_pair(high), marks=(*bodies, arrows), axes="frame",
+        low=_pair(low), high=_pair(high), marks=(*bodies, *arrows), axes="frame",
         title=f"{title}contact forces on the slave nodes; the largest is "
-        f"{largest / factor:.3g} {prefix}N/m",
+        f"{largest / factor:.3g} {prefix}N/m{key}",
         **_axes(span),
     )  # fmt: skip
 

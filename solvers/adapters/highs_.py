@@ -67,7 +67,9 @@ class HiGHS:
             "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
             "residuals of 5e-12.",
             "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
-            "entries 1e6 times larger (tests/solvers/test_solvers.py).",
+            "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
+            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
+            "260 (suites/friction.toml).",
             "On QPs with bounds only and without the free row, HiGHS 1.15.1 claims an "
             "optimum after 0 iterations: a membrane of 225 nodes has a residual of 1 "
             "(conformance check 'finds where a membrane of 400 nodes touches').",

@@ -53,7 +53,9 @@ class QTQP:
         limits=(
             "Needs an inequality row or a bound: without one it divides by zero.",
             "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
-            "Nr=30/Nh=15/primal and ends at its iteration limit, close to the answer.",
+            "Nr=30/Nh=15/primal and ends at its iteration limit, close to the answer; "
+            "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
+            "of what it claims is 2.0e-8, twice what is verified.",
         ),
     )
 

@@ -9,7 +9,7 @@ from solvers.smalbe.outer_loop import Constants, Iterate
 from solvers.smalbe.projected import Projected
 
 Array = NDArray[np.float64]
-Kept = NDArray[np.int64]
+Kept = NDArray[np.int32]
 
 class Product:
     count: int
@@ -25,6 +25,7 @@ class Solver:
         alpha: float,
         preconditioned: bool,
     ) -> None: ...
+    def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
     def smalbe(
         self,
         constants: Constants,
@@ -44,24 +45,23 @@ class Solver:
     def point(
         self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
-    def residual_bound(
-        self,
-        x: Vector,
-        y: Vector,
-        z_box: Vector,
-        Fx: Vector,
-        lb: Vector,
-        ub: Vector,
-        G: Array,
-        e: Vector,
-    ) -> float: ...
 
-def prepare(
-    P: Matrix, n: int, G: Array, e: Vector, start: Vector, steps: int
+def residual_bound(*vectors: Vector, G: Array) -> float: ...
+def orthonormal(
+    G: Array, e: Vector
 ) -> tuple[
-    Product,
-    tuple[Array, Array, Array, float, float, Vector, bool],
-    tuple[Array, Kept, Vector],
-    tuple[Vector, Vector, Array, float],
+    tuple[Array, Array, Array, float, float, Vector, bool], tuple[Array, Kept, Vector]
 ]: ...
+def lanczos(
+    F: Product, C: Array, start: Vector, steps: int
+) -> tuple[Vector, Vector, Array, float]: ...
+def homogenised(
+    F: Product,
+    C: Array,
+    x_tilde: Vector,
+    q: Vector,
+    lb: Vector,
+    ub: Vector,
+    norm: float,
+) -> tuple[Vector, tuple[Vector, Vector]]: ...
 def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...

@@ -5,7 +5,7 @@
 The readable modules define what happens here, and are what tests compare with: the same
 counts, and the same points up to rounding.
 
-* `prepare`: `solvers.smalbe.projected`, `solvers.smalbe.spectrum`
+* `orthonormal`, `lanczos`: `solvers.smalbe.projected`, `solvers.smalbe.spectrum`
 * `_Run.step_of_model`, `_Run.core`: `solvers.smalbe.model`
 * `_Run.minimise`: `solvers.smalbe.mprgp`
 * `smalbe`: `solvers.smalbe.outer_loop`
@@ -21,7 +21,7 @@ from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dgemv, dsymv
 from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev, dtrtrs,
+    dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev,
 )
 
 import numpy as np
@@ -119,8 +119,8 @@ cdef double *pointer(double[::1] v) noexcept:
     return &v[0] if v.shape[0] else NULL
 
 
-cdef double *first(double[:, ::1] M) noexcept:
-    return &M[0, 0] if M.shape[0] and M.shape[1] else NULL
+cdef double *first(const double[:, ::1] M) noexcept:
+    return <double *> &M[0, 0] if M.shape[0] and M.shape[1] else NULL
 
 
 cdef void rows_times(
@@ -156,86 +156,83 @@ cdef void without(
 # --- preparation --------------------------------------------------------------------
 
 
-def prepare(P, Py_ssize_t n, const double[:, ::1] G, const double[::1] e,
-            const double[::1] start, int steps):
-    """Find orthonormal rows, x̃ and Ritz pairs, as `projected_problem` does.
+def orthonormal(const double[:, ::1] G, const double[::1] e):
+    """Find orthonormal rows and x̃ for Gx = e, G (m, n), as `orthonormal_rows` does.
 
-    G (m, n), e (m,); start (n,) of the Lanczos process, `steps` long. Returns the
-    product, the fields of `Rows` but the last, the QR factorisation that
-    multipliers need, and the fields of `Ritz`.
+    Returns the fields of `Rows` but the last, and the QR factorisation that multipliers
+    need: R (r, r), the rows kept (r,), their sizes (m,).
     """
-    cdef Py_ssize_t i, m = G.shape[0], r = 0
-    cdef Product F = Product(P, n)
-    cdef double mismatch = 0.0, most_x = 0.0, most_e = 0.0, square = 0.0
-    cdef bint consistent = True
-    dense, least_pivot = np.asarray(G), 1.0
-    kept, R, rows = np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros((0, n))
-    sizes, x_tildes, GC = np.ones(m), np.zeros(n), np.zeros((m, 0))
-    cdef double[::1] size = sizes, x_tilde = x_tildes
-    cdef double[:, ::1] C = rows
+    cdef Py_ssize_t i, j, m = G.shape[0], n = G.shape[1], w = min(m, n)
+    cdef int rows = m, columns = n, info = 0, most, r = 0
+    cdef double mismatch = 0.0, most_x = 0.0, most_e = 0.0, square = 0.0, z, error
+    cdef double least_pivot = 1.0
+    sizes, x_tildes, unit = np.ones(m), np.zeros(n), np.empty((m, n))
+    pivots, tau, work = np.zeros(m, dtype=np.int32), np.empty(w), np.empty(64 * (m + n))
+    cdef double[::1] size = sizes, x_tilde = x_tildes, t = tau, space = work
+    cdef double[:, ::1] A = unit, R, GC  # A (m, n) by rows is (n, m) by columns
+    cdef int[::1] pivot = pivots
+    most = space.shape[0]
     for i in range(m):
         size[i] = sqrt(dot(&G[i, 0], &G[i, 0], n)) if n else 0.0
         size[i] = size[i] or 1.0
         most_e = fmax(most_e, fabs(e[i]) / size[i])
         square += e[i] * e[i]
-    if m and n:
-        R, kept, rows = _orthonormal(dense / sizes[:, None], min(m, n))
-        C, r = rows, rows.shape[0]
-        GC = dense @ rows.T
-        if r:
-            least_pivot = min(1.0, np.abs(np.diag(R)).min())
-            coefficients = _triangular(R, (np.asarray(e) / sizes)[kept], b"T")
-            x_tilde = coefficients @ rows
-        for i in range(n):
-            most_x = fmax(most_x, fabs(x_tilde[i]))
+        for j in range(n):
+            A[i, j] = G[i, j] / size[i]
+    if w:
+        dgeqp3(&columns, &rows, &A[0, 0], &columns, &pivot[0], &t[0], &space[0], &most,
+               &info)
+    for i in range(w):
+        if fabs(A[i, i]) > RANK:
+            r += 1
+            least_pivot = fmin(least_pivot, fabs(A[i, i]))
+    R, GC = np.zeros((r, r)), np.empty((m, r))
+    for i in range(r):
+        for j in range(i, r):
+            R[i, j] = A[j, i]
+    if r:
+        dorgqr(&columns, &r, &r, &A[0, 0], &columns, &t[0], &space[0], &most, &info)
+    for i in range(r):  # x̃ = Cᵀz with Rᵀz = e/size
+        pivot[i] -= 1
+        z = e[pivot[i]] / size[pivot[i]]
+        for j in range(i):
+            z -= R[j, i] * space[j]
+        space[i] = z / R[i, i]
+        add(space[i], &A[i, 0], &x_tilde[0], n)
+    for i in range(n):
+        most_x = fmax(most_x, fabs(x_tilde[i]))
     for i in range(m):
-        e_i = dot(&G[i, 0], &x_tilde[0], n) if n else 0.0
-        mismatch = fmax(mismatch, fabs(e_i - e[i]) / size[i])
-    consistent = mismatch <= 1e-8 * (most_x + most_e)
-    rows = (dense, rows, GC, sqrt(square), least_pivot, np.asarray(x_tilde), consistent)
-    return F, rows, (R, kept, sizes), _lanczos(F, C, start, steps)
+        error = (dot(&G[i, 0], &x_tilde[0], n) if n else 0.0) - e[i]
+        mismatch = fmax(mismatch, fabs(error) / size[i])
+        for j in range(r):
+            GC[i, j] = dot(&G[i, 0], &A[j, 0], n)
+    return (
+        (np.asarray(G), unit[:r], np.asarray(GC), sqrt(square), least_pivot, x_tildes,
+         mismatch <= 1e-8 * (most_x + most_e)),
+        (np.asarray(R), pivots[:r], sizes),
+    )
 
 
-def _orthonormal(unit, Py_ssize_t w):
-    """Factorise unitᵀ = QR with pivots: R (r, r), the rows kept (r,), C = Qᵀ (r, n)."""
-    cdef double[:, ::1] A = np.array(unit)  # (m, n) by rows is (n, m) by columns
-    cdef int m = A.shape[0], n = A.shape[1], info = 0, most, r = 0, width = w
-    pivots, tau, work = np.zeros(m, dtype=np.int32), np.empty(w), np.empty(64 * (m + n))
-    cdef int[::1] pivot = pivots
-    cdef double[::1] t = tau, space = work
-    most = space.shape[0]
-    dgeqp3(&n, &m, &A[0, 0], &n, &pivot[0], &t[0], &space[0], &most, &info)
-    R = np.triu(np.asarray(A)[:w, :w].T)
-    diagonal = np.abs(np.diag(R))
-    r = int((diagonal > RANK).sum())
-    if r:
-        dorgqr(&n, &r, &r, &A[0, 0], &n, &t[0], &space[0], &most, &info)
-    return R[:r, :r].copy(), pivots[:r].astype(np.int64) - 1, np.asarray(A)[:r].copy()
+cdef double RANK = 1e-13  # pivots of the normalised rows below this are rounding errors
 
 
-RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
-
-
-def multipliers(Py_ssize_t m, R, kept, size, a):
+def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
+                const double[::1] size, const double[::1] a):
     """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
-    y = np.zeros(m)
-    if len(kept):
-        y[kept] = _triangular(R, a, b"N") / size[kept]
-    return y
+    cdef Py_ssize_t i, j
+    cdef double s
+    result = np.zeros(m)
+    cdef double[::1] y = result
+    for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
+        s = a[i]
+        for j in range(i + 1, R.shape[0]):
+            s -= R[i, j] * y[kept[j]] * size[kept[j]]
+        y[kept[i]] = s / (R[i, i] * size[kept[i]])
+    return result
 
 
-def _triangular(R, b, char *transposed):
-    """Solve Rx = b, or Rᵀx = b, with an upper triangle R (r, r)."""
-    cdef double[::1, :] A = np.asfortranarray(R)
-    cdef double[::1] x = np.array(b)
-    cdef int r = x.shape[0], one = 1, info = 0
-    if r:
-        dtrtrs(b"U", transposed, b"N", &r, &one, &A[0, 0], &r, &x[0], &r, &info)
-    return np.asarray(x)
-
-
-cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
-    """Find upper Ritz pairs of PFP: values, residuals, vectors (k, n), and at the start."""
+def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int steps):
+    """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`."""
     cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
     cdef int kept, info = 0, again
     steps = min(steps, n)
@@ -279,6 +276,31 @@ cdef _lanczos(Product F, double[:, ::1] C, const double[::1] start, int steps):
     vectors = whole[:, ::-1].T @ bases[:kept]
     residuals = offs[kept - 1] * np.abs(whole[-1, ::-1])
     return np.asarray(theta)[::-1].copy(), residuals, vectors, at_start
+
+
+def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q, lb, ub,
+                double norm):
+    """Return b (n,) and the bounds of ν = x − x̃, as `_normalised` finds them."""
+    cdef Py_ssize_t i, n = x_tilde.shape[0], r = C.shape[0]
+    cdef double[:, ::1] found = np.zeros((3, n))
+    cdef double[::1] b = found[0], Cb = np.empty(r)
+    cdef const double[::1] cost = _whole(q), low = _whole(lb), high = _whole(ub)
+    cdef double square = 0.0
+    cdef bint moved = False
+    for i in range(n):
+        found[1, i], found[2, i] = low[i] - x_tilde[i], high[i] - x_tilde[i]
+        moved = moved or x_tilde[i] != 0
+    if moved:
+        F.apply(&x_tilde[0], &b[0])
+    for i in range(n):
+        b[i] = -cost[i] - b[i]
+        square += b[i] * b[i]
+    without(first(C), r, pointer(b), pointer(Cb), n)
+    if dot(pointer(b), pointer(b), n) <= 1e-28 * square:
+        b[:] = 0.0  # nothing but rounding errors is left of d
+    scale(1 / norm, pointer(b), n)
+    whole = np.asarray(found)
+    return whole[0], (whole[1], whole[2])
 
 
 # --- MPRGP and the outer loop -------------------------------------------------------
@@ -394,7 +416,7 @@ cdef class Solver:
     cdef double inverse_norm, norm, e_size, x_tilde_size, alpha, Gamma_square, rho
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef int expansion
-    cdef double[:, ::1] C, GC, vectors, room
+    cdef double[:, ::1] C, GC, vectors
     cdef const double[::1] q, diagonal
     cdef double[::1] x_tilde, b, lower, upper, above, rhs
     cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
@@ -407,6 +429,7 @@ cdef class Solver:
     cdef double[:, ::1] core, inverse
 
     def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
+        cdef Py_ssize_t i, k
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
         self.C, self.GC, self.x_tilde = map(_whole, (rows.C, rows.GC, rows.x_tilde))
@@ -424,19 +447,28 @@ cdef class Solver:
         k = 0
         if spectrum.ritz is not None:
             above, vectors, self.tail = problem.upper_end()
-            self.above = np.append(above, np.zeros(self.r)) - self.tail
-            self.vectors = np.vstack([vectors, rows.C])
-            k = self.above.shape[0]
+            k = len(above) + self.r
+            self.above, self.vectors = np.zeros(k), np.concatenate((vectors, rows.C))
+            for i in range(k):
+                self.above[i] = (above[i] if i < k - self.r else 0.0) - self.tail
         n = self.n
-        self.room = np.empty((14, n))
-        (self.x, self.g, self.p, self.Hp, self.phi, self.free, self.z, self.s, self.Hs,
-         self.t, self.x2, self.g2, self.box_lower, self.box_upper) = self.room
-        self.rhs, self.piece, self.piece2 = np.empty((3, n))
-        self.Cv, self.Cw = np.empty((2, self.r))
+        cdef double[:, ::1] room = np.empty((17, n)), small = np.empty((7, k))
+        cdef double[:, ::1] cores = np.empty((2 * k, k)), tiny = np.empty((2, self.r))
+        self.x, self.g, self.p, self.Hp, self.phi = (
+            room[0], room[1], room[2], room[3], room[4]
+        )
+        self.free, self.z, self.s, self.Hs, self.t = (
+            room[5], room[6], room[7], room[8], room[9]
+        )
+        self.x2, self.g2, self.box_lower, self.box_upper = (
+            room[10], room[11], room[12], room[13]
+        )
+        self.rhs, self.piece, self.piece2 = room[14], room[15], room[16]
+        self.Cv, self.Cw = tiny[0], tiny[1]
         self.Ge, self.told = np.empty(self.m), np.empty(4)
-        (self.y, self.dy, self.y2, self.slope, self.slope2, self.c,
-         self.c2) = np.empty((7, k))
-        self.core, self.inverse = np.empty((2, k, k))
+        self.y, self.dy, self.y2, self.slope = small[0], small[1], small[2], small[3]
+        self.slope2, self.c, self.c2 = small[4], small[5], small[6]
+        self.core, self.inverse = cores[:k], cores[k:]
 
     # the operator
 
@@ -894,6 +926,20 @@ cdef class Solver:
 
     # the outer loop
 
+    def begin(self, const double[::1] x, const double[::1] mu, double rho):
+        """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
+        cdef Py_ssize_t i, n = self.n
+        start, gradient = np.empty(n), np.empty(n)
+        cdef double[::1] nu = start, g = gradient
+        self.rho = rho
+        for i in range(n):
+            nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
+        self.H(pointer(nu), pointer(g))
+        add(-1.0, pointer(self.b), pointer(g), n)
+        for i in range(self.r):
+            add(mu[i], &self.C[i, 0], pointer(g), n)
+        return start, gradient
+
     def smalbe(self, constants, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
 
@@ -988,7 +1034,7 @@ cdef class Solver:
 
     # back to the problem as given
 
-    def point(self, nu, mu, const double[::1] lb, const double[::1] ub):
+    def point(self, nu, mu, lb, ub):
         """Return x, a, z_box and Fx of the problem with the rows Cx = Cx̃; one product.
 
         As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
@@ -997,7 +1043,7 @@ cdef class Solver:
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
         result = np.zeros((4, n))
-        cdef const double[::1] v = nu
+        cdef const double[::1] v = nu, low = _whole(lb), high = _whole(ub)
         cdef double[::1] x, z_box, Fx, rest, at = np.empty(n)
         cdef double[::1] a = self.norm * np.asarray(mu), da = np.zeros(r)
         cdef double[:, ::1] S = np.zeros((r, r))
@@ -1006,8 +1052,8 @@ cdef class Solver:
         for i in range(n):
             at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
             s = self.x_tilde[i] + v[i]
-            s = lb[i] if at[i] < 0 else (ub[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, lb[i]), ub[i])  # l − x̃ + x̃ may differ in the last bit
+            s = low[i] if at[i] < 0 else (high[i] if at[i] > 0 else s)
+            x[i] = fmin(fmax(s, low[i]), high[i])  # l − x̃ + x̃ may differ in the last bit
         self.F.apply(&x[0], &Fx[0])
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
@@ -1037,73 +1083,77 @@ cdef class Solver:
                 z_box[i] -= fmin(rest[i], 0.0)
         return np.asarray(x), np.asarray(a), np.asarray(z_box), np.asarray(Fx)
 
-    def residual_bound(self, const double[::1] x, const double[::1] y,
-                       const double[::1] z_box, const double[::1] Fx,
-                       const double[::1] lb, const double[::1] ub,
-                       const double[:, ::1] G, const double[::1] e):
-        """Bound the worst of `harness.kkt_residuals` from above, without products.
 
-        With the least scale of energy that it may use, and nothing excused as rounding:
-        where this is small, so are the residuals. inf where nothing can be said.
-        """
-        cdef Py_ssize_t i, j, n = self.n, m = e.shape[0]
-        cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
-        cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-        cdef double[::1] forces = np.array(z_box), size = self.s
-        if not self.diagonal.shape[0]:
+def residual_bound(*vectors, G):
+    """Bound the worst of `harness.kkt_residuals` from above, without products.
+
+    vectors : q, the diagonal of P (empty for an operator), x, y, z_box, Px, lb, ub, e;
+    G (m, n), e (m,): the rows Gx = e
+
+    With the least scale of energy that it may use, and nothing excused as rounding:
+    where this is small, so are the residuals. inf where nothing can be said.
+    """
+    cdef const double[:, ::1] rows = G
+    cdef const double[::1] q, diagonal, x, y, z_box, Fx, lb, ub, e
+    q, diagonal, x, y, z_box, Fx, lb, ub, e = map(_whole, vectors)
+    cdef Py_ssize_t i, j, n = x.shape[0], m = e.shape[0]
+    cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
+    cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
+    cdef double[::1] forces = np.array(z_box), size = np.empty(n)
+    if not diagonal.shape[0]:
+        return INFINITY
+    for i in range(m):
+        add(y[i], &rows[i, 0], pointer(forces), n)
+        held += e[i] * y[i]
+    for i in range(n):
+        if not lb[i] <= x[i] <= ub[i]:
             return INFINITY
-        for i in range(m):
-            add(y[i], &G[i, 0], pointer(forces), n)
-            held += e[i] * y[i]
-        for i in range(n):
-            if not lb[i] <= x[i] <= ub[i]:
-                return INFINITY
-            xFx += x[i] * Fx[i]
-            qx += self.q[i] * x[i]
-            if z_box[i]:
-                step = ub[i] if z_box[i] > 0 else lb[i]
-                held += step * z_box[i]
-                worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
-            if self.diagonal[i] > 0:
-                least = fmin(least, self.diagonal[i])
-            S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(self.q[i]), fabs(forces[i])))
-        most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held))
-        energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
-        if not energy > 0:
-            return INFINITY
-        worst = fmax(worst, fabs(xFx + qx + held)) / energy
-        if isfinite(least):
-            S = fmax(S, sqrt(energy * least))
-        for i in range(n):
-            step = fabs(Fx[i] + self.q[i] + forces[i])
-            total += step
-            if step == 0:
-                continue
-            worst = fmax(worst, step / S)
-            own = step / fmax(fmax(fabs(Fx[i]), fabs(self.q[i])), fabs(forces[i]))
-            if self.diagonal[i] > 0:
-                known = fmax(fabs(x[i]), step / self.diagonal[i])
-                terms = x[i] - lb[i] if Fx[i] + self.q[i] + forces[i] > 0 else ub[i] - x[i]
-                own = fmin(own, step * fmin(known, terms) / energy)
-            worst = fmax(worst, own)
-        for j in range(n if m else 0):
-            step = INFINITY
-            if self.diagonal[j] > 0:
-                step = sqrt(energy / self.diagonal[j])
-            if self.q[j]:
-                step = fmin(step, energy / fabs(self.q[j]))
-            size[j] = 0.0
-            if isfinite(step):
-                size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
-        for i in range(m):
-            violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
-            for j in range(n):
-                violated += G[i, j] * x[j]
-                terms += fabs(G[i, j] * x[j])
-                known += fabs(G[i, j]) * size[j]
-            total += violated
-            if violated:
-                worst = fmax(worst, fabs(violated) / known)
-                if fabs(e[i]) > 1e-9 * known:
-                    worst = fmax(worst, 1e-4 * fabs(violated) / terms)
-        return worst if isfinite(total) and isfinite(worst) else INFINITY
+        xFx += x[i] * Fx[i]
+        qx += q[i] * x[i]
+        if z_box[i]:
+            step = ub[i] if z_box[i] > 0 else lb[i]
+            held += step * z_box[i]
+            worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
+        if diagonal[i] > 0:
+            least = fmin(least, diagonal[i])
+        S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(q[i]), fabs(forces[i])))
+    most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held))
+    energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
+    if not energy > 0:
+        return INFINITY
+    worst = fmax(worst, fabs(xFx + qx + held)) / energy
+    if isfinite(least):
+        S = fmax(S, sqrt(energy * least))
+    for i in range(n):
+        step = fabs(Fx[i] + q[i] + forces[i])
+        total += step
+        if step == 0:
+            continue
+        worst = fmax(worst, step / S)
+        own = step / fmax(fmax(fabs(Fx[i]), fabs(q[i])), fabs(forces[i]))
+        if diagonal[i] > 0:
+            known = fmax(fabs(x[i]), step / diagonal[i])
+            terms = x[i] - lb[i] if Fx[i] + q[i] + forces[i] > 0 else ub[i] - x[i]
+            own = fmin(own, step * fmin(known, terms) / energy)
+        worst = fmax(worst, own)
+    for j in range(n if m else 0):
+        step = INFINITY
+        if diagonal[j] > 0:
+            step = sqrt(energy / diagonal[j])
+        if q[j]:
+            step = fmin(step, energy / fabs(q[j]))
+        size[j] = 0.0
+        if isfinite(step):
+            size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
+    for i in range(m):
+        violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
+        for j in range(n):
+            violated += rows[i, j] * x[j]
+            terms += fabs(rows[i, j] * x[j])
+            known += fabs(rows[i, j]) * size[j]
+        total += violated
+        if violated:
+            worst = fmax(worst, fabs(violated) / known)
+            if fabs(e[i]) > 1e-9 * known:
+                worst = fmax(worst, 1e-4 * fabs(violated) / terms)
+    return worst if isfinite(total) and isfinite(worst) else INFINITY

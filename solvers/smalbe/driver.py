@@ -51,6 +51,7 @@ class Carry(NamedTuple):
     """What one problem of a sequence leaves for the next."""
 
     x: Vector  #: (n,)
+    side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper one, else 0
     force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
     spectrum: Spectrum
     block: FreeBlock | None
@@ -95,7 +96,7 @@ def prepared(
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
         solve=solve, solver=solver, history=history,
-        start=_start(problem, options, carry, tol),
+        start=_start(problem, options, carry, tol, solver),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -136,14 +137,28 @@ def _lanczos_steps(options: Options, n: int) -> int:
 
 
 def _start(
-    problem: Projected, options: Options, carry: Carry | None, tol: float
+    problem: Projected,
+    options: Options,
+    carry: Carry | None,
+    tol: float,
+    solver: compiled.Solver | None,
 ) -> Iterate:
-    """Start from zero, or from where the problem before ended."""
+    """Start from zero, or from where the problem before ended.
+
+    What was at a bound there begins at that bound here, wherever it is now: rows that
+    slip go on slipping when their friction changes.
+    """
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), np.zeros(len(C))
     if carry is not None:
-        x, mu = carry.x, C @ carry.force / problem.spectrum.norm
-    return first_iterate(problem, x, mu, M=options.M, rho=_penalty(options, tol))
+        lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
+        x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
+        x = np.where(np.isfinite(x), x, carry.x)
+        mu = C @ carry.force / problem.spectrum.norm
+    rho = _penalty(options, tol)
+    if solver is None:
+        return first_iterate(problem, x, mu, M=options.M, rho=rho)
+    return Iterate(*solver.begin(x, mu, rho), mu, options.M, rho)
 
 
 def _penalty(options: Options, tol: float) -> float:
@@ -195,7 +210,7 @@ def _compiled_loop(
     at: Iterate,
 ) -> Iterate:
     nu, g, mu, M, rho, done, status = solver.smalbe(
-        constants, tol, at, partial(infeasible, problem),
+        constants, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
     outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
@@ -255,8 +270,13 @@ def _nothing() -> None:
 
 def _carry(task: _Task, at: Iterate) -> Carry:
     problem, eliminated = task.problem, task.eliminated
+    lower, upper = problem.bounds
+    side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
+    held = lower == upper
+    side[held] = -np.sign(at.g[held])  # where it would go
     return Carry(
         x=problem.rows.x_tilde + at.nu,
+        side=side,
         force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
         spectrum=problem.spectrum,
         block=eliminated and eliminated.block,
@@ -308,9 +328,10 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
     qp = task.qp
     if task.solver is not None and task.eliminated is None:
-        bound: float = task.solver.residual_bound(
-            point.x, point.y, point.z_box, Fx, qp.lb, qp.ub, task.problem.rows.G, qp.b
-        )
+        bound = compiled.residual_bound(
+            qp.q, task.problem.diagonal, point.x, point.y, point.z_box, Fx,
+            qp.lb, qp.ub, qp.b, G=task.problem.rows.G,
+        )  # fmt: skip
         if bound <= enough:
             return bound
     task.problem.F.count += 1

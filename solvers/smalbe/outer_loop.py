@@ -40,7 +40,7 @@ from solvers.smalbe.mprgp import (
     Watch,
     mprgp,
 )
-from solvers.smalbe.projected import Projected
+from solvers.smalbe.projected import Projected, Rows
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products
@@ -148,7 +148,9 @@ def smalbe(
         lagrangian = at.outer[-1].lagrangian
         if small(Point(run.x, run.g), run.face):
             return at._replace(status=Status.SOLVED)
-        if (not run.stopped or at.stalled) and infeasible(problem, at.nu):
+        if (not run.stopped or at.stalled) and infeasible(
+            problem.rows, problem.bounds, at.nu
+        ):
             return at._replace(status=Status.INFEASIBLE)
         if not run.stopped or left < 0:
             return at
@@ -213,13 +215,13 @@ def _updated(
     return _with_penalty(problem, new, constants.rho_growth * rho)
 
 
-def infeasible(problem: Projected, nu: Vector) -> bool:
+def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
     """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
 
     By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum
     of rᵀν' over the box is positive.
     """
-    rows, (lower, upper) = problem.rows, problem.bounds
+    lower, upper = bounds
     Cnu = rows.C @ nu
     r = rows.C.T @ Cnu
     size = _norm(rows.x_tilde) + _norm(nu)

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
-from scipy.sparse import issparse
 
 from harness import QP, Matrix, Vector
 from solvers.smalbe import compiled
@@ -68,7 +67,7 @@ class Spectrum(NamedTuple):
         if self.ritz is None:
             return self
         V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
-        vectors = (V * np.sign(np.diag(R))).T
+        vectors = np.ascontiguousarray((V * np.sign(np.diag(R))).T)
         return self._replace(ritz=self.ritz._replace(vectors=vectors))
 
 
@@ -156,7 +155,8 @@ def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
     mismatch = np.abs(dense @ x_tilde - e) / size
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
 
-    multipliers = partial(compiled.multipliers, e.size, R, kept, size)
+    triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
+    multipliers = partial(compiled.multipliers, e.size, *triangle)
     consistent = bool((mismatch <= 1e-8 * scale).all())
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
     pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
@@ -184,31 +184,44 @@ def projected_problem(
 
 def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
-    start = random_start(qp.q.size)
-    F, orthonormal, triangle, ritz = compiled.prepare(
-        qp.P, qp.q.size, _dense(qp.A), np.ascontiguousarray(qp.b), start, steps
+    F, rows = Product(qp.P, qp.q.size), prepared_rows(qp)
+    ritz = Ritz(*compiled.lanczos(F, rows.C, random_start(qp.q.size), steps))
+    diagonal = _diagonal(qp)
+    spectrum = _not_vanishing(Spectrum(ritz.norm or 1.0, ritz), diagonal)
+    b, bounds = compiled.homogenised(
+        F, rows.C, rows.x_tilde, qp.q, qp.lb, qp.ub, spectrum.norm
     )
-    found = Ritz(*ritz)
-    rows = Rows(*orthonormal, partial(compiled.multipliers, qp.b.size, *triangle))
-    return _normalised(qp, F, rows, Spectrum(found.norm or 1.0, found))
+    return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
+
+
+def prepared_rows(qp: QP) -> Rows:
+    """Do what `orthonormal_rows` does, compiled."""
+    rows, triangle = compiled.orthonormal(_dense(qp.A), np.ascontiguousarray(qp.b))
+    return Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
 
 
 def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:
-    if spectrum.norm <= NOTHING * (size := _mean_eigenvalue(qp.P)):
-        spectrum = spectrum._replace(norm=size or 1.0)  # 𝒫F𝒫 is zero, or rounding
+    diagonal = _diagonal(qp)
+    spectrum = _not_vanishing(spectrum, diagonal)
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
         b = np.zeros_like(b)  # nothing but rounding errors is left of d
-    diagonal = np.asarray(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
     return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
-def _mean_eigenvalue(P: Matrix) -> float:
-    """Return the trace of an explicit P by its size, 0 for an operator."""
-    explicit = isinstance(P, np.ndarray) or issparse(P)
-    return float(P.diagonal().mean()) if explicit and P.shape[0] else 0.0
+def _diagonal(qp: QP) -> Vector:
+    """Copy the diagonal of an explicit P; empty for an operator."""
+    return np.array(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
+
+
+def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
+    """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
+    mean = float(diagonal.mean()) if diagonal.size else 0.0
+    if spectrum.norm > NOTHING * mean:
+        return spectrum
+    return spectrum._replace(norm=mean or 1.0)
 
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:

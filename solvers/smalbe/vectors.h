@@ -5,6 +5,7 @@
    compiler can do four components at once. */
 
 #include <math.h>
+#include <string.h>
 
 #if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__)
 #define TWICE __attribute__((target_clones("arch=haswell", "default")))
@@ -75,7 +76,7 @@ TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_
             least = to < least ? to : least;
         }
     }
-    feasible = *(double *) &least;
+    memcpy(&feasible, &least, sizeof feasible);
     told[0] = curvature > 0 ? slope / curvature : INFINITY;
     told[1] = feasible;
     told[2] = slope;

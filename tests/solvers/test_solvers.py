@@ -33,7 +33,7 @@ CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
 }
 WILDCARDS = ("qpsolvers:*", "cvxpy:*")
 #: end at a vertex of the active-set search, whatever the tolerance
-EXACT = ("bvls", "daqp", "highs", "quadprog")
+EXACT = ("bvls", "daqp", "highs", "quadprog", "smalbe-direct")
 SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
     "cvxopt",

@@ -340,3 +340,23 @@ def test_the_file_is_plain_data(tmp_path):
 
     assert row["case"] == "obstacle/n=4"
     assert row["error"] == found.error
+
+
+def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path):
+    """Of two meshes that one halving apart, the coarse one's error has the change."""
+    name = (
+        "contact-patch/lower={0}/upper={0}/ratio=0.1/friction=tresca/bound=1e5/primal"
+    )
+    coarse, fine = (meshes(tmp_path, name.format(n))[0] for n in (4, 8))
+    curved, coulomb = meshes(
+        tmp_path, "beam-ring/Nr=2/Nh=1/steps=1/friction=tresca/bound=1e6/primal",
+        "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/primal",
+    )  # fmt: skip
+
+    assert coarse.kind == fine.kind == "limit"
+    whole = np.hypot(coarse.change, fine.error * fine.levels[0].norm
+                     / coarse.levels[0].norm)  # fmt: skip
+    assert coarse.error == pytest.approx(whole, rel=0.1)
+    assert "on curved sides" in curved.note
+    assert "expected friction=tresca" in coulomb.note
+    assert curved.kind == coulomb.kind == "unknown"

@@ -292,7 +292,7 @@ forms = ["dual"]
 """
 
 
-def first_page(folder, _formats, *, factor=10.0):
+def first_page(folder, _formats, *, factor=10.0, pool_forms=False):
     """Write what the summary of a report says."""
     (folder / "said").write_text("\n".join(summary(read_evidence(folder)).prose))
     return []

@@ -127,6 +127,8 @@ def test_each_contact_of_a_deformed_state_comes_back(tmp_path, fields):
         )
         for i in range(2)
     )  # fmt: skip
+    rough = {"shear": np.array([1.0, -2.0]), "friction": np.array(["slip", "open"])}
+    sides = (sides[0], replace(sides[1], **rough))
     stored = replace(fields, contacts=sides)
     loaded = load_fields(tmp_path, save_fields(tmp_path, stored))
 
@@ -134,4 +136,7 @@ def test_each_contact_of_a_deformed_state_comes_back(tmp_path, fields):
     for one, two in zip(loaded.contacts, sides, strict=True):
         for part in ("nodes", "length", "force", "pressure", "gap"):
             np.testing.assert_array_equal(getattr(one, part), getattr(two, part))
+    assert loaded.contacts[0].friction is loaded.contacts[0].shear is None
+    for part, values in rough.items():
+        np.testing.assert_array_equal(getattr(loaded.contacts[1], part), values)
     assert load_fields(tmp_path, save_fields(tmp_path, fields)).contacts == ()

@@ -36,7 +36,7 @@ params = { depth = [1, 2] }
 """
 
 
-def no_report(folder, formats, *, factor=10.0):
+def no_report(folder, formats, *, factor=10.0, pool_forms=False):
     return []
 
 

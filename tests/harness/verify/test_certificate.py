@@ -241,9 +241,10 @@ def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
     mechanics = known(CASES[0]).mechanics
     fresh = reference_point(mechanics, reference_solution, tmp_path)
     (stored,) = tmp_path.iterdir()
-    wrong = ~fresh.active
+    wrong = (-1 - fresh.states).astype(np.int8)
     for content in (
-        {"active": wrong}, {"active": wrong[:3]}, {"active": wrong * 1.0}, {"u": wrong},
+        {"states": wrong}, {"states": wrong[:3]}, {"states": wrong * 1.0},
+        {"states": 5 + wrong}, {"states": 1 + 0 * wrong}, {"u": wrong},
     ):  # fmt: skip
         with stored.open("wb") as file:
             np.savez(file, **content)

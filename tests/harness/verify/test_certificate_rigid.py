@@ -312,7 +312,9 @@ def test_balance_is_not_sought_beyond_what_rounding_allows():
     """Sums of terms that cancel are known to the rounding of the terms only."""
     G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
     lam = np.ones(2, dtype=Real)
-    found = _newton(lam, lam, G, load, lambda lam: np.abs(G).T @ lam)
+    found = _newton(
+        lam, lam, G, load, (0 * lam, np.inf * lam), lambda lam: np.abs(G).T @ lam
+    )
     assert found is not None
     assert (found == lam).all()
 

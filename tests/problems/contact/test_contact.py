@@ -32,7 +32,7 @@ def closest_points(x, chain, *normals):
 
 
 def test_a_node_above_a_segment_may_descend_by_its_gap():
-    B, c = rows(np.array([[1.0, 0.25]]), MASTER)
+    B, c, *_ = rows(np.array([[1.0, 0.25]]), MASTER)
 
     assert c == pytest.approx([0.25])
     # −n at the slave, +½n at both ends of the second segment, n = (0, 1)
@@ -40,13 +40,13 @@ def test_a_node_above_a_segment_may_descend_by_its_gap():
 
 
 def test_a_penetrated_node_has_a_negative_gap():
-    _, c = rows(np.array([[3.0, -0.1]]), MASTER)
+    _, c, *_ = rows(np.array([[3.0, -0.1]]), MASTER)
 
     assert c == pytest.approx([-0.1])
 
 
 def test_at_a_vertex_the_normal_is_averaged_and_the_vertex_carries_the_force():
-    B, c = rows(np.array([[1.0, 1.5]]), ROOF)
+    B, c, *_ = rows(np.array([[1.0, 1.5]]), ROOF)
 
     assert c == pytest.approx([0.5])
     assert B.toarray() == pytest.approx(
@@ -75,8 +75,8 @@ def test_the_constraint_is_on_the_total_displacement():
     slave = np.array([[1.0, 0.25], [3.0, 0.5]])
     u = np.zeros((5, 2))
     u[:2, 1] = [-0.2, 0.3]
-    B, c = rows(slave, MASTER)
-    B_moved, c_moved = rows(slave, MASTER, u.ravel())
+    B, c, *_ = rows(slave, MASTER)
+    B_moved, c_moved, *_ = rows(slave, MASTER, u.ravel())
 
     assert B_moved.toarray() == pytest.approx(B.toarray())
     assert c_moved == pytest.approx(c)
@@ -90,7 +90,7 @@ def test_rows_are_blind_to_translations_and_forces_balance_in_moment(seed):
     master = np.column_stack([np.linspace(4, 0, 9), 0.1 * rng.standard_normal(9)])
     slave = np.column_stack([rng.uniform(0.3, 3.7, 12), rng.uniform(0.3, 0.6, 12)])
     u = 0.05 * rng.standard_normal(42)
-    B, _ = rows(slave, master, u)
+    B, *_ = rows(slave, master, u)
     x = np.concatenate([slave, master]) + u.reshape(-1, 2)
     at = closest_points(x[:12], x[12:])
     inside = (at.xi > 0) & (at.xi < 1)
@@ -114,13 +114,13 @@ def test_the_linearised_gap_is_exact_to_first_order():
         "sa,sax->sx", N, master[np.column_stack([foot.segment, foot.segment + 1])]
     )
     slave = start + 1e-9 * foot.normal
-    B, c = rows(slave, master)
+    B, c, *_ = rows(slave, master)
     direction = rng.standard_normal(14)
     errors = []
     for size in (1e-2, 1e-3):
         du = size * direction
-        _, c_new = rows(slave, master, du)
-        B_new, _ = rows(slave, master, du)
+        _, c_new, *_ = rows(slave, master, du)
+        B_new, *_ = rows(slave, master, du)
         true_gap = c_new - B_new @ du
         errors.append(abs(true_gap - (c - B @ du)).max())
 
@@ -128,7 +128,7 @@ def test_the_linearised_gap_is_exact_to_first_order():
 
 
 def test_a_node_exactly_on_a_vertex_has_no_gap_and_the_averaged_normal():
-    B, c = rows(ROOF[1:2], ROOF)
+    B, c, *_ = rows(ROOF[1:2], ROOF)
 
     assert c == pytest.approx([0], abs=1e-15)
     assert B.toarray() == pytest.approx(
@@ -137,7 +137,7 @@ def test_a_node_exactly_on_a_vertex_has_no_gap_and_the_averaged_normal():
 
 
 def test_a_node_on_an_end_of_the_master_has_the_normal_of_the_last_segment():
-    B, c = rows(ROOF[2:], ROOF)
+    B, c, *_ = rows(ROOF[2:], ROOF)
 
     n = np.array([-1, 1]) / np.sqrt(2)
     assert c == pytest.approx([0], abs=1e-15)
@@ -166,7 +166,7 @@ def test_segments_without_length_change_nothing(normals):
 
 def test_slave_segments_without_length_keep_their_nodes_in_reach():
     near = Reach(distance=0.3)
-    B, c = rows(np.repeat(FLAT, 2, axis=0), MASTER, reach=near)
+    B, c, *_ = rows(np.repeat(FLAT, 2, axis=0), MASTER, reach=near)
 
     assert B.shape[0] == 6
     assert c == pytest.approx(0.25)
@@ -175,7 +175,7 @@ def test_slave_segments_without_length_keep_their_nodes_in_reach():
 def test_a_master_that_folds_back_onto_itself_has_finite_rows():
     needle = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
     for normals in ("segment", "averaged"):
-        B, c = rows(np.array([[1.0, 0.0], [1.5, 0.0], [0.5, 0.1]]), needle,
+        B, c, *_ = rows(np.array([[1.0, 0.0], [1.5, 0.0], [0.5, 0.1]]), needle,
                     normals=normals)  # fmt: skip
 
         assert np.isfinite(c).all()
@@ -230,7 +230,7 @@ def test_averaged_normals_of_a_flat_master_are_its_normal():
     [(None, 3), (Reach(), 3), (Reach(distance=0.3), 3), (Reach(distance=0.2), 0)],
 )
 def test_nodes_farther_than_the_reach_get_no_row(reach, kept):
-    B, c = rows(FLAT, MASTER, reach=reach)
+    B, c, *_ = rows(FLAT, MASTER, reach=reach)
 
     assert B.shape == (kept, 12)
     assert c.shape == (kept,)
@@ -261,7 +261,7 @@ def test_a_slave_that_runs_the_wrong_way_is_out_of_reach_everywhere():
 def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
     """Self-contact: the closest point of a master node is that node."""
     points = np.concatenate([MASTER, [[1.0, 0.25]]])
-    B, c = node_to_segment(points, np.zeros(8), np.array([1, 3]), np.arange(3))
+    B, c, *_ = node_to_segment(points, np.zeros(8), np.array([1, 3]), np.arange(3))
 
     assert B.has_canonical_format
     assert B.toarray() == pytest.approx(

@@ -93,7 +93,7 @@ def test_the_dual_basis_of_a_full_segment_is_2_minus_1():
 
 @pytest.mark.parametrize("basis", BASES)
 def test_the_gap_of_parallel_sides_is_their_distance_in_every_row(basis):
-    B, c = rows(flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False),
+    B, c, *_ = rows(flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False),
                 basis=basis)  # fmt: skip
 
     assert c == pytest.approx(np.full(8, 0.25))
@@ -105,7 +105,7 @@ def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
     """With Φ biorthogonal ∫Φ_j g/∫N_j is g_j; with N it is an average."""
     slave, master = flat(4, 0.5, rightwards=True), np.array([[2.0, 0.2], [-1.0, -0.1]])
     gap = 0.5 - 0.1 * slave[:, 0]
-    _, c = rows(slave, master, basis=basis)
+    _, c, *_ = rows(slave, master, basis=basis)
 
     if basis == "dual":
         assert c == pytest.approx(gap)
@@ -120,8 +120,8 @@ def test_the_constraint_is_on_the_total_displacement(basis):
     slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
     u = np.zeros((14, 2))
     u[:8, 1] = -0.3
-    B, c = rows(slave, master, basis=basis)
-    B_moved, c_moved = rows(slave, master, u.ravel(), basis=basis)
+    B, c, *_ = rows(slave, master, basis=basis)
+    B_moved, c_moved, *_ = rows(slave, master, u.ravel(), basis=basis)
 
     assert B_moved.toarray() == pytest.approx(B.toarray())
     assert c_moved == pytest.approx(c)
@@ -219,7 +219,7 @@ def test_the_search_loses_no_overlap(seed, monkeypatch):
 @pytest.mark.parametrize("basis", BASES)
 def test_the_forces_of_a_row_are_in_equilibrium(basis):
     slave, master = arcs(20)
-    B, _ = rows(slave, master, basis=basis)
+    B, *_ = rows(slave, master, basis=basis)
 
     forces = B.toarray().reshape(len(slave), -1, 2)
     assert forces.sum(axis=1) == pytest.approx(0, abs=1e-14)
@@ -234,7 +234,7 @@ def test_on_curved_sides_the_moment_of_a_pressure_vanishes_as_h_squared(basis):
         t, x = np.linspace(-0.6, 0.5, n + 1), np.linspace(1, -1, 9 * n // 10 + 1)
         slave = np.column_stack([np.sin(t), -np.cos(t)])
         master = np.column_stack([x, 0.1 * x**2 - 1.05])
-        B, _ = rows(slave, master, basis=basis)
+        B, *_ = rows(slave, master, basis=basis)
         nodal_forces = np.exp(3 * slave[:, 0]) / n
         force = (B.T @ nodal_forces).reshape(-1, 2)
         x = np.concatenate([slave, master])
@@ -257,7 +257,7 @@ def test_before_loading_no_weighted_gap_of_the_paper_is_negative(mesh, basis):
     """Beam and ring are 0.01 m apart; a chord of the arc is farther, never nearer."""
     bodies = model(*mesh, "strain")
     points, (pair,) = bodies.mesh.points, bodies.pairs
-    B, c = mortar(points, np.zeros(points.size), *pair, basis=basis)
+    B, c, *_ = mortar(points, np.zeros(points.size), *pair, basis=basis)
 
     assert 0 < B.shape[0] < len(pair.slave)  # the flanks face nothing
     assert c.min() > (0.0099 if mesh[1] > 1 else 0.0098)
@@ -280,7 +280,7 @@ def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
 @pytest.mark.parametrize("height", [0.25, -0.25], ids=["apart", "overlapping"])
 @pytest.mark.parametrize(("distance", "kept"), [(0.3, 8), (0.2, 0)])
 def test_segments_farther_than_the_reach_do_not_count(distance, kept, height):
-    B, c = rows(flat(7, height, rightwards=True), flat(5, 0.0, rightwards=False),
+    B, c, *_ = rows(flat(7, height, rightwards=True), flat(5, 0.0, rightwards=False),
                 reach=Reach(distance=distance))  # fmt: skip
 
     assert B.shape == (kept, 28)
@@ -289,7 +289,7 @@ def test_segments_farther_than_the_reach_do_not_count(distance, kept, height):
 
 def test_only_covered_nodes_get_a_row():
     """The master ends in the fifth of ten segments: nodes 0 to 5 are covered."""
-    B, _ = rows(flat(10, 0.1, rightwards=True),
+    B, *_ = rows(flat(10, 0.1, rightwards=True),
                 flat(3, 0.0, rightwards=False, right=0.45))  # fmt: skip
 
     assert B.shape[0] == 6
@@ -321,8 +321,8 @@ def test_a_side_that_runs_the_wrong_way_faces_nothing(basis):
 @pytest.mark.parametrize("basis", BASES)
 def test_segments_without_length_change_no_gap_and_no_force(basis):
     slave, master = flat(2, 0.25, rightwards=True), flat(3, 0.0, rightwards=False)
-    once, c = rows(slave, master, basis=basis)
-    twice, c_twice = rows(np.repeat(slave, [1, 2, 1], axis=0),
+    once, c, *_ = rows(slave, master, basis=basis)
+    twice, c_twice, *_ = rows(np.repeat(slave, [1, 2, 1], axis=0),
                           np.repeat(master, 2, axis=0), basis=basis)  # fmt: skip
 
     assert np.isfinite(twice.toarray()).all()
@@ -343,7 +343,7 @@ def test_odd_shapes_give_finite_rows(shape, basis):
         # beyond the point where the normals of a convex slave meet, inside its body
         "focus": ([[-1, 0.2], [0, 0], [1, 0.2]], [[2, 9], [-2, 9]]),
     }[shape]  # fmt: skip
-    B, c = rows(np.array(slave, float), np.array(master, float), basis=basis,
+    B, c, *_ = rows(np.array(slave, float), np.array(master, float), basis=basis,
                 reach=ANY_ANGLE)  # fmt: skip
 
     assert np.isfinite(B.toarray()).all()

@@ -574,3 +574,51 @@ def test_a_bad_name_is_refused(described, text, message):
         parse(text, PROBLEMS)
 
     assert str(e.value).startswith(message)
+
+
+def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_it(
+    described,
+):
+    law = 'friction = "coulomb"\nmu = 0.3\n'
+    same = "beam-ring/Nr=2/Nh=1/steps=2/friction=coulomb/mu=0.3/dual-bounds"
+    known = build(same).qp
+    for toml, keys in (
+        (TOML, "/friction=coulomb/mu=0.3"),
+        (law + TOML, ""),
+        (TOML + law, ""),
+        (TOML + law, "/friction=tresca/bound=1e3"),
+    ):
+        qp = build(f"{described(toml=toml)}{keys}/dual-bounds").qp
+
+        assert qp.ub.size == 2 * (12 * NH + 1)
+        assert sorted(qp.ub) == pytest.approx(sorted(known.ub), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("keys", "pair", "told"),
+    [
+        ("", 'friction = "tresca"', "contacts[0]: friction 'tresca' needs bound"),
+        ("", 'friction = "tresca"\nbound = -1', "contacts[0]: bound = -1; expected a"),
+        ("", 'friction = "coulomb"\nbound = 1', "contacts[0]: bound is not used by"),
+        ("", "mu = 0.1", "contacts[0]: mu is not used by friction 'none'"),
+        ("", 'friction = "oily"', "contacts[0]: unknown value of friction 'oily'"),
+        ("/friction=coulomb", "", "friction=coulomb needs mu"),
+        ("/bound=3", "", "bound=3 is not used by friction=none"),
+        ("/friction=coulomb", 'friction = "none"\nmu = 3', "mu is not used by"),
+    ],
+)
+def test_a_law_of_a_pair_that_does_not_fit_is_refused_in_one_line(
+    described, keys, pair, told
+):
+    with pytest.raises(InputError) as e:
+        build(f"{described(toml=TOML + pair)}{keys}/dual")
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_a_pair_may_lack_the_friction_that_the_others_have(described):
+    name = described(toml=TOML + 'friction = "none"')
+    qp = build(f"{name}/friction=coulomb/mu=1/dual-bounds").qp
+
+    assert np.isinf(qp.ub).all()

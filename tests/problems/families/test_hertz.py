@@ -7,8 +7,11 @@ import pytest
 from scipy.integrate import quad
 
 from harness import InputError, kkt_residuals
+from harness.names import parse
+from problems import PROBLEMS
 from problems.families.hertz import HertzCylinder, HertzPlane
-from problems.models.hertz import LineContact, two_cylinders
+from problems.models.hertz import sheared, two_cylinders
+from problems.models.line_contact import LineContact
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
@@ -174,3 +177,131 @@ def test_values_out_of_range_are_refused(family, bad, told):
         family.check({**family.defaults, **bad})
 
     assert told in str(e.value)
+
+
+COULOMB = dict(n=20, m=20, friction="coulomb", mu=0.3)
+
+
+def sheared_result(form="dual", **given):
+    case = CYLINDER.build(
+        form, CYLINDER.complete({**COULOMB, **given}), reference_solution
+    )
+    s = SOLVERS[form].prepare(case.qp, TOL)()
+    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
+    return case.quantities(s)
+
+
+@pytest.mark.parametrize(
+    ("Q", "contact"),
+    [(0.25, "mortar"), (0.5, "nts"), (0.75, "mortar"), (0.9, "mortar")],
+)
+def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
+    """20 cells per a, a/R = 0.027; c from the second moment of the traction."""
+    got = sheared_result(Q=Q, contact=contact)
+
+    assert abs(got["stick_half_width_error"]) < 0.01
+    assert abs(got["shear_centre_error"]) < 0.01
+    assert abs(got["tangential_force_error"]) < 1e-3
+    assert got["shear_l2_error"] < 0.1
+    assert got["stick"] == pytest.approx(2 * 20 * np.sqrt(1 - Q), abs=2)
+    assert got["stick"] + got["slip"] == 41
+    assert abs(got["half_width_error"]) < 2e-3
+    assert got["friction_residual"] < 1e-8
+
+
+@pytest.mark.parametrize("Q", [0.2, -0.6])
+def test_unloading_lets_it_slip_back_from_the_edge(Q):
+    got = sheared_result(Q=Q, peak=0.6)
+
+    assert abs(got["stick_half_width_error"]) < 0.01
+    assert abs(got["shear_centre_error"]) < 0.01
+    assert got["shear_l2_error"] < 0.1
+    assert got["stick"] == pytest.approx(40 * np.sqrt(1 - (0.6 - Q) / 2), abs=2)
+
+
+def test_in_proportion_only_the_last_node_at_each_edge_slips():
+    """And as if Q had come last, where the load is static."""
+    given = dict(n=6, m=6, Q=0.5)
+    got = sheared_result(**given, steps=6, programme="proportional")
+    static = sheared_result(**given, loading="static")
+
+    assert (got["slip"], static["slip"]) == (2, pytest.approx(12 * 0.29, abs=1.1))
+    assert abs(static["stick_half_width_error"]) < 0.03
+    assert static["dissipation"] > 10 * got["dissipation"]
+    assert "stick_half_width" not in got
+
+
+@pytest.mark.slow
+def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
+    """q = (Q/P)p, of about first order in h and the load steps."""
+    errors = []
+    for n in (5, 10, 20):
+        got = sheared_result(
+            n=n, m=n, steps=n, load=0.1, Q=0.5, programme="proportional"
+        )
+        assert got["slip"] <= 2
+        errors.append([abs(got["shear_centre_error"]), got["shear_l2_error"]])
+
+    assert (np.divide(errors[:-1], errors[1:]) > 1.4).all()
+    assert errors[-1][0] < 0.1
+    assert errors[-1][1] < 0.06
+
+
+def test_the_tangential_force_turns_no_body():
+    """Loads and their moments cancel on each body, so that supports carry nothing."""
+    given = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
+    params = CYLINDER.complete(given)
+    bodies, _ = two_cylinders(params)
+    load, (x, y) = sheared(bodies.mesh).reshape(-1, 2), bodies.mesh.points.T
+    upper = bodies.body_of_node == 0
+    case = CYLINDER.build("dual", params, reference_solution)
+
+    for body, Q in ((upper, 1.0), (~upper, -1.0)):
+        assert load[body].sum(axis=0) == pytest.approx([Q, 0], abs=1e-12)
+        turning = x[body] @ load[body, 1] - y[body] @ load[body, 0]
+        assert turning == pytest.approx(0, abs=1e-12)
+    assert abs(reference_solution(case.qp).x[:3]).max() < 1e-3  # turned contact normals
+
+
+def test_friction_holds_equal_cylinders_together_without_a_force():
+    """None is needed: they deform alike, and the pressure is Hertz's."""
+    given = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)
+    got, smooth = result(CYLINDER, **given), result(CYLINDER, n=10, m=10, load=0.1)
+
+    assert got["p_max"] == pytest.approx(smooth["p_max"], rel=2e-3)
+    assert got["dissipation"] < 1e-5 * abs(got["energy"])
+
+
+def test_of_a_fixed_point_every_tresca_problem_can_be_had():
+    count = sheared_result(n=5, m=5, Q=0.5)["tresca_problems"]
+    residuals = [
+        sheared_result(n=5, m=5, Q=0.5, iterate=i)["friction_residual"]
+        for i in range(1, count + 1)
+    ]
+
+    assert 2 <= count <= 10
+    assert np.divide(residuals[1:], residuals[:-1]).max() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [("Q=0.5", "friction=none with a tangential force; expected friction=coulomb"),
+     ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
+     ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
+     ("friction=coulomb/mu=0.3/Q=0.6/peak=0.4", "must be between -peak and peak=0.4"),
+     ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),
+     ("friction=coulomb/mu=0.3/programme=proportional", "proportional needs Q"),
+     ("friction=coulomb/mu=0.3/Q=0.2/peak=0.4/programme=proportional",
+      "proportional needs Q, and no peak above it"),
+     ("friction=coulomb/mu=0.3/Q=0.5/steps=5", "expected programme=proportional"),
+     ("friction=coulomb/mu=0.3/Q=0.2/peak=0.5/loading=static",
+      "peak=0.5 is not used by loading=static"),
+     ("friction=coulomb/mu=0.3/Q=0.5/programme=both", "programme='both' is unknown")],
+)  # fmt: skip
+def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, told):
+    with pytest.raises(InputError, match="hertz-cylinder: ") as e:
+        parse(f"hertz-cylinder/{keys}/dual", PROBLEMS)
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)

@@ -144,6 +144,23 @@ def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_
     assert np.isnan(data["gap"]).sum() == 6
 
 
+def test_of_friction_grid_and_table_tell_shear_and_what_sticks(tmp_path):
+    rough = replace(
+        SIDE, shear=np.array([1e5, -0.5, 0.0]),
+        friction=np.array(["slip", "stick", "open"]),
+    )  # fmt: skip
+    write_vtu(replace(FIELDS, contacts=(rough,)), tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+    table = pd.read_csv(tmp_path / "a-disc-on-a-b-2.csv")
+
+    assert data["shear"][SIDE.nodes].tolist() == rough.shear.tolist()
+    assert data["friction"][SIDE.nodes].tolist() == [2, 1, 0]
+    assert table.friction.tolist() == rough.friction.tolist()
+    assert table.shear_Pa.tolist() == rough.shear.tolist()
+    write_vtu(replace(FIELDS, contacts=(SIDE,)), tmp_path / "b.vtu")
+    assert "friction" not in meshio.read(tmp_path / "b.vtu").point_data
+
+
 @pytest.fixture
 def solve(tmp_path, capsys):
     """Solve a case with --vtu; return exit code, stderr and the file."""

@@ -189,6 +189,18 @@ def test_each_contact_that_carries_load_has_a_window_with_its_own_forces(bodies)
         assert (tips <= panel.high).all()
 
 
+def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
+    pair = side("up on low", [4, 5, 0, 1], [[1, -3], [0, -2], [1, -1], [0, 0]])
+    states = np.array(["slip", "stick", "slip", "open"])
+    rough = replace(pair, shear=pair.gap, friction=states)
+    _, zoom = deformed_figure(replace(bodies, contacts=(rough,))).panels
+    slip, stick = zoom.marks[-2:]
+
+    assert zoom.title.endswith("\nstick: blue (1), slip: red (2)")
+    assert (len(stick.feet), len(slip.feet)) == (1, 2)
+    assert stick.colour != slip.colour
+
+
 def test_the_scale_is_that_of_the_displacement(bodies):
     there = deformed_figure(bodies, 4.0).panels[0]
     (field, *_) = (m for m in there.marks if isinstance(m, ColourField))

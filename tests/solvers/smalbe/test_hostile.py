@@ -62,7 +62,7 @@ def ends(name, seeds):
     return given_up, runs, wrong
 
 
-@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed"])
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-direct"])
 def test_nothing_is_claimed_wrongly(name):
     given_up, runs, wrong = ends(name, range(1000, 1060))
 

@@ -1,0 +1,107 @@
+"""GRECO's plate with Coulomb friction on a rigid plane (Code_Aster's SSNV128).
+
+A square of 40 mm, in plane strain, lies on y = 0 with μ = 1. It is pressed down on its
+top, pushed towards +x on its left side, and held on its right one:
+
+    σ_y = −5e7 Pa at y = 40 mm,  σ_x = −15e7 Pa at x = 0,  u_x = 0 at x = 40 mm
+
+and u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end lifts off,
+the middle slips and the right end sticks. Published are the tangential displacements of
+five points of the contact side, ±5 %, and the normal force at 38.75 mm on 32 cells a
+side (GRECO working group on friction; collected in Code_Aster's document V6.04.128).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from harness import QP, Case, Friction, Reference, Solution, Value, Vector
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
+from problems.contact.friction import FrictionLaw
+from problems.contact.results import quantities
+from problems.contact.rigid_plane import above_plane
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import LoadPath
+from problems.fem.elasticity import Material
+from problems.fem.mesh import nodal_lengths, rectangle
+
+SIDE = 0.04  #: m
+MATERIAL = Material(E=1.3e11, nu=0.2)
+TOP, LEFT = 5e7, 15e7  #: pressures, Pa
+PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: m
+PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
+FORCE_AT = 38.75e-3  #: m
+
+
+def greco(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
+    """Emit a Tresca problem of the fixed point in one form, the last unless asked."""
+    p: Any = params
+    path = _path(p["n"], p["mu"], reference)
+    bodies, problem = path.bodies, path.problem(1, p["iterate"])
+    primal, friction, count = problem.primal, problem.friction, path.iterates(1)
+    return contact_case(
+        bodies, primal, form,
+        floating=lambda: floating(bodies), clamped=lambda: path.inverse,
+        supported=lambda: supported(bodies), friction=friction,
+        quantities=lambda s: quantities(bodies, primal, s, friction)
+        | along_the_side(bodies, primal, s, friction) | {"tresca_problems": count},
+    )  # fmt: skip
+
+
+def plate(n: int) -> Bodies:
+    """Mesh and assemble the plate with n × n cells."""
+    mesh = rectangle((0.0, 0.0), (SIDE, SIDE), (n, n))
+    top, left, right, bottom = (
+        mesh.boundaries[side] for side in ("top", "left", "right", "bottom")
+    )
+    load = np.zeros(mesh.dofs)
+    load[2 * top + 1] -= TOP * nodal_lengths(mesh.points[top])
+    load[2 * left] += LEFT * nodal_lengths(mesh.points[left])
+    return assemble(
+        mesh, np.zeros(n**2, dtype=np.int64), names=("plate",), materials=(MATERIAL,),
+        plane="strain", units=(SIDE, TOP * SIDE),
+        fixed=np.append(2 * right, 2 * bottom[-1] + 1), load=load,
+        pairs=(ContactPair(bottom[:-1], np.zeros(0, dtype=np.int64)),),
+    )  # fmt: skip
+
+
+def along_the_side(
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction
+) -> dict[str, Any]:
+    """Report what was published; between nodes, by linear interpolation.
+
+    displacement: u_x at `PLACES`, m. published_error: the largest relative distance
+    from the published ones. normal_force: of the node at 38.75 mm, tangential_sum: of
+    all nodes, N/m.
+    """
+    nodes = bodies.pairs[0].slave
+    x, u = bodies.mesh.points[nodes, 0], s.x[2 * nodes] * bodies.length
+    normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
+    at_places: Vector = np.interp(PLACES, x, u)
+    return {
+        "displacement": at_places.tolist(),
+        "published_error": float(np.abs(at_places / PUBLISHED - 1).max()),
+        "normal_force": float(np.interp(FORCE_AT, x, normal)),
+        "tangential_sum": float(abs(tangential.sum())),
+    }
+
+
+@lru_cache(maxsize=2)
+def _path(n: int, mu: float, reference: Reference) -> LoadPath:
+    bodies = plate(n)
+    rows = above_plane(bodies.mesh, bodies.pairs[0].slave, tangential=True)
+    return LoadPath(
+        bodies, lambda u: rows, clamped(bodies), reference, steps=1,
+        laws=(FrictionLaw("coulomb", mu=mu),),
+    )  # fmt: skip

@@ -1,0 +1,223 @@
+"""Two half planes in contact by the logarithmic kernel: no mesh, a dense F of any size.
+
+Forces per thickness on the surfaces of two half planes displace them, relative to each
+other, by (Johnson 1985, "Contact mechanics", Sections 2.2 and 2.3, 2/(πE*) of both)
+
+    u(x) = −2/(πE*) ∫ ln(|x − s|/a) p(s) ds + a constant
+
+along the normal by pressures, along the tangent by shear tractions; between bodies of
+one material neither causes the other. With a traction λ_j/h on each of n equal elements
+and u at their midpoints, u = Fλ with F_ij of |i − j| alone. F is positive definite over
+a length of less than 4a. The constant, free as the force is given, is the multiplier of
+the one equation Σλ = force: the form ``dual`` of bodies with one rigid motion.
+
+* law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R; |x| ≤ 3a/2
+* law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
+  exact p and, when unloading, the exact tractions λ* before, else 0; |x| ≤ a
+
+Forces are in units of F₀ = P (tangential ones μP), displacements in l = 2F₀/(πE*), so
+that F is a matrix of logarithms and Hertz's gap (x/a)². Exact energies are those of
+sums of semicircles: with lengths in a and s_c = 2/(πc)√(1 − x²/c²),
+
+    −∫ ln|x − t| s_c(t) dt = ln(2/c) + ½ − x²/c²,  |x| ≤ c,      ∫x²s_c = c²/4
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import toeplitz
+
+from harness import QP, Case, Matrix, Solution, Value, Vector, no_rows
+from problems.contact.sides import ACTIVE
+from problems.models.hertz import MATERIAL, RADIUS, UNIT_LOAD
+from problems.models.line_contact import LineContact, TangentialContact
+
+MU = 0.3
+LOAD = 10 * UNIT_LOAD  #: P, N/m
+REACH = 1.5  #: half width of what may touch, in a, of law=hertz
+
+#: two cylinders of the radius and the material of the families of Hertz
+EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
+
+
+def half_planes(params: Mapping[str, Value]) -> Case:
+    """Emit the QP, a dual."""
+    p: Any = params
+    if p["law"] == "hertz":
+        return _pressed(p["n"])
+    return _sheared(p["n"], TangentialContact(EXACT, MU, p["Q"], p["peak"]))
+
+
+@dataclass(frozen=True, eq=False)
+class Elements:
+    """Equal elements of [−width, width]; lengths in a."""
+
+    n: int
+    width: float
+
+    @property
+    def h(self) -> float:
+        """Length of one."""
+        return 2 * self.width / self.n
+
+    @property
+    def ends(self) -> Vector:
+        """Ends (n + 1,) of all, ascending."""
+        return np.linspace(-self.width, self.width, self.n + 1)
+
+    @property
+    def middle(self) -> Vector:
+        """Midpoints (n,)."""
+        return (self.ends[1:] + self.ends[:-1]) / 2
+
+    @property
+    def F(self) -> Matrix:
+        """Displacement of the midpoints by a unit force on each element, (n, n).
+
+        −1/h ∫ ln|x_i − s| ds over element j, by the antiderivative t ln|t| − t.
+        """
+        t = self.h * (np.arange(self.n + 1) - 0.5)
+        antiderivative = t * np.log(np.abs(t)) - t
+        return toeplitz(-np.diff(antiderivative) / self.h)
+
+
+def _pressed(n: int) -> Case:
+    elements = Elements(n, REACH)
+    qp = _dual(elements.F, elements.middle**2, 1.0, np.zeros(n), np.full(n, np.inf))
+    x, width = EXACT.a * elements.middle, EXACT.a * elements.h
+    approach = displacement(((1.0, 1.0),))
+    exact_energy = self_energy(((1.0, 1.0),)) - approach
+
+    def quantities(s: Solution) -> dict[str, Any]:
+        """Compare with Hertz; errors are relative, that of p at the midpoints.
+
+        energy: elastic − P·approach, of an approach that is zero where u is.
+        """
+        force = s.x * EXACT.P
+        p, hertz = force / width, EXACT.pressure(x)
+        half_width = np.sqrt(4 * force @ (x**2 + width**2 / 12) / EXACT.P)
+        energy = 0.5 * s.x @ (qp.P @ s.x) + s.y[0]
+        return {
+            "elements": n,
+            "contact_rows": n,
+            "active": int((s.x > ACTIVE * s.x.max(initial=0.0)).sum()),
+            "energy": float(energy) * _energy_unit(EXACT.P),
+            "energy_error": float(energy / exact_energy - 1),
+            "multiplier_sum": float(force.sum()),
+            "force_error": float(force.sum() / EXACT.P - 1),
+            "approach_error": float(-s.y[0] / approach - 1),
+            "p_max": float(p.max()),
+            "p_max_error": float(p.max() / hertz.max() - 1),
+            "pressure_l2_error": _distance(p, hertz),
+            "half_width": float(half_width),
+            "half_width_error": float(half_width / EXACT.a - 1),
+        }
+
+    return _case(qp, EXACT.P, quantities)
+
+
+def _sheared(n: int, exact: TangentialContact) -> Case:
+    elements = Elements(n, 1.0)
+    F0, ends = exact.mu * EXACT.P, EXACT.a * elements.ends
+    bound = np.diff(EXACT.force(ends)) / EXACT.P
+    unloads = exact.Q != exact.peak
+    before = np.diff(exact.before.force(ends)) / F0 if unloads else np.zeros(n)
+    F = elements.F
+    qp = _dual(F, -F @ before, exact.Q, -bound, bound)
+    x, width = EXACT.a * elements.middle, EXACT.a * elements.h
+    moved = displacement(exact.semicircles)
+    moved_before = displacement(exact.before.semicircles) if unloads else 0.0
+    exact_energy = self_energy(exact.semicircles) - exact.Q * moved
+
+    def quantities(s: Solution) -> dict[str, Any]:
+        """Compare with Cattaneo and Mindlin; errors are relative, of q at midpoints.
+
+        energy: elastic − Q·displacement; dissipation: of this loading or unloading,
+        Σg|slip|; both J/m. stick_half_width: of a traction with this ∫x²q.
+        shear_centre: mean of what is next to x = 0.
+        """
+        force = s.x * F0
+        q, mindlin = force / width, exact.traction(x)
+        moment = float(force @ (x**2 + width**2 / 12))
+        c = exact.stick_half_width(moment, EXACT.P * EXACT.a**2 / 4)
+        next_to = slice((n - 1) // 2, n // 2 + 1)
+        centre, at_centre = (float(v[next_to].mean()) for v in (q, mindlin))
+        slips = np.abs(s.x) >= bound * (1 - ACTIVE)
+        energy = 0.5 * s.x @ (F @ s.x) - exact.Q * (moved_before - s.y[0])
+        return {
+            "elements": n,
+            "contact_rows": n,
+            "stick": int((~slips).sum()),
+            "slip": int(slips.sum()),
+            "open": 0,
+            "energy": float(energy) * _energy_unit(F0),
+            "energy_error": float(energy / exact_energy - 1),
+            "dissipation": float(bound @ np.abs(s.z_box)) * _energy_unit(F0),
+            "tangential_force": float(force.sum()),
+            "force_error": float((s.x.sum() - exact.Q) / exact.peak),
+            "shear_centre": centre,
+            "shear_centre_error": centre / at_centre - 1,
+            "shear_l2_error": _distance(q, mindlin),
+            "stick_half_width": c,
+            "stick_half_width_error": c / exact.c - 1,
+        }
+
+    return _case(qp, F0, quantities)
+
+
+def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
+    """Return the constant that u, in l, is where all tractions Σ w·s_c of (w, c) act.
+
+    It is the displacement where bodies stick: parabolas add up to zero there, or to
+    Hertz's gap.
+    """
+    return float(sum(w * (np.log(2 / c) + 0.5) for w, c in semicircles))
+
+
+def self_energy(semicircles: Sequence[tuple[float, float]]) -> float:
+    """Return ½∫q Fq, in F₀l, of tractions Σ w·s_c of parts (w, c)."""
+    total = 0.0
+    for v, b in semicircles:
+        for w, c in semicircles:
+            least, most = sorted((b, c))
+            total += v * w * (np.log(2 / most) + 0.5 - (least / most) ** 2 / 4)
+    return float(0.5 * total)
+
+
+def _dual(F: Matrix, gap: Vector, force: float, lower: Vector, upper: Vector) -> QP:
+    """Emit  min ½λᵀFλ + gᵀλ,  Σλ = force,  lower ≤ λ ≤ upper."""
+    n = gap.size
+    return QP(
+        P=F, q=gap, A=np.ones((1, n)), b=np.array([force]),
+        G=no_rows(n), h=np.zeros(0), lb=lower, ub=upper,
+    )  # fmt: skip
+
+
+def _case(
+    qp: QP, force: float, quantities: Callable[[Solution], Mapping[str, Any]]
+) -> Case:
+    length = _length_unit(force)
+    return Case(
+        qp=qp,
+        recover=lambda s: (qp.P @ s.x) * length,
+        quantities=quantities,
+        scale=-force * length,
+        matrices={"F": qp.P, "d": -qp.q, "R": np.ones((qp.q.size, 1))},
+    )
+
+
+def _length_unit(force: float) -> float:
+    """Return l, m."""
+    return 2 * force / (np.pi * EXACT.E_star)
+
+
+def _energy_unit(force: float) -> float:
+    return force * _length_unit(force)
+
+
+def _distance(got: Vector, exact: Vector) -> float:
+    return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

@@ -1,0 +1,118 @@
+"""Exact line contact: Hertz's pressure, and Cattaneo and Mindlin's shear traction.
+
+Two elastic bodies whose profiles are parabolas of relative curvature 1/R,
+1/R = 1/R₁ + 1/R₂, and 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ), touch under the force
+P per thickness over |x| ≤ a with (Johnson 1985, "Contact mechanics", Section 4.2)
+
+    p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
+
+Where both are of one material, p causes no tangential displacement between them and a
+shear traction no normal one. A tangential force Q < μP that is applied afterwards lets
+a ≥ |x| ≥ c slip while |x| < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2), with
+
+    q(x) = μp₀√(1 − x²/a²) − μp₀(c/a)√(1 − x²/c²),    c/a = √(1 − Q/μP)
+
+where a root of something negative counts as zero. Back from Q* to Q, |Q| ≤ Q*, slip of
+the other direction comes in from the edge and q is q* − 2q′, with q′ the traction of
+half the difference: c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from harness import Vector
+
+
+@dataclass(frozen=True)
+class LineContact:
+    """Hertz's solution for a force per thickness."""
+
+    P: float  #: N/m
+    R: float  #: relative radius, m
+    E_star: float  #: contact modulus, Pa
+
+    @property
+    def a(self) -> float:
+        """Half width of the contact, m."""
+        return float(np.sqrt(4 * self.P * self.R / (np.pi * self.E_star)))
+
+    @property
+    def p0(self) -> float:
+        """Peak pressure, Pa."""
+        return 2 * self.P / (np.pi * self.a)
+
+    def pressure(self, x: Vector) -> Vector:
+        """Return p(x), Pa; zero outside the contact."""
+        return self.p0 * _root(x / self.a)
+
+    def force(self, x: Vector) -> Vector:
+        """Return the force on all that is left of x, N/m: ∫p from −a to x."""
+        return self.P * _share(x / self.a)
+
+
+@dataclass(frozen=True)
+class TangentialContact:
+    """Cattaneo and Mindlin's solution after loading to `peak`, and back to `Q`."""
+
+    normal: LineContact
+    mu: float
+    Q: float  #: tangential force as a part of μP, −peak … peak
+    peak: float  #: the largest that came before, as a part of μP; Q if there was none
+
+    @property
+    def before(self) -> TangentialContact:
+        """The state at the peak."""
+        return TangentialContact(self.normal, self.mu, self.peak, self.peak)
+
+    @property
+    def semicircles(self) -> tuple[tuple[float, float], ...]:
+        """Forces w in μP and half widths c in a with q = μP Σ w·2/(πc)√(1 − x²/c²).
+
+        Those of the loading, and after them those of the unloading.
+        """
+        stuck = 1 - self.peak  # (c/a)²
+        loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
+        if self.Q == self.peak:
+            return loading
+        stuck = 1 - (self.peak - self.Q) / 2
+        return (*loading, (-2.0, 1.0), (2 * stuck, np.sqrt(stuck)))
+
+    @property
+    def c(self) -> float:
+        """Half width of the part that sticks, m: c, or c′ when unloading."""
+        return float(self.normal.a * self.semicircles[-1][1])
+
+    def traction(self, x: Vector) -> Vector:
+        """Return q(x), Pa."""
+        s, p0 = x / self.normal.a, self.mu * self.normal.p0
+        return np.asarray(p0 * sum(w / c * _root(s / c) for w, c in self.semicircles))
+
+    def force(self, x: Vector) -> Vector:
+        """Return ∫q from −a to x, N/m."""
+        s, P = x / self.normal.a, self.mu * self.normal.P
+        return np.asarray(P * sum(w * _share(s / c) for w, c in self.semicircles))
+
+    def stick_half_width(self, shear: float, pressure: float) -> float:
+        """Return c, m, of a traction with the moments ∫x²q dx and ∫x²p dx, N·m.
+
+        While loading  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  When unloading,
+        the traction before is taken for exact. Where no c gives the moment, the nearest
+        is returned.
+        """
+        *known, (w, c) = self.semicircles
+        rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in known)
+        return float(self.normal.a * np.clip(rest * c**2 / w, 0, 1) ** 0.25)
+
+
+def _root(s: Vector) -> Vector:
+    """Return √(1 − s²), zero beyond 1."""
+    return np.asarray(np.sqrt(np.maximum(1 - s**2, 0)))
+
+
+def _share(s: Vector) -> Vector:
+    """Return (2/π)∫√(1 − t²) dt from −1 to s: 0 … 1."""
+    s = np.clip(s, -1, 1)
+    return np.asarray(0.5 + (s * np.sqrt(1 - s**2) + np.arcsin(s)) / np.pi)

@@ -1,0 +1,202 @@
+"""SMALBE for small problems: faces by Cholesky factors instead of iterations.
+
+Minimises ½xᵀPx + qᵀx subject to Gx = e and l ≤ x ≤ u by the proximal method of
+multipliers (Rockafellar, Math. Oper. Res. 1, 1976, 97-116). With orthonormal rows C
+that span those of G, the shortest x̃ with Gx̃ = e, and D the diagonal of P, for
+k = 0, 1, …:
+
+1. x ← argmin over the box of
+   ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2 ‖C(x − x̃)‖² + δ/2 ‖x − x_k‖²_D,
+   exactly, from one face to the next (`solvers.smalbe.faces`).
+2. a ← a + ρC(x − x̃), x_{k+1} = x.
+
+This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) where every
+inner run is exact, M = 0. The proximal term makes P + ρCᵀC + δD positive definite where
+P is singular on a face; at the solution, where x = x_k, it is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from harness import QP, About, Solution, Status, Vector, kkt_residuals
+from solvers.common.conversion import dense, needs_dense, positive
+from solvers.smalbe.compiled import residual_bound
+from solvers.smalbe.driver import CLAIM, FREE_RANK, PATIENCE
+from solvers.smalbe.faces import Faces
+from solvers.smalbe.outer_loop import infeasible
+from solvers.smalbe.projected import Rows, prepared_rows
+
+LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
+RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
+MOST_RHO = 1e9  #: where ‖Cν‖ falls slowly, ρ grows to this
+DELTA = 1e-10  #: δ
+
+
+@dataclass(frozen=True)
+class Direct:
+    """In-house SMALBE for small problems: face problems by updated Cholesky factors.
+
+    Ends where the KKT residuals on the QP as given are within `tol`, or get no smaller
+    and are within 5·tol, which is what is claimed.
+    """
+
+    max_solves: int = 10_000  #: with factors of faces, in total
+
+    about: ClassVar[About] = About(
+        title="SMALBE, direct (ours)", licence="BSD-3-Clause",
+        method="augmented Lagrangian with an exact active-set method inside",
+        linear_solver="dense Cholesky factor, updated as the active set changes",
+        phases="preparing orthonormalises rows and factorises the free block",
+        limits=(
+            "inequality rows are declined: dualise first",
+            f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is the "
+            "faster one from about 300 on",
+        ),
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        positive(max_solves=self.max_solves)
+
+    def declines(self, qp: QP) -> str | None:
+        if qp.h.size:
+            return "takes bounds and equality rows; dualise inequality rows first"
+        if qp.q.size > LARGEST:
+            return f"is for small problems; takes at most {LARGEST} unknowns"
+        return needs_dense(qp, 3)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        P = qp.P if isinstance(qp.P, np.ndarray) else dense(qp.P)
+        P = P if P.flags.c_contiguous else P.T  # it is symmetric
+        rows = prepared_rows(qp)
+        if not rows.consistent:
+            message = "the equality rows contradict each other"
+            return partial(Solution.without_point, qp, Status.INFEASIBLE, message)
+        bounds = (qp.lb, qp.ub)
+        try:
+            faces = Faces(P, qp.q, rows.C, rows.x_tilde, bounds, RHO, DELTA)
+        except ArithmeticError:
+            return partial(_not_convex, qp)
+        return partial(_solved, _Task(qp, rows, faces), tol, self.max_solves)
+
+
+class _Point(NamedTuple):
+    x: Vector
+    y: Vector
+    z_box: Vector
+    residual: float  #: at least the worst on the QP as given
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    qp: QP
+    rows: Rows
+    faces: Faces
+
+    def point(self, *, fitted: bool) -> _Point:
+        """Return the present x with its multipliers.
+
+        fitted : have a leave least of the gradient on the free components, where its
+            own rounding, ρ times that of Cν, may be seen
+        """
+        qp, faces, a = self.qp, self.faces, self.faces.a
+        x, Px, z_box = faces.at(a)
+        if fitted:
+            a = self._fitted(a, x, Px + qp.q)
+            x, Px, z_box = faces.at(a)
+        y = self.rows.multipliers(a)
+        worst = residual_bound(
+            qp.q, faces.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, G=self.rows.G
+        )
+        if worst == np.inf:  # it tells nothing
+            worst = kkt_residuals(qp, self.solution(x, y, z_box)).worst
+        return _Point(x, y, z_box, worst)
+
+    def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
+        """Claim a point, before it has been checked."""
+        return Solution(
+            status=Status.SOLVED, x=x, y=y, z=np.zeros(0), z_box=z_box,
+            message="converged",
+        )  # fmt: skip
+
+    def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
+        """Have Cᵀa leave least of the gradient g on the free components."""
+        C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
+        missing = g[free] + C.T[free] @ a
+        change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)
+        if rank < len(C):
+            return np.asarray(a - change)
+        return np.asarray(np.linalg.lstsq(C.T[free], -g[free], rcond=FREE_RANK)[0])
+
+
+def _solved(task: _Task, tol: float, most: int) -> Solution:
+    """Run the outer loop until the residuals are within `tol`, or get no smaller."""
+    qp, rows, faces = task.qp, task.rows, task.faces
+    bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
+    best: _Point | None = None
+    error, outer, waited, settled = np.inf, 0, 0, True
+    most_rho = MOST_RHO / RHO * faces.rho
+    while settled and waited < PATIENCE:
+        outer += 1
+        try:
+            settled = faces.minimise(most)
+        except ArithmeticError:
+            return _not_convex(qp)
+        before, error = error, faces.update()
+        point = task.point(fitted=waited > 0)
+        gains = best is None or point.residual < best.residual / 2 or error < before / 2
+        waited = 0 if gains else waited + 1
+        if best is None or point.residual <= best.residual:
+            best = point
+        if point.residual <= tol:
+            break
+        if not gains and infeasible(rows, bounds, point.x - rows.x_tilde):
+            message = "no point within the bounds meets the equality rows"
+            return Solution.without_point(qp, Status.INFEASIBLE, message)
+        if error > before / 10 and faces.rho < most_rho:
+            most_rho = _penalised(faces, most_rho)
+    message = "no further progress: rounding, or the cost is unbounded"
+    return _claimed(task, best, tol, message if settled else "step limit", outer)
+
+
+def _penalised(faces: Faces, most: float) -> float:
+    """Raise ρ a hundredfold where rounding allows; return the most that it does."""
+    rho = faces.rho
+    try:
+        faces.penalise(100 * rho)
+    except ArithmeticError:
+        faces.penalise(rho)
+        return rho
+    return most
+
+
+def _claimed(
+    task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
+) -> Solution:
+    """Claim a point that is within 5·tol, by its residuals where a bound is not."""
+    faces, checked = task.faces, False
+    if point is None:
+        return Solution.without_point(task.qp, Status.ITERATION_LIMIT, otherwise)
+    s = task.solution(point.x, point.y, point.z_box)
+    status, message = s.status, s.message
+    if not point.residual <= CLAIM * tol:
+        checked = True
+        if not kkt_residuals(task.qp, s).worst <= CLAIM * tol:
+            status, message = Status.ITERATION_LIMIT, otherwise
+    counts = {
+        "P_products": faces.products + checked, "outer": outer,
+        "solves": faces.solves, "set_changes": faces.joined + faces.left,
+    }  # fmt: skip
+    return replace(
+        s, status=status, message=message, iterations=faces.solves, counts=counts
+    )
+
+
+def _not_convex(qp: QP) -> Solution:
+    message = "P is not positive semidefinite"
+    return Solution.without_point(qp, Status.FAILED, message)

@@ -1,0 +1,378 @@
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+# cython: initializedcheck=False
+"""A proximal augmented Lagrangian, minimised over a box exactly, face after face.
+
+`Faces` keeps the Cholesky factor of its second derivative on the free components. A
+component that becomes free adds a row to it; one that is held takes its row out, and
+Givens rotations, or a factorisation of what lies behind it, mend the rest (Golub and
+Van Loan, Matrix Computations, 4th ed., 6.5.4). `solvers.smalbe.direct` says what it is
+used for.
+"""
+
+from cpython.exc cimport PyErr_CheckSignals
+from libc.math cimport fabs, fmax, fmin, hypot, sqrt
+from libc.string cimport memcpy
+from scipy.linalg.cython_blas cimport dgemm, dsymv, dsyrk, dtrsm, dtrsv
+from scipy.linalg.cython_lapack cimport dpotrf
+
+import numpy as np
+
+cdef double ROUNDING = 8 * 2.0 ** -52  # of a sum of terms, relative to their sizes
+cdef double NEARLY = 0.9  # of the largest inward gradient: freed with it at first
+cdef double FLAT = 1e-12  # of the mean of D: as good as not curved
+cdef int GIVENS = 6  # a row taken out by rotations, in steps of a factorisation
+
+
+def _whole(a):
+    return np.ascontiguousarray(a, dtype=float)
+
+
+cdef class Faces:
+    """½xᵀPx + qᵀx + aᵀCν + ρ/2 ‖Cν‖² + δ/2 ‖x − x_k‖²_D over l ≤ x ≤ u, ν = x − x̃.
+
+    P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, or its mean
+    where that is nearly zero. a and x_k begin with zeros. L (k, k) is the factor of
+    P + ρCᵀC + δD in the order in which components became free. It is stored by rows,
+    which LAPACK reads as the columns of Lᵀ; `among` holds the columns of C in that
+    order, as rows. Nearer to a bound than the rounding of qᵢ/Dᵢ is on it.
+    """
+
+    cdef Py_ssize_t n, k
+    cdef int r
+    cdef readonly long products, solves, joined, left
+    cdef readonly double rho
+    cdef double delta, share
+    cdef const double[:, ::1] P, C
+    cdef double[:, ::1] L, among
+    cdef const double[::1] q, x_tilde, lower, upper
+    cdef readonly object diagonal
+    cdef double[::1] d, D, mu, off, centre, near, noise, size, x, g, y, gy, step
+    cdef double[::1] cosine, sine
+    cdef signed char[::1] free, wanted, face
+    cdef int[::1] order, place
+
+    def __init__(self, P, q, C, x_tilde, bounds, double rho, double delta):
+        """Begin at zero, moved into the box; factorise where it is on no bound.
+
+        rho is relative to ‖P‖ (Frobenius). Raises ArithmeticError where P is not
+        positive semidefinite.
+        """
+        cdef Py_ssize_t i, n = q.size
+        cdef double square = 0.0, mean = 0.0
+        self.n, self.r, self.delta = n, len(C), delta
+        self.L, self.among = np.empty((n, n)), np.empty((n, max(self.r, 1)))
+        self.P, self.q, self.C, self.x_tilde, self.lower, self.upper = map(
+            _whole, (P, q, C, x_tilde, *bounds)
+        )
+        self.mu, self.off = np.zeros((2, self.r))
+        self.diagonal = np.empty(n)
+        self.d = self.diagonal
+        cdef double[:, ::1] room = np.zeros((12, n))
+        self.D, self.centre, self.near, self.noise = room[0], room[1], room[2], room[3]
+        self.size, self.x, self.g, self.y = room[4], room[5], room[6], room[7]
+        self.gy, self.step, self.cosine, self.sine = room[8], room[9], room[10], room[11]
+        self.free, self.wanted, self.face = np.zeros((3, n), dtype=np.int8)
+        self.order, self.place = np.full((2, n), -1, dtype=np.int32)
+        for i in range(n):
+            self.d[i] = self.P[i, i]
+            if self.d[i] < 0:
+                raise ArithmeticError("P is not positive semidefinite")
+            mean += self.d[i] / n
+        for i in range(n * n):
+            square += (&self.P[0, 0])[i] * (&self.P[0, 0])[i]
+        self.rho = rho * (sqrt(square) or 1.0)
+        for i in range(n):
+            self.D[i] = self.d[i] if self.d[i] > FLAT * mean else mean or 1.0
+            self.size[i] = sqrt(self.d[i] + delta * self.D[i])
+            self.near[i] = ROUNDING * fabs(self.q[i]) / self.D[i]
+            self.x[i] = fmin(fmax(0.0, self.lower[i]), self.upper[i])
+            self.wanted[i] = self.lower[i] < self.x[i] < self.upper[i]
+        self.enter()
+
+    def at(self, const double[::1] a):
+        """Return x, Px and z_box (n,) for multipliers a: −(Px + q + Cᵀa) on bounds.
+
+        Where a bound cannot bear that, z_box is zero.
+        """
+        cdef Py_ssize_t i, m, n = self.n
+        cdef double total
+        x, Px, z_box = np.array(self.x), np.zeros(n), np.zeros(n)
+        cdef double[::1] product = Px, z = z_box
+        self.add_product(self.x, product)
+        for i in range(n):
+            if self.free[i]:
+                continue
+            total = product[i] + self.q[i]
+            for m in range(self.r):
+                total += self.C[m, i] * a[m]
+            if self.x[i] <= self.lower[i]:
+                z[i] = -fmax(total, 0.0)
+            if self.x[i] >= self.upper[i]:
+                z[i] -= fmin(total, 0.0)
+        return x, Px, z_box
+
+    @property
+    def a(self):
+        """Multipliers (r,) of Cν = 0."""
+        return np.array(self.mu)
+
+    # the factor
+
+    cdef int enter(self) except -1:
+        """Have the factor be that of the face where `wanted` components are free."""
+        cdef Py_ssize_t i, j, first = self.k, kept, base, known, a, b
+        cdef int gone = 0, n = self.n, r = max(self.r, 1), s, t, info = 0
+        cdef double one = 1.0, minus = -1.0
+        for j in range(self.k):
+            if not self.wanted[self.order[j]]:
+                gone += 1
+                first = min(first, j)
+        if gone * GIVENS <= first + (self.k - first) / 3:
+            for j in range(self.k - 1, first - 1, -1):
+                if not self.wanted[self.order[j]]:
+                    self.remove(j)
+            base = self.k
+        else:
+            kept = base = first
+            for j in range(first, self.k):
+                i = self.order[j]
+                if self.wanted[i]:
+                    memcpy(&self.L[kept, 0], &self.L[j, 0], base * sizeof(double))
+                    self.put(kept, i)
+                    kept += 1
+                else:
+                    self.place[i] = -1
+            self.k = kept
+        self.left += gone
+        known = self.k
+        for i in range(self.n):
+            self.free[i] = self.wanted[i]
+            if self.wanted[i] and self.place[i] < 0:
+                self.put(self.k, i)
+                self.k += 1
+        self.joined += self.k - known
+        if self.k == base:
+            return 0
+        for a in range(base, self.k):
+            for b in range(0 if a >= known else base, a + 1):
+                self.L[a, b] = self.P[self.order[a], self.order[b]]
+            self.L[a, a] += self.delta * self.D[self.order[a]]
+        s, t = self.k - known, base
+        if s and t:
+            dgemm(b"T", b"N", &t, &s, &r, &self.rho, &self.among[0, 0], &r,
+                  &self.among[known, 0], &r, &one, &self.L[known, 0], &n)
+            dtrsm(b"L", b"U", b"T", b"N", &t, &s, &one, &self.L[0, 0], &n,
+                  &self.L[known, 0], &n)
+        s = self.k - base
+        dsyrk(b"U", b"T", &s, &r, &self.rho, &self.among[base, 0], &r, &one,
+              &self.L[base, base], &n)
+        if t:
+            dsyrk(b"U", b"T", &s, &t, &minus, &self.L[base, 0], &n, &one,
+                  &self.L[base, base], &n)
+        dpotrf(b"U", &s, &self.L[base, base], &n, &info)
+        if info:
+            raise ArithmeticError("a face is not positive definite")
+        return 0
+
+    cdef void put(self, Py_ssize_t j, Py_ssize_t i):
+        """Have row j of the factor be that of component i."""
+        cdef Py_ssize_t m
+        self.order[j], self.place[i], self.among[j, 0] = i, j, 0.0
+        for m in range(self.r):
+            self.among[j, m] = self.C[m, i]
+
+    cdef void remove(self, Py_ssize_t p):
+        """Take row p out of the factor; rotations of columns mend what is below."""
+        cdef Py_ssize_t r, j
+        cdef double a, size
+        cdef double *row
+        self.place[self.order[p]] = -1
+        self.k -= 1
+        for r in range(p, self.k):
+            self.put(r, self.order[r + 1])
+            row = &self.L[r, 0]
+            memcpy(row, &self.L[r + 1, 0], (r + 2) * sizeof(double))
+            for j in range(p, r):
+                a = row[j]
+                row[j] = self.cosine[j] * a + self.sine[j] * row[j + 1]
+                row[j + 1] = self.cosine[j] * row[j + 1] - self.sine[j] * a
+            size = hypot(row[r], row[r + 1])
+            self.cosine[r], self.sine[r] = row[r] / size, row[r + 1] / size
+            row[r] = size
+
+    cdef void solve(self):
+        """step ← (LLᵀ)⁻¹ step, its first k components."""
+        cdef int n = self.n, k = self.k, one = 1
+        self.solves += 1
+        if k:
+            dtrsv(b"U", b"T", b"N", &k, &self.L[0, 0], &n, &self.step[0], &one)
+            dtrsv(b"U", b"N", b"N", &k, &self.L[0, 0], &n, &self.step[0], &one)
+
+    # the method
+
+    cdef void gradient(self, const double[::1] x, double[::1] g):
+        """g ← the gradient of f at x; one product. Cν is small, and kept."""
+        cdef Py_ssize_t i, m, n = self.n
+        cdef double weight
+        for i in range(n):
+            g[i] = self.q[i] + self.delta * self.D[i] * (x[i] - self.centre[i])
+        for m in range(self.r):
+            self.off[m] = 0.0
+            for i in range(n):
+                self.off[m] += self.C[m, i] * (x[i] - self.x_tilde[i])
+            weight = self.mu[m] + self.rho * self.off[m]
+            for i in range(n):
+                g[i] += weight * self.C[m, i]
+        self.add_product(x, g)
+
+    cdef void add_product(self, const double[::1] x, double[::1] g):
+        """g ← g + Px."""
+        cdef int n = self.n, one = 1
+        cdef double unit = 1.0
+        self.products += 1
+        dsymv(b"U", &n, &unit, <double *> &self.P[0, 0], &n, <double *> &x[0], &one,
+              &unit, &g[0], &one)
+
+    def update(self):
+        """a ← a + ρCν and x_k ← x; return ‖Cν‖."""
+        cdef Py_ssize_t i, m
+        cdef double square = 0.0
+        for m in range(self.r):
+            self.off[m] = 0.0
+            for i in range(self.n):
+                self.off[m] += self.C[m, i] * (self.x[i] - self.x_tilde[i])
+            self.mu[m] += self.rho * self.off[m]
+            square += self.off[m] * self.off[m]
+        self.centre[:] = self.x
+        return sqrt(square)
+
+    def penalise(self, double rho):
+        """Change ρ, and factorise anew."""
+        self.rho, self.k = rho, 0
+        self.wanted[:] = self.free
+        np.asarray(self.place)[:] = -1
+        self.enter()
+
+    def minimise(self, long most):
+        """Minimise from where x is; False after `most` solves with factors of faces.
+
+        1. x ← the minimum on its face, which loses what would leave the box.
+        2. Components whose gradient leads from their bound into the box: where there
+           are none, x is the minimum.
+        3. Free those whose gradient, relative to √Pᵢᵢ, is at least a share of the
+           largest, and do 1. If that lowered the cost, go to 2. The share is halved
+           where nothing left the face, and NEARLY again where something did.
+        4. Else free the one with the largest. Go to the minimum on that face, or as
+           far as the box lets, hold what stops, again; go to 2.
+
+        3 and 4 lower the cost, and each ends at the minimum on a face. No face comes
+        twice, and there are finitely many.
+        """
+        cdef long left
+        self.share = NEARLY
+        self.wanted[:] = self.free
+        self.gradient(self.x, self.g)
+        self.shrink(self.x, self.g)
+        while self.solves < most:
+            PyErr_CheckSignals()
+            self.face[:] = self.free
+            if not self.release(self.share):
+                return True
+            self.y[:], self.gy[:] = self.x, self.g
+            left = self.left
+            self.shrink(self.y, self.gy)
+            self.share = NEARLY if self.left > left else self.share / 2
+            if not self.lowered():
+                self.release(1.0)
+                self.y[:], self.gy[:] = self.x, self.g
+                self.advance(self.y, self.gy)
+                if not self.lowered():  # all that is left is rounding
+                    self.wanted[:] = self.face
+                    self.enter()
+                    return True
+            self.x[:], self.g[:] = self.y, self.gy
+        return False
+
+    cdef int shrink(self, double[::1] x, double[::1] g) except -1:
+        """Minimise on the face of `wanted`; hold what leaves the box; until none does."""
+        cdef Py_ssize_t i, j
+        cdef bint leaves = True
+        while leaves:
+            leaves = False
+            self.enter()
+            for j in range(self.k):
+                self.step[j] = g[self.order[j]]
+            self.solve()
+            for j in range(self.k):
+                i = self.order[j]
+                x[i] -= self.step[j]
+                if x[i] - self.lower[i] <= self.near[i]:
+                    x[i], self.wanted[i], leaves = self.lower[i], False, True
+                elif self.upper[i] - x[i] <= self.near[i]:
+                    x[i], self.wanted[i], leaves = self.upper[i], False, True
+            self.gradient(x, g)
+        return 0
+
+    cdef int advance(self, double[::1] x, double[::1] g) except -1:
+        """Go to the minimum on the face of `wanted`, or to the first bound; and on."""
+        cdef Py_ssize_t i, j
+        cdef double length = 0.0, s, bound
+        while length < 1:
+            self.enter()
+            for j in range(self.k):
+                self.step[j] = g[self.order[j]]
+            self.solve()
+            length = 1.0
+            for j in range(self.k):
+                i, s = self.order[j], self.step[j]
+                if s:
+                    bound = self.lower[i] if s > 0 else self.upper[i]
+                    length = fmin(length, fmax((x[i] - bound) / s, 0.0))
+            for j in range(self.k):
+                i, s = self.order[j], self.step[j]
+                bound = self.lower[i] if s > 0 else self.upper[i]
+                if length < 1 and s and (x[i] - bound) / s <= length:
+                    x[i], self.wanted[i] = bound, False
+                else:
+                    x[i] -= length * s
+            self.gradient(x, g)
+        return 0
+
+    cdef bint release(self, double share):
+        """Want the held ones whose gradient leads into the box; whether there are any.
+
+        Of these, only what has at least that share of the largest, relative to √Pᵢᵢ,
+        and is no rounding: Σ|Pᵢⱼxⱼ| ≤ √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
+        """
+        cdef Py_ssize_t i, m
+        cdef double most = 0.0, total = 0.0, inward, terms, force
+        self.wanted[:] = self.face
+        for i in range(self.n):
+            total += self.size[i] * fabs(self.x[i])
+        for i in range(self.n):
+            terms = self.size[i] * total + fabs(self.q[i])
+            for m in range(self.r):
+                force = fabs(self.mu[m]) + self.rho * fabs(self.off[m])
+                terms += fabs(self.C[m, i]) * force
+            self.noise[i], inward = ROUNDING * terms, 0.0
+            if not self.face[i] and self.lower[i] < self.upper[i]:
+                inward = -self.g[i] if self.x[i] <= self.lower[i] else self.g[i]
+                if inward <= self.noise[i]:
+                    inward = 0.0
+            self.step[i] = inward / self.size[i]
+            most = fmax(most, self.step[i])
+        for i in range(self.n if most else 0):
+            if self.step[i] >= share * most:
+                self.wanted[i] = True
+                if share == 1:
+                    break
+        return most > 0
+
+    cdef bint lowered(self):
+        """Whether ½(g_x + g_y)ᵀ(y − x), the change of the cost, is below its noise."""
+        cdef Py_ssize_t i
+        cdef double change = 0.0, step
+        for i in range(self.n):
+            step = self.y[i] - self.x[i]
+            change += (self.g[i] + self.gy[i]) * step + self.noise[i] * fabs(step)
+        return change < 0

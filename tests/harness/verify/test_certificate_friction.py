@@ -1,0 +1,256 @@
+"""The certificate with friction: no error above its bound, however rows are disturbed.
+
+The disturbances are those of a solver that is wrong: noise, rows that stick where they
+should slip or are open, slips the other way, forces beyond the bound of friction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from harness import Case, Mechanics, Solution, Status, certify, kkt_residuals
+from harness.mechanics import Extended, Real
+from harness.names import parse
+from harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
+from harness.verify.certificate import Certificate
+from harness.verify.references import ReferencePoint, reference_point
+from problems import PROBLEMS
+from problems.contact.friction import FrictionLaw
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support.incline import block_on_incline
+
+INCLINE = "a block that friction alone holds"
+#: a problem and its twin without friction
+CASES = {
+    "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7": (
+        "beam-ring/Nr=3/Nh=2/steps=2"
+    ),
+    "beam-ring/Nr=2/Nh=3/steps=1/friction=coulomb/mu=0.3": (
+        "beam-ring/Nr=2/Nh=3/steps=1"
+    ),
+    "beam-ring/Nr=3/Nh=2/steps=1/contact=mortar/friction=coulomb/mu=0.6": (
+        "beam-ring/Nr=3/Nh=2/steps=1/contact=mortar"
+    ),
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2": "contact-patch/ratio=0.1",
+    "contact-patch/ratio=0.1/contact=nts/friction=tresca/bound=1.5e5": (
+        "contact-patch/ratio=0.1/contact=nts"
+    ),
+}
+PERTURBATIONS = 10_000
+ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
+NOISE = 1e-7  #: relative error from which on effectivities are measured
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A small problem with its solution to rounding."""
+
+    mechanics: Mechanics
+    exact: ReferencePoint
+
+    def solution(self) -> Solution:
+        """The solution as `Mechanics.back` would give it."""
+        mechanics, primal = self.mechanics, self.mechanics.primal
+        u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
+        y = -primal.A @ (primal.P @ u + primal.q + mechanics.rows.T @ lam)
+        z, m = np.zeros(primal.h.size + mechanics.friction.bound.size), primal.h.size
+        z[:m], z[m:][mechanics.friction.bound > 0] = lam[:m], lam[m:]
+        return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
+
+    def error(self, u: Extended) -> float:
+        """‖u − u*‖_K."""
+        return self.mechanics.norm(u - self.exact.u)
+
+
+def build(name: str, form: str = "primal") -> Case:
+    if name == INCLINE:
+        return block_on_incline(0.35, FrictionLaw("coulomb", mu=0.3), form=form)
+    return parse(f"{name}/{form}", PROBLEMS).build(reference_solution)
+
+
+@cache
+def known(name: str) -> Known:
+    mechanics = build(name).mechanics
+    assert mechanics is not None
+    return Known(mechanics, reference_point(mechanics, reference_solution))
+
+
+def holds(problem: Known, s: Solution, found: Certificate) -> bool:
+    """Whether no error that the certificate speaks of exceeds what it says."""
+    exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
+    of_u, of_equilibrium = map(problem.error, (found.u, found.equilibrium))
+    of_answer = problem.error(s.x.astype(Real))
+    return bool(
+        np.hypot(of_u, of_equilibrium) <= ROUNDED * found.pair + 2 * slack
+        and max(of_u, of_equilibrium, of_answer)
+        <= ROUNDED * min(found.error, found.bound * problem.exact.norm) + slack
+        and (found.multipliers >= exact.lower).all()
+        and (found.multipliers <= exact.upper).all()
+        and (exact.motion(found.u)[exact.contact] <= 0).all()
+    )
+
+
+def _noise(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
+    """Disturb all components by as much; the forces of friction leave their bounds."""
+    del m
+    x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
+    # of rows, not of their number: the twin's are disturbed by the same numbers
+    z = s.z + size * np.abs(s.z).max() * rng.standard_normal(s.z.size)
+    return replace(s, x=x, z=z)
+
+
+def _wrong_states(
+    s: Solution, size: float, rng: np.random.Generator, m: int
+) -> Solution:
+    """Exchange forces between rows of one kind: stick for slip, closed for open."""
+    z = s.z.copy()
+    for rows in (slice(0, m), slice(m, None)):
+        part = z[rows]
+        swapped = rng.random(part.size) < max(size, 1.5 / max(part.size, 1))
+        part[swapped] = rng.permutation(part)[swapped]
+    return replace(s, z=z)
+
+
+def _turned(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
+    """Turn some forces of friction round, and leave others out; disturb u slightly."""
+    z = s.z.copy()
+    z[m:] *= rng.choice([-1.0, 0.0, 1.0, 1.0, 1.0, 1.0], z.size - m)
+    x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
+    return replace(s, x=x, z=z)
+
+
+def _scaled(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
+    """Scale point and multipliers by factors near 1, or not near at all."""
+    del m
+    a, b = 1 + 3 * size * rng.standard_normal(2)
+    return replace(s, x=a * s.x, z=b * s.z)
+
+
+def _rounded(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
+    """Set what is small to zero, and round the rest to as many digits."""
+    del m
+    x = np.where(np.abs(s.x) < size * np.abs(s.x).max(), 0, s.x)
+    z = np.where(np.abs(s.z) < size * np.abs(s.z).max(), 0, s.z)
+    unit = 10.0 ** np.floor(np.log10(np.abs(s.x).max()))
+    return replace(s, x=np.round(x / unit, rng.integers(1, 6)) * unit, z=z)
+
+
+KINDS: tuple[Callable[..., Solution], ...] = (
+    _noise, _wrong_states, _turned, _scaled, _rounded,
+)  # fmt: skip
+
+
+def attacked(name: str, count: int) -> tuple[list[str], list[float]]:
+    """Disturb the solution at random; tell every bound that did not hold.
+
+    Also returns the bound over the true error of each pair, where that is no rounding.
+    """
+    problem, told, effectivities = known(name), [], []
+    s, m = problem.solution(), problem.mechanics.primal.h.size
+    for i in range(count):
+        rng = np.random.default_rng([577, i])
+        kind, size = KINDS[i % len(KINDS)], 10 ** rng.uniform(-10, 0.5)
+        disturbed = kind(s, size, rng, m)
+        found = certify(problem.mechanics, disturbed)
+        if not holds(problem, disturbed, found):
+            told.append(f"{kind.__name__} {size:.1e}: bound {found.bound:.3e}")
+        true = np.hypot(*map(problem.error, (found.u, found.equilibrium)))
+        if true > NOISE * problem.exact.norm:
+            effectivities.append(found.pair / true)
+    return told, effectivities
+
+
+def sharp(cases: Sequence[str], count: int) -> None:
+    """Attack the cases, and their twins with the same numbers."""
+    rough, smooth = [], []
+    for name in cases:
+        told, found = attacked(name, count)
+        assert told == []
+        rough += found
+        smooth += attacked(CASES[name], count)[1]
+    assert len(rough) > count * len(cases) / 3
+    assert np.median(rough) <= 1.5 * np.median(smooth)
+
+
+def test_no_disturbed_solution_with_friction_is_further_off_than_its_bound():
+    sharp(list(CASES), 25)
+
+
+def test_nor_is_one_of_a_body_that_friction_alone_holds():
+    assert attacked(INCLINE, 40)[0] == []
+
+
+@pytest.mark.slow
+def test_none_of_ten_thousand_is():
+    sharp(list(CASES), PERTURBATIONS // len(CASES))
+    assert attacked(INCLINE, PERTURBATIONS // len(CASES))[0] == []
+
+
+def test_the_cases_have_rows_that_stick_and_slip_either_way_and_are_open():
+    found = set()
+    for name in CASES:
+        problem = known(name)
+        contact = problem.mechanics.exact.contact
+        closed = problem.exact.states == CLOSED
+        found |= {("contact", bool(c)) for c in closed[contact]}
+        found |= {("friction", int(v)) for v in problem.exact.states[~contact]}
+
+    assert found == {
+        ("contact", True), ("contact", False),
+        ("friction", LOWER), ("friction", CLOSED), ("friction", UPPER),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*CASES, INCLINE])
+def test_the_bound_of_the_solution_is_that_of_rounding(name):
+    problem = known(name)
+    mechanics, s = problem.mechanics, problem.solution()
+
+    assert problem.exact.bound < 1e-7
+    assert certify(mechanics, s).bound < 2e-7
+    force, slip = s.z[mechanics.primal.h.size :], mechanics.friction.T @ s.x
+    assert (abs(force) <= mechanics.friction.bound * (1 + 1e-12)).all()
+    work = mechanics.friction.bound * abs(slip - mechanics.friction.start)
+    assert work.sum() >= 0
+
+
+@pytest.mark.parametrize("name", list(CASES)[:3])
+def test_what_solvers_return_is_bounded_in_every_form(name):
+    problem, found = known(name), []
+    for form in ("primal", "dual", "dual-bounds"):
+        case = build(name, form)
+        for label in ("smalbe", "clarabel", "osqp"):
+            solver = SOLVERS[label]
+            if solver.declines(case.qp) is not None:
+                continue
+            for tol in (1e-3, 1e-6):
+                s = solver.prepare(case.qp, tol)()
+                assert kkt_residuals(case.qp, s).worst <= 100 * tol
+                back = case.mechanics.back(s)
+                c = certify(case.mechanics, back)
+                assert holds(problem, back, c)
+                found.append(c.bound)
+    assert max(found) < 0.3
+
+
+def test_work_of_friction_has_its_own_part():
+    """Where a force does not oppose the slip, the work that it lacks is charged."""
+    problem = known("beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7")
+    mechanics, s = problem.mechanics, problem.solution()
+    slip = mechanics.friction.T @ s.x - mechanics.friction.start
+    m, row = (
+        mechanics.primal.h.size,
+        int((mechanics.friction.bound * abs(slip)).argmax()),
+    )
+    z = s.z.copy()
+    z[m + row] = 0.0
+    c = certify(mechanics, replace(s, z=z))
+
+    assert 0 < c.sliding <= mechanics.friction.bound[row] * abs(slip[row]) * (1 + 1e-9)
+    assert c.parts["friction"] <= c.parts["work"] * (1 + 1e-12)

@@ -1,0 +1,285 @@
+"""Friction against limits, digits of other codes, and the laws themselves."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.sparse import vstack
+
+from harness import InputError, kkt_residuals
+from harness.names import parse
+from problems import PROBLEMS
+from problems.contact.balance import check_balance
+from problems.contact.bodies import ContactPair, assemble, clamped
+from problems.contact.friction import FrictionLaw
+from problems.contact.linearise import linearisation
+from problems.contact.node_to_segment import ContactRows, rows_along, tangent
+from problems.duality.stepping import LoadPath
+from problems.fem.elasticity import Material
+from problems.fem.mesh import dofs_of, rectangle
+from problems.models.patch import model
+from solvers.reference.solve import reference_solution
+from tests.support.incline import WEIGHT, block_on_incline, incline
+
+SMALL = "beam-ring/Nr=3/Nh=2/steps=1"
+
+
+@cache
+def solved(name):
+    """The case, its solution, and its quantities."""
+    case = parse(name, PROBLEMS).build(reference_solution)
+    s = reference_solution(case.qp)
+    return case, s, case.quantities(s)
+
+
+# mu: tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows of 8 active ones
+DIGITS = [
+    (0.1, -0.295871, 1.79947, 1),
+    (0.3, -0.29546, 1.7963, 1),
+    (0.6, -0.29495, 1.7938, 2),
+]
+
+
+@pytest.mark.parametrize(
+    ("mu", "tip", "force", "stick"),
+    [pytest.param(*row, marks=[pytest.mark.slow] * (row[0] < 0.6)) for row in DIGITS],
+)
+def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force, stick):
+    _, _, found = solved(
+        f"beam-ring/steps=1/relin=8/friction=coulomb/mu={mu}/dual-bounds"
+    )
+
+    assert found["tip"][1] == pytest.approx(tip, abs=6e-6)
+    assert found["contact_force"][1] / 1e8 == pytest.approx(force, abs=6e-5)
+    assert (found["stick"], found["slip"], found["open"]) == (stick, 8 - stick, 53)
+    assert found["friction_residual"] <= 1e-10
+
+
+def test_a_bound_that_nothing_reaches_glues_the_flanks_as_well():
+    """The other code's limit g → ∞ with all rows of the arc."""
+    _, _, found = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
+
+    assert found["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
+    assert found["slip"] == 0
+    assert found["stick"] == found["active"]
+
+
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize("law", ["tresca/bound=0", "coulomb/mu=0"])
+def test_a_bound_of_zero_is_no_friction(law, contact, form):
+    name = f"{SMALL}/contact={contact}"
+    _, _, rough = solved(f"{name}/friction={law}/{form}")
+    _, _, smooth = solved(f"{name}/{form}")
+
+    for key in ("tip", "energy", "contact_force", "multiplier_sum", "active"):
+        assert rough[key] == pytest.approx(smooth[key], rel=1e-7)
+    assert (rough["dissipation"], rough["stick"]) == (0.0, 0)
+
+
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize(
+    "law", ["tresca/bound=5e7", "tresca/bound=5e7/loading=static", "coulomb/mu=0.3"]
+)
+def test_every_form_is_the_same_problem(law, contact):
+    name = f"{SMALL}/contact={contact}/friction={law}"
+    forms = {
+        form: solved(f"{name}/{form}") for form in ("primal", "dual", "dual-bounds")
+    }
+    case, s, primal = forms["primal"]
+
+    for other, t, found in forms.values():
+        assert kkt_residuals(other.qp, t).worst < 1e-7
+        energy = other.scale * other.qp.objective(t.x) + other.constant
+        assert energy == pytest.approx(found["energy"] + found["dissipation"], rel=1e-9)
+        for key in ("energy", "tip", "dissipation", "stick", "slip", "open"):
+            assert found[key] == pytest.approx(primal[key], rel=1e-6)
+        u, v = other.recover(t), case.recover(s)
+        assert u == pytest.approx(v, abs=1e-8 * abs(v).max())
+
+
+@pytest.mark.parametrize("law", ["tresca/bound=5e7", "coulomb/mu=0.3"])
+def test_friction_opposes_the_slip_and_only_at_its_bound(law):
+    case, s, found = solved(f"{SMALL}/friction={law}/dual")
+    friction, back = case.mechanics.friction, case.mechanics.back(s)
+    force = back.z[case.mechanics.primal.h.size :]
+    slip = friction.T @ back.x - friction.start
+    slips = abs(slip) > 1e-9 * abs(slip).max()
+
+    assert (abs(force) <= friction.bound * (1 + 1e-9)).all()
+    assert force[slips] == pytest.approx(np.sign(slip)[slips] * friction.bound[slips])
+    work = (friction.bound * abs(slip)).sum() * case.scale
+    assert abs(work) == pytest.approx(found["dissipation"], rel=1e-6)
+
+
+@pytest.mark.parametrize("basis", ["dual", "standard"])
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
+    case = parse(
+        f"contact-patch/contact={contact}/basis={basis}/friction=tresca/bound=2e5"
+        "/primal",
+        PROBLEMS,
+    ).build(reference_solution)
+    share = np.array([1, 2, 2, 2, 1]) / 8  # of a side of 1 m in four cells
+
+    assert case.mechanics.friction.bound * 1e6 == pytest.approx(2e5 * share)
+
+
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+def test_tangential_rows_are_blind_to_what_both_sides_do_together(contact):
+    bodies = model(PROBLEMS["contact-patch"].defaults)
+    law = (FrictionLaw("tresca", bound=1.0),)
+    rows = linearisation(bodies, contact, "dual", law)(np.zeros(bodies.mesh.dofs))
+    along = np.tile([1.0, 0.0], len(bodies.mesh.points))
+    slave = np.zeros_like(along)
+    slave[2 * bodies.pairs[0].slave] = 1.0
+
+    assert abs(rows.T @ along).max() < 1e-14
+    assert abs(rows.T @ slave) == pytest.approx(1.0)
+    assert abs(rows.B @ slave).max() < 1e-14
+
+
+@pytest.mark.parametrize("law", ["tresca/bound=1e6", "coulomb/mu=0.5"])
+@pytest.mark.parametrize("basis", ["dual", "standard"])
+def test_friction_makes_no_difference_to_a_uniform_pressure_on_one_material(basis, law):
+    name = f"contact-patch/basis={basis}/friction={law}/dual"
+
+    assert solved(name)[2]["stress_error"] <= 1e-10
+    assert solved(name)[2]["slip"] == 0
+
+
+COULOMB = FrictionLaw("coulomb", mu=0.3)
+
+
+def test_a_block_on_an_incline_slips_at_its_limit():
+    """NAFEMS CGS-4: F/G = (tan α + mu)/(1 − mu tan α), tan α = 0.1, mu = 0.3."""
+    limit = 0.412371
+    case = block_on_incline(limit - 4e-4, COULOMB)
+    found = case.quantities(reference_solution(case.qp))
+    across, onto = found["contact_force"]
+
+    assert found["stick"] > 0
+    assert across / -onto == pytest.approx(0.3, abs=1e-3)
+    with pytest.raises(InputError, match="no equilibrium was found with the"):
+        block_on_incline(limit + 4e-4, COULOMB)
+
+
+def test_loads_are_balanced_where_friction_may_hold_them():
+    """As `bodies:` ask before they solve; without friction the block slides."""
+    bodies = incline(0.3)
+    rows = linearisation(bodies, "nts", "dual", (COULOMB,))(np.zeros(bodies.mesh.dofs))
+
+    check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+    with pytest.raises(InputError, match="'block': nothing balances its load in x"):
+        check_balance(bodies, rows.B)
+
+
+@pytest.mark.parametrize("push", [0.2, -0.1])
+def test_below_the_limit_it_stays_whatever_the_law_allows(push):
+    """Forces follow from the weight alone, not from the law."""
+    normal = (1 + 0.1 * push) / np.hypot(1, 0.1) * WEIGHT
+    for law in (COULOMB, FrictionLaw("tresca", bound=0.5 * WEIGHT)):
+        case = block_on_incline(push, law)
+        found = case.quantities(reference_solution(case.qp))
+
+        assert found["multiplier_sum"] == pytest.approx(normal, rel=1e-9)
+        assert found["contact_force"][0] == pytest.approx(
+            (push - 0.1) / np.hypot(1, 0.1) * WEIGHT, rel=1e-7
+        )
+
+
+def test_quasi_static_slip_begins_where_the_step_before_ended():
+    """In proportion, two steps; the static problem knows nothing of the first one."""
+    name = f"{SMALL.replace('steps=1', 'steps=2')}/friction=tresca/bound=5e7"
+    first, _, _ = solved(f"{name}/step=1/primal")
+    path, s, _ = solved(f"{name}/primal")
+    static, _, _ = solved(f"{name}/loading=static/primal")
+    before = reference_solution(first.qp).x[: first.mechanics.primal.q.size]
+    friction = path.mechanics.friction
+
+    assert friction.start == pytest.approx(friction.T @ before, abs=1e-9)
+    assert abs(friction.start).max() > 1e-3
+    assert (static.mechanics.friction.start == 0).all()
+    assert kkt_residuals(path.qp, s).worst < 1e-9
+
+
+def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
+    """Each has mu times the pressure of the one before as its bound."""
+    name = f"{SMALL}/friction=coulomb/mu=0.3"
+    _, _, first = solved(f"{name}/iterate=1/dual-bounds")
+    _, _, smooth = solved(f"{SMALL}/dual-bounds")
+    last, _, _ = solved(f"{name}/dual-bounds")
+    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)  # of no bound yet
+    residuals = []
+    for k in (1, 2, 3, 4):
+        case, s, found = solved(f"{name}/iterate={k}/dual-bounds")
+        after, _, _ = solved(f"{name}/iterate={k + 1}/dual-bounds")
+        m = case.mechanics.primal.h.size
+        demanded = 0.3 * s.x[:m]
+
+        assert after.qp.ub[m:] == pytest.approx(demanded, abs=1e-9)
+        assert (after.qp.P == last.qp.P).all()
+        residuals.append(found["friction_residual"])
+    assert residuals[1:] == sorted(residuals[1:], reverse=True)
+
+
+REFUSED = [
+    ("beam-ring/friction=sliding/dual", "expected 'none' or 'tresca' or 'coulomb'"),
+    ("beam-ring/friction=tresca/dual", "friction=tresca needs bound, a traction"),
+    ("beam-ring/friction=coulomb/dual", "friction=coulomb needs mu, a coefficient"),
+    ("beam-ring/friction=coulomb/bound=1e6/mu=0.1/dual", "bound=1e+06 is not used by"),
+    ("beam-ring/mu=0.1/dual", "mu=0.1 is not used by friction=none; expected no mu"),
+    ("beam-ring/friction=tresca/bound=-5/dual", "bound=-5; expected a traction of 0"),
+    ("contact-patch/friction=coulomb/mu=-0.1/dual", "mu=-0.1; expected a coefficient"),
+    (
+        "contact-patch/loading=static/dual",
+        "loading=static is not used by friction=none",
+    ),
+    ("beam-ring/friction=tresca/bound=1/iterate=2/dual", "iterate=2 is not used by"),
+    ("beam-ring/friction=coulomb/mu=1/loading=slow/dual", "'quasi-static' or 'static'"),
+    ("hertz-plane/friction=coulomb/dual", "unknown key 'friction'"),
+    ("obstacle/mu=0.3/primal", "unknown key 'mu'"),
+]
+
+
+@pytest.mark.parametrize(("name", "told"), REFUSED)
+def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, told):
+    with pytest.raises(InputError) as e:
+        parse(name, PROBLEMS)
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("load", [(0.0, 1.0), (1.0, 1.0)])
+def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(load):
+    """The tip of a slender beam against a wall across it: slip presses far more."""
+    mesh = rectangle((0.0, 0.0), (4.0, 0.2), (20, 2))
+    sides = mesh.boundaries
+    tip = np.intersect1d(sides["top"], sides["right"])
+    force = np.zeros(mesh.dofs)
+    force[dofs_of(tip)] = load
+    bodies = assemble(
+        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("beam",),
+        materials=(Material(1e6, 0.3),), plane="strain", units=(1.0, 1.0),
+        fixed=dofs_of(sides["left"]), load=force, pairs=(ContactPair(tip, tip),),
+    )  # fmt: skip
+    normal, one = np.array([[np.cos(0.1), np.sin(0.1)]]), np.ones((1, 1))
+    B = rows_along(tip[:, None], one, normal, mesh.dofs)
+    T = rows_along(tip[:, None], one, tangent(normal), mesh.dofs)
+    first = np.zeros(1, dtype=np.int64)
+    rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
+    laws = (FrictionLaw("coulomb", mu=0.5),)
+    path = LoadPath(
+        bodies, lambda u: rows, clamped(bodies), reference_solution, 1, laws=laws
+    )
+
+    told = r"step 1 does not settle: after 3. Tresca problems .* is [789]\.\de-01, and"
+    with pytest.raises(InputError, match=told):
+        path.problem(1)
+
+
+def test_an_iterate_beyond_the_last_one_is_refused():
+    name = f"{SMALL}/friction=coulomb/mu=0.3/iterate=900/dual-bounds"
+    with pytest.raises(InputError, match="iterate=900: the fixed point of step 1 has"):
+        parse(name, PROBLEMS).build(reference_solution)

@@ -1,0 +1,116 @@
+"""GRECO's plate: published digits, and those of an independent prototype."""
+
+import numpy as np
+import pytest
+
+from harness import InputError, kkt_residuals
+from harness.names import parse
+from problems import PROBLEMS
+from problems.families.greco import Greco
+from problems.models.greco import PUBLISHED
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+FAMILY = Greco()
+
+#: cells a side: u_x at 0, 1.25, 5, 7.5 and 11.25 mm, normal force at 38.75 mm
+PROTOTYPE = {
+    32: ([2.85944, 2.72168, 2.28500, 1.97963, 1.54056], 1.04823e5),
+    128: ([2.86022, 2.72250, 2.28669, 1.98067, 1.54134], 2.62061e4),
+}
+
+
+def solved(n, form="dual-bounds", tol=1e-10, **given):
+    case = FAMILY.build(form, FAMILY.complete({"n": n, **given}), reference_solution)
+    s = SMALBE().prepare(case.qp, tol)()
+    assert kkt_residuals(case.qp, s).worst <= 10 * tol
+    return case, s
+
+
+@pytest.mark.parametrize("n", [32, pytest.param(128, marks=pytest.mark.slow)])
+def test_it_has_the_digits_of_the_prototype(n):
+    case, s = solved(n)
+    got = case.quantities(s)
+    displacement, force = PROTOTYPE[n]
+
+    assert got["displacement"] == pytest.approx(np.multiply(1e-5, displacement), 3e-6)
+    assert got["normal_force"] == pytest.approx(force, rel=5e-6)
+    assert got["published_error"] < 0.05
+    assert got["friction_residual"] < 1e-6
+    if n == 32:
+        assert [got[k] for k in ("open", "slip", "stick")] == [3, 21, 8]
+        assert got["tangential_sum"] == pytest.approx(1.4053764e6, rel=5e-8)
+        assert got["normal_force"] == pytest.approx(1.04864e5, rel=5e-4)  # published
+
+
+def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
+    case, s = solved(32)
+    u = case.recover(s)
+    bottom = u[0 : 2 * 33 : 2]  # the first row of nodes
+
+    assert abs(bottom[24:]).max() < 1e-12
+    assert (bottom[:24] > 1e-9).all()
+    assert bottom[0] == pytest.approx(PUBLISHED[0], rel=0.05)
+
+
+def test_forces_are_in_equilibrium():
+    """Friction and the reactions of the right side carry the push, contact the rest."""
+    case, s = solved(8)
+    got, reaction = case.quantities(s), case.mechanics.back(s).y * 5e7 * 0.04
+    fx, fy = got["contact_force"]
+
+    assert 15e7 * 0.04 + fx - reaction[:9].sum() == pytest.approx(0, abs=1)
+    assert -5e7 * 0.04 + fy - reaction[9] == pytest.approx(0, abs=1)
+    assert fx < 0 < fy
+
+
+def test_every_form_has_the_same_answer():
+    energies = []
+    for form in FAMILY.forms:
+        case = FAMILY.build(form, FAMILY.complete({"n": 6}), reference_solution)
+        s = reference_solution(case.qp)
+        got = case.quantities(s)
+        objective = case.scale * case.qp.objective(s.x) + case.constant
+        assert objective == pytest.approx(got["energy"] + got["dissipation"], rel=1e-9)
+        energies.append(got["energy"])
+
+    assert energies == pytest.approx(energies[:1] * 3, rel=1e-8)
+
+
+def test_the_fixed_point_begins_without_friction_and_contracts():
+    """Every one of its Tresca problems can be had by its number."""
+    case, s = solved(8)
+    count, residuals = case.quantities(s)["tresca_problems"], []
+    for i in range(1, count + 1):
+        case, s = solved(8, iterate=i)
+        residuals.append(case.quantities(s)["friction_residual"])
+
+    assert case.qp.ub[8:].max() > 0.1
+    assert solved(8, iterate=1)[0].qp.ub[8:] == pytest.approx(0)
+    assert residuals[-1] < 1e-8
+    assert (np.divide(residuals[2:9], residuals[1:8]) < 0.7).all()
+
+
+def test_without_friction_nothing_slips_back():
+    got = solved(8, mu=0.0)[0].quantities(solved(8, mu=0.0)[1])
+
+    assert got["tangential_sum"] == 0
+    assert got["dissipation"] == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("n=1", "greco: n=1 must be at least 2"),
+     ("mu=-0.5", "greco: mu=-0.5; expected a coefficient of friction of 0 or more"),
+     ("iterate=-1", "greco: iterate=-1 must be at least 0")],
+)  # fmt: skip
+def test_values_out_of_range_are_refused(name, told):
+    with pytest.raises(InputError) as e:
+        parse(f"greco/{name}/dual", PROBLEMS)
+
+    assert told in str(e.value)
+
+
+def test_an_iterate_beyond_the_last_is_refused():
+    with pytest.raises(InputError, match="iterate=99: the fixed point of step 1 has"):
+        solved(4, iterate=99)

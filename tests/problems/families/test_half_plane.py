@@ -1,0 +1,191 @@
+"""Half planes without a mesh against Hertz, Cattaneo and Mindlin."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from harness import InputError, kkt_residuals
+from harness.names import parse
+from problems import PROBLEMS
+from problems.families.half_plane import HalfPlane
+from problems.models.half_plane import EXACT, MU, Elements, displacement, self_energy
+from problems.models.line_contact import TangentialContact
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+FAMILY = HalfPlane()
+TOL = 1e-9
+
+
+def result(solver=None, **given):
+    case = FAMILY.build("dual", FAMILY.complete(given), reference_solution)
+    s = (solver or SMALBE()).prepare(case.qp, TOL)()
+    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
+    return case.quantities(s)
+
+
+def tangential(Q, peak=None):
+    return TangentialContact(EXACT, MU, Q, Q if peak is None else peak)
+
+
+@pytest.mark.parametrize(("Q", "c"), [(0.25, 0.866025), (0.5, 0.707107), (0.75, 0.5)])
+def test_the_stick_zone_has_the_published_half_width(Q, c):
+    assert tangential(Q).c / EXACT.a == pytest.approx(c, abs=5e-7)
+    assert tangential(Q).traction(np.zeros(1)) == pytest.approx(
+        MU * EXACT.p0 * (1 - tangential(Q).c / EXACT.a)
+    )
+
+
+@pytest.mark.parametrize(("Q", "peak"), [(0.4, 0.4), (0.1, 0.7), (-0.6, 0.6)])
+def test_the_exact_traction_adds_up_to_its_force_and_keeps_to_coulomb_s_law(Q, peak):
+    exact, a = tangential(Q, peak), EXACT.a
+    edges = sorted({a, exact.c, exact.before.c, -a, -exact.c, -exact.before.c})
+
+    def moment(k):
+        def f(t):
+            return float(exact.traction(np.array([t]))[0]) * t**k
+
+        pieces = pairwise(edges)
+        return sum(quad(f, *piece, epsabs=0, epsrel=1e-8)[0] for piece in pieces)
+
+    x = np.linspace(-a, a, 401)
+    assert moment(0) == pytest.approx(Q * MU * EXACT.P, rel=1e-8)
+    assert exact.force(np.array([a]))[0] == pytest.approx(moment(0), rel=1e-8)
+    pressure = EXACT.P * a**2 / 4
+    assert exact.stick_half_width(moment(2), pressure) == pytest.approx(exact.c, 1e-6)
+    excess = np.abs(exact.traction(x)) - MU * EXACT.pressure(x)
+    assert excess.max() <= 1e-12 * EXACT.p0
+    if peak == Q:
+        c4 = (exact.c / a) ** 4
+        assert moment(2) == pytest.approx(MU * EXACT.P * a**2 / 4 * (1 - c4), rel=1e-8)
+
+
+def test_full_unloading_to_the_other_side_is_loading_to_the_other_side():
+    x = np.linspace(-EXACT.a, EXACT.a, 101)
+
+    assert tangential(-0.6, 0.6).traction(x) == pytest.approx(
+        -tangential(0.6).traction(x), rel=1e-12
+    )
+
+
+def test_the_kernel_displaces_as_the_integral_of_the_logarithm():
+    """And F is symmetric and positive definite: the segment is shorter than 4."""
+    elements = Elements(8, 1.5)
+    F, h = elements.F, elements.h
+
+    for i, j in ((0, 0), (0, 1), (2, 7)):
+        x, s = elements.middle[[i, j]]
+        direct, _ = quad(
+            lambda t, x=x: -np.log(abs(x - t)) / h, s - h / 2, s + h / 2, points=[x]
+        )
+        assert F[i, j] == pytest.approx(direct, rel=1e-9)
+    assert (F == F.T).all()
+    assert np.linalg.eigvalsh(F)[0] > 0.5
+
+
+def test_exact_energies_are_those_of_integrals():
+    """½∫q Fq by a fine quadrature of the kernel, and u = const − x² under Hertz."""
+    elements = Elements(1200, 1.0)
+    share = np.diff(EXACT.force(EXACT.a * elements.ends)) / EXACT.P
+    q = np.diff(tangential(0.5).force(EXACT.a * elements.ends)) / (MU * EXACT.P)
+
+    inside = np.abs(elements.middle) < 0.9
+    u = (elements.F @ share + elements.middle**2)[inside]
+    assert u == pytest.approx(displacement(((1.0, 1.0),)), abs=1e-4)
+    assert 0.5 * q @ elements.F @ q == pytest.approx(
+        self_energy(tangential(0.5).semicircles), rel=1e-4
+    )
+
+
+@pytest.mark.parametrize("Q", [0.3, 0.6, 0.9])
+def test_400_elements_have_the_shear_traction_of_cattaneo_and_mindlin(Q):
+    got = result(n=400, law="cattaneo", Q=Q)
+
+    assert got["shear_l2_error"] < 2.5e-3
+    assert abs(got["shear_centre_error"]) < 1e-4
+    assert abs(got["stick_half_width_error"]) < 1e-3
+    assert abs(got["energy_error"]) < 1e-4
+    assert got["stick"] + got["slip"] == 400
+    assert got["stick"] / 400 == pytest.approx(np.sqrt(1 - Q), abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "error"),
+    [(dict(law="hertz"), "pressure_l2_error"),
+     (dict(law="cattaneo", Q=0.3), "shear_l2_error"),
+     (dict(law="cattaneo", Q=0.9), "shear_l2_error"),
+     (dict(law="cattaneo", Q=0.2, peak=0.6), "shear_l2_error")],
+    ids=str,
+)  # fmt: skip
+def test_tractions_converge_about_linearly_and_energies_quadratically(given, error):
+    """Over four halvings: at each, c and a fall differently between the elements."""
+    coarse, fine = (result(n=n, **given) for n in (50, 800))
+
+    assert np.log2(coarse[error] / fine[error]) / 4 > 0.8
+    assert np.log2(abs(coarse["energy_error"] / fine["energy_error"])) / 4 > 1.5
+
+
+def test_400_elements_have_hertz_s_pressure():
+    got = result(n=400)
+
+    assert got["pressure_l2_error"] < 2.5e-3
+    assert abs(got["p_max_error"]) < 1e-4
+    assert abs(got["half_width_error"]) < 1e-4
+    assert abs(got["approach_error"]) < 1e-4
+    assert got["active"] == pytest.approx(400 / 1.5, abs=2)
+
+
+@pytest.mark.parametrize(("Q", "peak"), [(0.2, 0.6), (-0.9, 0.9), (0.0, 0.5)])
+def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
+    got = result(n=400, law="cattaneo", Q=Q, peak=peak)
+
+    assert got["shear_l2_error"] < 8e-3  # of a q that is small at the end
+    assert abs(got["shear_centre_error"]) < 1e-3
+    assert abs(got["stick_half_width_error"]) < 1e-3
+    assert got["dissipation"] > 0
+
+
+def test_friction_dissipates_what_the_force_did_less_what_is_stored():
+    """∫Q dδ of the closed curve Q(δ) from −peak to peak and back: 2·dissipation."""
+    Q = np.linspace(-0.8, 0.8, 201)
+    unit = MU * EXACT.P * 2 * MU * EXACT.P / (np.pi * EXACT.E_star)
+    moved = [displacement(tangential(q, 0.8).semicircles) for q in Q]
+    back = -np.trapezoid(Q, moved) * unit  # from 0.8 to −0.8, as moved falls
+    got = result(n=200, law="cattaneo", Q=-0.8, peak=0.8)["dissipation"]
+
+    assert got == pytest.approx(abs(back), rel=2e-3)
+
+
+def test_an_interior_point_method_finds_the_same():
+    given = dict(n=40, law="cattaneo", Q=0.4, peak=0.7)
+
+    ours, theirs = result(**given), result(Clarabel(), **given)
+    assert ours["shear_centre"] == pytest.approx(theirs["shear_centre"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("Q=0.5", "Q=0.5 needs law=cattaneo"), ("peak=0.5", "peak=0.5 needs law=cattaneo"),
+     ("law=cattaneo", "Q=0.0 must be between 0 and 1"),
+     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("law=cattaneo/Q=-0.5", "Q=-0.5 must be between 0 and 1"),
+     ("law=cattaneo/Q=0.6/peak=0.5", "must be between -peak and peak=0.5"),
+     ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),
+     ("n=1", "n=1 must be at least 2"), ("n=90000000", "a full matrix of 90000000")],
+)  # fmt: skip
+def test_what_the_law_does_not_use_or_lacks_is_refused_in_one_line(name, told):
+    with pytest.raises(InputError, match="half-plane: ") as e:
+        parse(f"half-plane/{name}/dual", PROBLEMS)
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_a_peak_that_was_never_passed_is_not_in_the_name():
+    case = parse("half-plane/law=cattaneo/Q=0.5/peak=0.5/dual", PROBLEMS)
+
+    assert str(case) == "half-plane/law=cattaneo/Q=0.5/dual"
+    assert case.params["peak"] == 0.5

@@ -1,0 +1,158 @@
+"""SMALBE on duals with friction: boxes on both sides, sticking and slipping rows."""
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+
+from harness import Status, kkt_residuals
+from harness.names import parse
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from solvers.smalbe import driver
+from solvers.smalbe.driver import outer_loop
+
+TOL = 1e-8
+PRESETS = ("smalbe-permon", "smalbe-espreso")
+COULOMB = "friction=coulomb/mu=0.3"
+CASES = [
+    "greco/n=16/dual-bounds",
+    "greco/n=16/dual",
+    "half-plane/law=cattaneo/Q=0.6/dual",
+    "half-plane/law=cattaneo/Q=0.2/peak=0.6/dual",
+    f"hertz-cylinder/n=5/m=5/{COULOMB}/Q=0.5/dual",
+    f"beam-ring/Nr=4/Nh=3/steps=1/{COULOMB}/dual",
+    "beam-ring/Nr=4/Nh=3/steps=1/friction=tresca/bound=1e8/dual-bounds",
+]
+
+
+@cache
+def emitted(name):
+    return parse(name, PROBLEMS).build(reference_solution).qp
+
+
+def products(solutions):
+    return sum(s.counts["P_products"] for s in solutions)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
+    qp, exact = emitted(name), reference_solution(emitted(name))
+    found = {s: SOLVERS[s].prepare(qp, TOL)() for s in ("smalbe", *PRESETS)}
+
+    for s in found.values():
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 10 * TOL
+        assert s.x == pytest.approx(exact.x, abs=1e-4 * abs(exact.x).max())
+    assert products([found["smalbe"]]) <= 0.85 * min(
+        products([found[s]]) for s in PRESETS
+    )
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("solver", ["smalbe", "smalbe-permon"])
+def test_compiled_and_written_steps_are_the_same(name, solver, monkeypatch):
+    """In the first 25, before rounding tells."""
+    qp, runs = emitted(name), []
+    for compiled in (True, False):
+        options = replace(SOLVERS[solver], max_steps=25, history=True)
+        if not compiled:
+            written = partial(outer_loop, is_compiled=False)
+            monkeypatch.setattr(driver, "outer_loop", written)
+        runs.append(options.prepare(qp, TOL)())
+
+    assert list(runs[0].history["step"]) == list(runs[1].history["step"])
+    assert runs[0].x == pytest.approx(runs[1].x, abs=1e-6 * abs(runs[1].x).max())
+
+
+def test_all_that_slipped_slips_back():
+    """From a bound to the opposite one and through, warm: peak to −peak, and again."""
+    there, back = (
+        emitted(f"half-plane/law=cattaneo/Q={Q}/peak=0.9/dual") for Q in (0.9, -0.9)
+    )
+    prepare = SOLVERS["smalbe"].chain(TOL)
+    found = [(qp, prepare(qp)()) for qp in (there, back, there, back)]
+    cold = [SOLVERS["smalbe"].prepare(qp, TOL)() for qp, _ in found]
+
+    for (qp, s), other in zip(found, cold, strict=True):
+        assert kkt_residuals(qp, s).worst <= 10 * TOL
+        assert s.x == pytest.approx(other.x, abs=1e-5 * abs(other.x).max())
+    assert (np.sign(found[0][1].x) == -np.sign(found[1][1].x)).all()
+    assert products([s for _, s in found]) <= 1.2 * products(cold)
+
+
+def test_bounds_that_close_and_open_again_are_followed():
+    """Without friction every tangential multiplier is held at zero from both sides."""
+    with_friction = emitted("greco/n=16/dual-bounds")
+    without = emitted("greco/n=16/iterate=1/dual-bounds")
+    some = replace(
+        with_friction,
+        lb=np.where(np.arange(32) % 3, with_friction.lb, 0.0),
+        ub=np.where((np.arange(32) % 3 > 0) | (np.arange(32) < 16),
+                    with_friction.ub, 0.0),
+    )  # fmt: skip
+    prepare = SOLVERS["smalbe"].chain(TOL)
+
+    assert (without.lb[16:] == without.ub[16:]).all()
+    for qp in (without, with_friction, some, without, some, with_friction):
+        s = prepare(qp)()
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 10 * TOL
+        assert s.x == pytest.approx(reference_solution(qp).x, abs=1e-5 * abs(s.x).max())
+
+
+def fixed_point(qp, mu, solve, enough):
+    """Solve Coulomb's law on a dual with bounds only; all solutions in turn."""
+    m = qp.q.size // 2
+    bound, found = np.zeros(m), []
+    for _ in range(60):
+        tresca = replace(
+            qp, lb=np.append(np.zeros(m), -bound), ub=np.append(qp.ub[:m], bound)
+        )
+        found.append(solve(tresca))
+        assert kkt_residuals(tresca, found[-1]).worst <= 10 * TOL
+        demanded = mu * np.maximum(found[-1].x[:m], 0)
+        residual = np.linalg.norm(bound - demanded) / max(np.linalg.norm(bound), 1e-300)
+        if residual <= enough:
+            return found, residual
+        bound = demanded
+    raise AssertionError(f"residual {residual} after 60 problems")
+
+
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-permon"])
+def test_a_warm_fixed_point_takes_less_than_half_the_products_of_a_cold_one(name):
+    """Each solver on its own sequence, to the same residual of Coulomb's law."""
+    qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS[name], 1e-7
+    prepare = solver.chain(TOL)
+    warm, left = fixed_point(qp, 1.0, lambda qp: prepare(qp)(), enough)
+    cold, _ = fixed_point(qp, 1.0, lambda qp: solver.prepare(qp, TOL)(), enough)
+    exact = reference_solution(qp)
+
+    assert left <= enough
+    assert abs(len(warm) - len(cold)) <= 1  # what is left of each differs by rounding
+    assert products(warm) <= 0.5 * products(cold)
+    assert warm[-1].x == pytest.approx(exact.x, abs=1e-5 * abs(exact.x).max())
+
+
+def test_the_emitted_sequence_is_cheaper_warm_where_rows_are_equations_too():
+    names = f"beam-ring/Nr=4/Nh=3/steps=1/{COULOMB}/iterate={{}}/dual"
+    qps = [emitted(names.format(i)) for i in range(1, 7)]
+    prepare = SOLVERS["smalbe"].chain(TOL)
+    warm = [prepare(qp)() for qp in qps]
+    cold = [SOLVERS["smalbe"].prepare(qp, TOL)() for qp in qps]
+
+    for qp, s in zip(qps, warm, strict=True):
+        assert kkt_residuals(qp, s).worst <= 10 * TOL
+    assert products(warm) <= 0.5 * products(cold)
+
+
+def test_a_sequence_with_one_equation_goes_on_with_the_spectrum_of_before():
+    """The arrays that are carried are as the compiled code needs them."""
+    qp = emitted("half-plane/law=cattaneo/Q=0.6/dual")
+    prepare = SOLVERS["smalbe"].chain(TOL)
+    first, again = prepare(qp)(), prepare(qp)()
+
+    assert qp.b.size == 1
+    assert again.counts["P_products"] < 0.5 * first.counts["P_products"]

@@ -1,0 +1,67 @@
+"""A block on an inclined plane, which friction alone keeps from sliding (CGS-4)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from harness import Case
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
+from problems.contact.friction import FrictionLaw
+from problems.contact.linearise import linearisation
+from problems.contact.results import quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.stepping import single_load
+from problems.fem.elasticity import Material
+from problems.fem.mesh import join, prefixed, rectangle
+from solvers.reference.solve import reference_solution
+
+WEIGHT = 1e5  #: G, N/m
+
+
+def incline(ratio: float, slope: float = 0.1) -> Bodies:
+    """Push a block of weight G up an incline by the horizontal force ratio·G.
+
+    Drawn with the incline along x; nothing but contact and friction holds the block.
+    """
+    mesh, body = join((
+        prefixed(rectangle((0.0, 0.0), (2.0, 0.5), (8, 2)), "base_"),
+        prefixed(rectangle((0.5, 0.5), (1.0, 0.5), (5, 2)), "block_"),
+    ))  # fmt: skip
+    sides = mesh.boundaries
+    cosine, sine = np.array([1.0, slope]) / np.hypot(1, slope)
+    along, onto = ratio * cosine - sine, cosine + ratio * sine
+    load = np.zeros((len(mesh.points), 2))
+    of_block = np.unique(mesh.cells[body == 1])
+    load[of_block] = np.array([along, -onto]) * WEIGHT / of_block.size
+    held = sides["base_bottom"]
+    return assemble(
+        mesh, body, names=("base", "block"),
+        materials=(Material(2e9, 0.3), Material(1e9, 0.3)), plane="strain",
+        units=(1.0, WEIGHT), fixed=np.concatenate([2 * held, 2 * held + 1]),
+        load=load.ravel(),
+        pairs=(ContactPair(sides["block_bottom"], sides["base_top"]),),
+    )  # fmt: skip
+
+
+def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
+    """Emit the QP of the block under a law of friction, in one form."""
+    bodies = incline(ratio)
+    linearise = linearisation(bodies, "mortar", "dual", (law,))
+    primal, friction = single_load(
+        bodies, linearise, (law,),
+        factorise=lambda: floating(bodies), reference=reference_solution,
+    )  # fmt: skip
+    return contact_case(
+        bodies, primal, form,
+        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies),
+        quantities=lambda s: quantities(bodies, primal, s, friction),
+        friction=friction,
+    )  # fmt: skip
