@@ -179,7 +179,7 @@ def sharp(cases: Sequence[str], count: int) -> None:
 
 
 def test_no_disturbed_solution_with_friction_is_further_off_than_its_bound():
-    sharp(list(CASES), 15)
+    sharp(list(CASES), 10)
 
 
 def test_nor_is_one_of_a_body_that_friction_alone_holds():
