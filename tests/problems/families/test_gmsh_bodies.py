@@ -580,7 +580,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
     described,
 ):
     law = 'friction = "coulomb"\nmu = 0.3\n'
-    same = "beam-ring/Nr=2/Nh=1/steps=2/friction=coulomb/mu=0.3/dual-bounds"
+    same = "beam-ring/Nr=2/Nh=1/steps=1/friction=coulomb/mu=0.3/dual-bounds"
     known = build(same).qp
     for toml, keys in (
         (TOML, "/friction=coulomb/mu=0.3"),
@@ -588,7 +588,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
         (TOML + law, ""),
         (TOML + law, "/friction=tresca/bound=1e3"),
     ):
-        qp = build(f"{described(toml=toml)}{keys}/dual-bounds").qp
+        qp = build(f"{described(toml=toml)}{keys}/steps=1/dual-bounds").qp
 
         assert qp.ub.size == 2 * (12 * NH + 1)
         assert sorted(qp.ub) == pytest.approx(sorted(known.ub), abs=1e-9)
