@@ -3,6 +3,7 @@
 import gc
 import os
 from collections.abc import Callable
+from contextlib import contextmanager
 
 import pytest
 
@@ -69,3 +70,20 @@ def how_processes_start(forks):
 def manufactured() -> Callable[..., tuple[QP, Solution]]:
     """Factory: ``manufactured(shape, seed=…, dense=False, n=20)``, as in `harness`."""
     return drawn
+
+
+@pytest.fixture(scope="module")
+def svg_only():
+    """Factory: a context in which reports have their figures as SVG alone.
+
+    That is what pages show; `reports/test_convergence.py` and
+    `reports/figures/test_pictures.py` have all formats.
+    """
+
+    @contextmanager
+    def context():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("reports.render.saving.ENDINGS", (".svg",))
+            yield
+
+    return context

@@ -358,7 +358,8 @@ def _connected(address: str, stack: ExitStack) -> Any:
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
                 memory_limit=0,  # the supervisor's business
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # any free port: several clusters
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
             return stack.enter_context(Client(stack.enter_context(cluster)))

@@ -140,6 +140,7 @@ def described_bodies(path: Path, plane: Any) -> Bodies:
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
+        _described_once(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
         units = _units(table.get("units", {}), named, load)
     body = np.repeat(
@@ -154,14 +155,27 @@ def described_bodies(path: Path, plane: Any) -> Bodies:
 
 
 def remarks(path: Path) -> tuple[str, ...]:
-    """Say which moduli of a description that can be read may be in another unit."""
+    """Say what of a description that can be read may be meant otherwise.
+
+    Moduli that may be in another unit, and contacts in two passes: each side is the
+    slave of the other one, and the force is shared among the rows of both.
+    """
     table = read_description(path)
-    return tuple(
+    soft = (
         f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
         f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
         for i, E in enumerate(body["E"] for body in table["bodies"])
         if E < SOFT
     )
+    sides = _sides(table["contacts"])
+    two_passes = (
+        f"{path}: contacts[{i}] is contacts[{sides.index((master, slave))}] "
+        "with slave and master exchanged: the force is shared among the two, "
+        "so that neither pressure is that between the bodies; leave one out to see it"
+        for i, (slave, master) in enumerate(sides)
+        if (master, slave) in sides[:i]
+    )
+    return (*soft, *two_passes)
 
 
 def _each(
@@ -278,6 +292,21 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
     if np.intersect1d(sides["slave"], sides["master"]).size:
         raise InputError("slave and master share nodes; expected sides that are apart")
     return ContactPair(**sides)
+
+
+def _sides(entries: list[dict[str, str]]) -> list[tuple[str, str]]:
+    """Return the names of slave and master of every contact."""
+    return [(entry["slave"], entry["master"]) for entry in entries]
+
+
+def _described_once(entries: list[dict[str, str]]) -> None:
+    sides = _sides(entries)
+    for i, (slave, master) in enumerate(sides):
+        if (first := sides.index((slave, master))) < i:
+            raise InputError(
+                f"contacts[{i}]: slave {slave!r} and master {master!r} are those of "
+                f"contacts[{first}]; expected every contact once"
+            )
 
 
 def _chain(where: str, edges: Nodes) -> Nodes:

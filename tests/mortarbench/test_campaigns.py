@@ -14,7 +14,8 @@ import mortarbench as mb
 from harness.files.reading import read_toml
 from harness.files.store import is_stored
 from harness.results.folder import environment_of
-from harness.results.journal import read_journal
+from harness.results.journal import Journal, read_journal
+from mortarbench import reporting
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from reports.data.evidence import read_evidence
@@ -32,12 +33,21 @@ def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
     )
 
 
-@pytest.fixture(autouse=True)
-def environment(monkeypatch):
-    """What runs find out of this machine, in no time; a test may say otherwise."""
+@pytest.fixture(scope="module", autouse=True)
+def _found():
+    """What runs find out of this machine, in no time."""
     here = {"machine": {"cpu": "one"}}
-    monkeypatch.setattr(Registries, "environment", lambda _: here)
-    return here
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Registries, "environment", lambda _: here)
+        yield here
+
+
+@pytest.fixture
+def environment(_found):
+    """The same, for a test that changes it."""
+    before = dict(_found["machine"])
+    yield _found
+    _found["machine"] = before
 
 
 @pytest.fixture
@@ -72,17 +82,30 @@ def stored(made, tmp_path):
 
 # growth
 
+GROWN = {
+    "solvers": '"exact", "lax", { name = "exact", label = "again" }',
+    "depths": "1, 2, 3", "tolerances": "[1e-6, 1e-4]", "repeats": 2,
+}  # fmt: skip
 
-def test_of_a_suite_that_grew_only_the_missing_is_measured(measure, tmp_path):
-    measure()
-    before = (tmp_path / "out/journal").glob("*.jsonl").__next__().read_bytes()
-    grown = {
-        "solvers": '"exact", "lax", "near"', "depths": "1, 2, 3",
-        "tolerances": "[1e-6, 1e-4]",
-    }  # fmt: skip
-    measure(**grown)
-    after = next((tmp_path / "out/journal").glob("*.jsonl")).read_bytes()
-    records = read_journal(tmp_path / "out")
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    """The folder `before`, and `grown`, a copy of it whose suite has grown."""
+    where = tmp_path_factory.mktemp("campaign")
+    for name, asked in (("before", {"repeats": 2}), ("grown", GROWN)):
+        (where / f"{name}.toml").write_text(suite(**asked))
+        mb.run(where / f"{name}.toml", out=where / name, plugins=[TOY_PROBLEM])
+        if name == "before":
+            shutil.copytree(where / name, where / "grown")
+    return where
+
+
+def test_of_a_suite_that_grew_only_the_missing_is_measured(campaign):
+    before, after = (
+        next((campaign / name / "journal").glob("*.jsonl")).read_bytes()
+        for name in ("before", "grown")
+    )
+    records = read_journal(campaign / "grown")
 
     assert after.startswith(before)  # not a byte of it was touched
     assert len(records) == len({r.run_id for r in records}) == 3 * 3 * 2 * 2
@@ -90,16 +113,15 @@ def test_of_a_suite_that_grew_only_the_missing_is_measured(measure, tmp_path):
     old = {(r.solver, r.case) for r in records if r.session == first}
     assert {s for s, _ in old} == {"exact", "lax"}
     assert sum(r.session == second for r in records) == 36 - 8
-    assert "depth = [1, 2, 3]" in (tmp_path / "out/suite.toml").read_text()
-    assert len(measure(**grown).records) == 36  # nothing is left
+    assert "depth = [1, 2, 3]" in (campaign / "grown/suite.toml").read_text()
+    again = mb.run(
+        campaign / "grown.toml", out=campaign / "grown", plugins=[TOY_PROBLEM]
+    )
+    assert len(again) == 36  # nothing is left
 
 
-def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(
-    measure, tmp_path
-):
-    measure()
-    measure(solvers='"exact", "lax", { name = "exact", label = "again" }')
-    evidence = read_evidence(tmp_path / "out")
+def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(campaign):
+    evidence = read_evidence(campaign / "grown")
     said = markdown(compose(evidence))
 
     assert "Measured in different sessions" in said
@@ -121,8 +143,10 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(
         ),
     ],
 )
-def test_what_would_mix_two_suites_is_refused(measure, tmp_path, change, said):
-    measure()
+def test_what_would_mix_two_suites_is_refused(
+    campaign, measure, tmp_path, change, said
+):
+    shutil.copytree(campaign / "before", tmp_path / "out")
     held = (tmp_path / "out/suite.toml").read_text()
     with pytest.raises(mb.InputError, match=said):
         measure(**change)
@@ -312,7 +336,12 @@ def cli(tmp_path, capsys, monkeypatch):
     return cli
 
 
-def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(cli, tmp_path):
+def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
+    cli, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        reporting, "report", lambda *_, **__: reporting.Report(files=())
+    )
     asked = ("run", "s.toml", "--plugin", TOY_PROBLEM, "--repeats", 1)
     (tmp_path / "s.toml").write_text(
         suite('"exact", "picky", "liar", "lost"', depths="2")
@@ -390,18 +419,41 @@ def test_folders_are_merged_from_the_command_line(cli, stored):
     assert "nowhere: no such folder; expected a result folder of `run`" in err
 
 
+def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
+    campaign, measure, tmp_path, monkeypatch
+):
+    """Before its fourth line is written."""
+    shutil.copytree(campaign / "before", tmp_path / "out")
+    append, left = Journal.append, iter(range(3))
+
+    def append_or_end(self, record):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        append(self, record)
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):
+        patch.setattr(Journal, "append", append_or_end)
+        measure(solvers='"exact", "lax", "near"')
+    check_growth(tmp_path / "out", 8, measure, solvers='"exact", "lax", "near"')
+
+
+@pytest.mark.slow
 def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
     """By SIGKILL, as it is about to write its fourth line."""
-    before = measure(depths="2", repeats=1).records
+    measure(depths="2", repeats=1)
     grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}
     (tmp_path / "grown.toml").write_text(suite(**grown))
     given = [tmp_path / "grown.toml", tmp_path / "out", 3, TOY_PROBLEM]
     program = [sys.executable, "-c", KILLED_RUN, *map(str, given)]
     assert subprocess.run(program, cwd=ROOT).returncode == -signal.SIGKILL
-    held = read_journal(tmp_path / "out")
-    assert len(held) == len(before) + 3
-    whole = measure(**grown).records
+    check_growth(tmp_path / "out", 2, measure, **grown)
 
+
+def check_growth(folder, before, measure, **grown):
+    """Hold three lines more than before, and after a second run all, once."""
+    held = read_journal(folder)
+    assert len(held) == before + 3
+    whole = measure(**grown).records
     assert len(whole) == len({r.run_id for r in whole}) == 3 * 2 * 2
     assert list(whole[: len(held)]) == held
 

@@ -142,7 +142,7 @@ def workflow():
 def test_the_workflow_for_ci_calls_commands_that_there_are():
     commands = [words[1:] for words in workflow() if words[0] == "mortarbench"]
 
-    assert [words[0] for words in commands] == ["test-solver", "run", "validate"]
+    assert [words[0] for words in commands] == ["test-solver", "run", "run", "report"]
     for words in commands:
         assert command_line_parser().parse_known_args(words)[1] == []
 
@@ -158,5 +158,7 @@ def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, cap
 
     for first, *words in workflow():
         if first == "mortarbench":
-            assert main(Registries(), words) == 0, (words, capsys.readouterr().err)
-    assert (tmp_path / "out/ci/report/index.html").is_file()
+            by_chance = words[0] == "report"  # slower, in 1 of 20 at most
+            allowed = {0, 1} if by_chance else {0}
+            assert main(Registries(), words) in allowed, (words, capsys.readouterr())
+    assert (tmp_path / "out/ci/new/report/against-base/index.html").is_file()

@@ -38,6 +38,13 @@ def results(tmp_path_factory):
     return mb.run(folder / "s.toml", out=folder / "out", plugins=[TOY_PROBLEM])
 
 
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """A run of two of our solvers on a case of ours."""
+    out = tmp_path_factory.mktemp("smoke")
+    return mb.run("smoke", out=out, cases=["*/dual"], solvers=["smalbe", "clarabel"])
+
+
 def test_every_name_that_is_promised_is_there():
     assert {name for name in mb.__all__ if not hasattr(mb, name)} == set()
     assert set(mb.__all__) <= set(dir(mb))
@@ -175,23 +182,24 @@ def test_progress_is_told_to_a_function(tmp_path, results):
     assert {event.done for event in told} == set(range(9))
 
 
-def test_a_report_names_its_page(results):
-    found = results.report(formats=["html", "md"])
+def test_a_report_names_its_page(results, svg_only):
+    with svg_only():
+        found = results.report(formats=["html", "md"])
+        compared = mb.report(results.folder, results.folder, formats=["md"])
 
     assert found.page == results.folder / "report/index.html"
     assert repr(found) == str(found.page)
     assert str(found.page) in found._repr_html_()
-    assert mb.report(results.folder, results.folder, formats=["md"]).said
+    assert compared.said
 
 
-def test_answers_of_a_folder_are_validated(tmp_path):
-    found = mb.run(
-        "smoke", out=tmp_path, cases=["*/dual"], solvers=["smalbe", "clarabel"]
-    ).validate(budget=0)
+def test_answers_of_a_folder_are_validated(smoke, svg_only):
+    with svg_only():
+        found = smoke.validate(budget=0)
 
     assert found.agreed
     assert found.data["counts"]["answers"] == 2
-    assert (tmp_path / "report/validation.html") in found.pages
+    assert (smoke.folder / "report/validation.html") in found.pages
     assert "smalbe" in repr(found)
     json.dumps(found.to_dict(), allow_nan=False)
 
@@ -346,18 +354,35 @@ def test_what_is_left_takes_as_long_as_what_was_measured(
     assert remaining(measured, to_do, seconds) == said
 
 
-def test_a_case_built_in_many_threads_is_the_one_that_was_measured(tmp_path):
-    """A program of the user's own, whose libraries use all cores."""
+def in_many_threads(program, folder):
+    """Run a program of the user's own, whose libraries use all cores; what it says."""
     many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "8")
+    return subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | many,
+        cwd=folder, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+
+
+def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
+    """A digest that differs would leave no answer to judge."""
+    program = (
+        "import mortarbench as mb\n"
+        "from mortarbench.registries import Registries\n"
+        "without_page = Registries(validation_page=lambda *_: [])\n"
+        "checked = mb.validate('.', budget=0, registries=without_page)\n"
+        "print(checked.data['counts']['answers'], checked.agreed)\n"
+    )
+
+    assert in_many_threads(program, smoke.folder).split() == ["2", "True"]
+
+
+@pytest.mark.slow
+def test_a_run_in_many_threads_measures_the_case_that_it_builds(tmp_path):
     program = (
         "import mortarbench as mb\n"
         "found = mb.run('smoke', out='o', cases=['*/dual'], solvers=['smalbe'])\n"
         "checked = found.validate(budget=0)\n"
         "print(checked.data['counts']['answers'], checked.agreed)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], env=os.environ | many,
-        cwd=tmp_path, capture_output=True, text=True, check=True,
-    )  # fmt: skip
 
-    assert done.stdout.split() == ["1", "True"]
+    assert in_many_threads(program, tmp_path).split() == ["1", "True"]

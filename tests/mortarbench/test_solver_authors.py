@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance.conformance import CHECKS, Grade, run_check
+from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
 from harness.registry import load_plugin
 from harness.results.journal import read_journal
 from harness.suite.suite import load_suite
@@ -164,13 +164,25 @@ def starting(capsys, monkeypatch, tmp_path):
 def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
     code, out, err = starting("new", "solver", "my-own")
     solver = load_plugin("my-own.py").solvers["my-own"]
-    results = {check: run_check(check, solver) for check in CHECKS}
+    strict = [check for check in CHECKS if not check.startswith(KEEPS)]
+    results = {check: run_check(check, solver) for check in strict}
 
     assert (code, out) == (0, "my-own.py\n")
     assert "mortarbench test-solver my-own --plugin my-own.py" in err
     assert conforms(results)
     assert {c for c, r in results.items() if r.grade is Grade.DECLINE} == {
         "takes or declines an operator", "solves a sequence"
+    }  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_new_solver_keeps_its_answer_in_every_equivalent_formulation(starting):
+    starting("new", "solver", "my-own")
+    solver = load_plugin("my-own.py").solvers["my-own"]
+    kept = [check for check in CHECKS if check.startswith(KEEPS)]
+
+    assert {run_check(check, solver).grade for check in kept} <= {
+        Grade.PASS, Grade.WEAK
     }  # fmt: skip
 
 

@@ -24,7 +24,9 @@ from harness.verify.verdicts import judged, new_record
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from problems import PROBLEMS
-from reports.validation.report import write_validation
+from reports.render.markdown import markdown
+from reports.render.writing import write_text
+from reports.validation.report import compose, write_validation
 from solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
 
@@ -78,6 +80,12 @@ def cli(capsys):
         return code, *capsys.readouterr()
 
     return cli
+
+
+def write_text_alone(directory, data, meshes=()):
+    """Write the page as Markdown; no figure is drawn."""
+    path = directory / "report" / "validation.md"
+    return [write_text(path, markdown(compose(data, meshes)))]
 
 
 def verdict_on(cli, folder, *more):
@@ -615,14 +623,15 @@ def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path,
 
 
 def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
-    truths, tmp_path, cli
+    truths, tmp_path, cli, svg_only
 ):
     _, s = truths[2, "primal"]
     name = "<b>evil</b>\x1b[31m\n|x"
     huge = replace(s, x=np.full_like(s.x, 1e300))
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
-    code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
+    with svg_only():
+        code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
 
     def refuse(constant):
         raise AssertionError(constant)
@@ -663,7 +672,7 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
     assert verdict["discretisation"][0]["error"] == found.error
     assert found.error * level.norm == pytest.approx(0.25 / np.sqrt(3))
     assert "obstacle/dim=1/n=12: " in cli(folder)[1]
-    cli(folder, validation_page=write_validation)
+    cli(folder, validation_page=write_text_alone)
     page = (folder / "report" / "validation.md").read_text()
     assert "Errors of the meshes" in page
     assert "obstacle/dim=1/n=12" in page.partition("Errors of the meshes")[2]
@@ -687,7 +696,7 @@ def test_errors_say_their_norm_and_nothing_is_said_of_a_smalbe_that_took_no_part
     for label, told in (("a", False), ("smalbe", True)):
         answers = [(k, f"{BEAM}/primal", truths[2, "primal"][1]) for k in (label, "b")]
         folder = write(tmp_path / label, answers)
-        _, out, _ = cli(folder, "--budget", "0", validation_page=write_validation)
+        _, out, _ = cli(folder, "--budget", "0", validation_page=write_text_alone)
         page = (folder / "report" / "validation.md").read_text()
 
         assert "Certified errors: relative, in the energy norm." in out

@@ -179,11 +179,11 @@ def sharp(cases: Sequence[str], count: int) -> None:
 
 
 def test_no_disturbed_solution_with_friction_is_further_off_than_its_bound():
-    sharp(list(CASES), 25)
+    sharp(list(CASES), 10)
 
 
 def test_nor_is_one_of_a_body_that_friction_alone_holds():
-    assert attacked(INCLINE, 40)[0] == []
+    assert attacked(INCLINE, 20)[0] == []
 
 
 @pytest.mark.slow

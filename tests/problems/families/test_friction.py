@@ -251,7 +251,9 @@ def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, told):
     assert "\n" not in str(e.value)
 
 
-@pytest.mark.parametrize("load", [(0.0, 1.0), (1.0, 1.0)])
+@pytest.mark.parametrize(
+    "load", [(0.0, 1.0), pytest.param((1.0, 1.0), marks=pytest.mark.slow)]
+)
 def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(load):
     """The tip of a slender beam against a wall across it: slip presses far more."""
     mesh = rectangle((0.0, 0.0), (4.0, 0.2), (20, 2))

@@ -329,6 +329,34 @@ def test_a_modulus_in_megapascals_is_remarked_upon_and_a_rubber_is_not(described
     assert build(f"{described(toml=TOML.replace('20e9', '1e6'))}/primal").remarks == ()
 
 
+PAIR = '[[contacts]]\nslave = "{}"\nmaster = "{}"\n'
+
+
+def test_two_passes_are_remarked_upon_and_share_the_force(described):
+    one = build(f"{described()}/step=1/dual-bounds")
+    two = build(
+        f"{described(toml=TOML + PAIR.format('bottom', 'outer'))}/step=1/dual-bounds"
+    )
+    forces = []
+    for case in (one, two):
+        contacts = case.quantities(reference_solution(case.qp))["contacts"]
+        forces.append(
+            sum(np.array(pair["force"]["ring"]) for pair in contacts.values())
+        )
+    (remark,) = two.remarks
+
+    assert one.remarks == ()
+    assert remark.startswith("a.toml: contacts[1] is contacts[0] with slave and master")
+    np.testing.assert_allclose(forces[1], forces[0], rtol=0.05, atol=0.05 * 1e8)
+
+
+def test_a_contact_that_is_described_twice_is_refused(described):
+    with pytest.raises(
+        InputError, match=r"contacts\[1\]: .* are those of contacts\[0\]"
+    ):
+        build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
+
+
 def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
     """Its top is on rollers; the factor of the singular K exists all the same."""
     there = ROOT / "suites" / "crossval"
@@ -552,7 +580,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
     described,
 ):
     law = 'friction = "coulomb"\nmu = 0.3\n'
-    same = "beam-ring/Nr=2/Nh=1/steps=2/friction=coulomb/mu=0.3/dual-bounds"
+    same = "beam-ring/Nr=2/Nh=1/steps=1/friction=coulomb/mu=0.3/dual-bounds"
     known = build(same).qp
     for toml, keys in (
         (TOML, "/friction=coulomb/mu=0.3"),
@@ -560,7 +588,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
         (TOML + law, ""),
         (TOML + law, "/friction=tresca/bound=1e3"),
     ):
-        qp = build(f"{described(toml=toml)}{keys}/dual-bounds").qp
+        qp = build(f"{described(toml=toml)}{keys}/steps=1/dual-bounds").qp
 
         assert qp.ub.size == 2 * (12 * NH + 1)
         assert sorted(qp.ub) == pytest.approx(sorted(known.ub), abs=1e-9)

@@ -1,5 +1,7 @@
 """GRECO's plate: published digits, and those of an independent prototype."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ PROTOTYPE = {
 }
 
 
+@cache
 def solved(n, form="dual-bounds", tol=1e-10, **given):
     case = FAMILY.build(form, FAMILY.complete({"n": n, **given}), reference_solution)
     s = SMALBE().prepare(case.qp, tol)()
@@ -67,7 +70,7 @@ def test_forces_are_in_equilibrium():
 def test_every_form_has_the_same_answer():
     energies = []
     for form in FAMILY.forms:
-        case = FAMILY.build(form, FAMILY.complete({"n": 6}), reference_solution)
+        case = FAMILY.build(form, FAMILY.complete({"n": 4}), reference_solution)
         s = reference_solution(case.qp)
         got = case.quantities(s)
         objective = case.scale * case.qp.objective(s.x) + case.constant
@@ -113,4 +116,4 @@ def test_values_out_of_range_are_refused(name, told):
 
 def test_an_iterate_beyond_the_last_is_refused():
     with pytest.raises(InputError, match="iterate=99: the fixed point of step 1 has"):
-        solved(4, iterate=99)
+        solved(2, iterate=99)

@@ -193,7 +193,12 @@ def sheared_result(form="dual", **given):
 
 @pytest.mark.parametrize(
     ("Q", "contact"),
-    [(0.25, "mortar"), (0.5, "nts"), (0.75, "mortar"), (0.9, "mortar")],
+    [
+        (0.25, "mortar"),
+        (0.5, "nts"),
+        (0.9, "mortar"),
+        pytest.param(0.75, "mortar", marks=pytest.mark.slow),
+    ],
 )
 def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
     """20 cells per a, a/R = 0.027; c from the second moment of the traction."""
@@ -209,7 +214,7 @@ def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
     assert got["friction_residual"] < 1e-8
 
 
-@pytest.mark.parametrize("Q", [0.2, -0.6])
+@pytest.mark.parametrize("Q", [0.2, pytest.param(-0.6, marks=pytest.mark.slow)])
 def test_unloading_lets_it_slip_back_from_the_edge(Q):
     got = sheared_result(Q=Q, peak=0.6)
 

@@ -56,10 +56,9 @@ def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
     assert exact_height(rim * (1 + h)) == pytest.approx(h**2, rel=1e-3)
 
 
-@pytest.mark.parametrize("dim", [1, 2])
-def test_the_exact_energy_is_that_of_the_exact_height(dim):
+@pytest.mark.parametrize(("dim", "n"), [(1, 2000), (2, 700)])
+def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
     """Midpoint rule for ½|∇u|² + 2u; |∇u| = 2(r − 1) or r − 1/r."""
-    n = 2000
     x = -1.5 + 3 * (np.arange(n) + 0.5) / n
     points = np.stack([a.ravel() for a in np.meshgrid(*[x] * dim)], axis=1)
     r = np.maximum(np.linalg.norm(points, axis=1), 1)
