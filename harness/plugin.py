@@ -85,6 +85,21 @@ class ContactSide:
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
     friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
+    #: (k, 3) of the exact solution, where it is known: distance along the side from its
+    #: middle, m, pressure and shear, Pa
+    exact: NDArray[Any] | None = None
+
+    def pressed(self, least: float) -> NDArray[Any]:
+        """Tell which nodes (s,) press on the other side.
+
+        Those whose force is more than `least`, N/m. With friction it is those that are
+        not open: Tresca's law lets friction act on open nodes, too.
+        """
+        told: NDArray[Any] = (
+            (self.force**2).sum(axis=1) > least**2
+            if self.friction is None else self.friction != "open"
+        )  # fmt: skip
+        return told
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

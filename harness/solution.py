@@ -8,6 +8,8 @@ may fill some of them:
 * ``free_gradient``, ``chopped_gradient``: ‖φ‖ and ‖β‖, so that the projected gradient
   has the norm √(‖φ‖² + ‖β‖²)
 * ``infeasibility``: ‖Ax − b‖, relative; ``active``: number of active bounds
+* ``two_sided``: number of active bounds of components between two bounds; in a dual
+  with friction the rows that slip, while those between their bounds stick
 * ``cost``: value of the objective or the Lagrangian; ``seconds``: since prepare began
 
 All of it is the solver's own word; no verdict rests on it.

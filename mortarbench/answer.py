@@ -102,6 +102,8 @@ class Answer:
     def plot(self, path: str | Path | None = None, *, scale: float = 1.0) -> Figure:
         """Draw the deformed bodies with their stresses, and each contact enlarged.
 
+        Of half planes, which have no ends, the tractions between them.
+
         path : of a file to write, too: .png, .pdf or .svg
         scale : of the displacement, as drawn
 
@@ -112,9 +114,16 @@ class Answer:
 
         """
         from reports.figures.deformed import deformed_figure
+        from reports.figures.tractions import traction_figure
         from reports.render.saving import draw, save
 
-        figure = deformed_figure(self.fields(), drawn_scale(scale))
+        fields, drawn = self.fields(), drawn_scale(scale)
+        figure = (
+            deformed_figure(fields, drawn)
+            if len(fields.cells) else traction_figure(fields)
+        )  # fmt: skip
+        if figure is None:
+            raise InputError("no bodies and no tractions: there is no picture")
         if path is not None:
             save(figure, writable(Path(path), PICTURES))
         return draw(figure)
@@ -132,6 +141,8 @@ class Answer:
         from reports.export.vtu import write_series, write_vtu
 
         path, fields = writable(Path(path), GRIDS), self.fields()
+        if not len(fields.cells):
+            raise InputError(f"{path}: {self.case.name} has no bodies to write")
         if path.suffix == ".vtu":
             write_vtu(fields, path)
             return path

@@ -36,7 +36,7 @@ _OF_A_CONTACT = {
 
 _HEADS = {
     "free_gradient": "‖φ‖", "chopped_gradient": "‖β‖", "infeasibility": "‖Ax−b‖",
-    "active": "at bound", "cost": "own cost",
+    "active": "at bound", "two_sided": "of two", "cost": "own cost",
 }  # fmt: skip
 _LEGEND = {
     "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
@@ -46,6 +46,8 @@ _LEGEND = {
     "chopped_gradient": "‖β‖: chopped gradient, of those that should leave theirs",
     "infeasibility": "‖Ax−b‖: how far the equality rows are from holding, relative",
     "active": "at bound: variables that meet one",
+    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
+    "slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }

@@ -8,11 +8,13 @@ and tractions in Pa, forces in N per m of thickness.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
+from scipy.sparse import vstack
 
-from harness import Case, InputError, Solution
+from harness import QP, Case, InputError, Reference, Solution
 from problems.contact.balance import check_balance
 from problems.contact.bodies import (
     Bodies,
@@ -22,10 +24,11 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
+from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import FORMS, contact_case
-from problems.duality.stepping import primal_qp
+from problems.duality.stepping import single_load
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import (
@@ -37,11 +40,20 @@ from problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from problems.ranges import at_least, at_most, one_of, positive
+from problems.ranges import (
+    LAWS,
+    NEEDED,
+    at_least,
+    at_most,
+    one_of,
+    physical,
+    positive,
+)
 
 __all__ = [
     "Bodies",
     "ContactPair",
+    "FrictionLaw",
     "Material",
     "Mesh",
     "NamedMesh",
@@ -67,6 +79,8 @@ def one_step(
     *,
     contact: Literal["nts", "mortar"] = "mortar",
     basis: Literal["dual", "standard"] = "dual",
+    friction: FrictionLaw | None = None,
+    reference: Reference | None = None,
 ) -> Case:
     """Emit the QP of bodies under their full load, contact linearised where they lie.
 
@@ -75,25 +89,61 @@ def one_step(
     form : "primal", "dual" or, where supports alone hold every body, "dual-bounds"
     contact : node to segment, or mortar
     basis : of the multipliers of mortar contact
+    friction : between the sides of every pair: FrictionLaw("tresca", bound=1e6), in Pa,
+        or FrictionLaw("coulomb", mu=0.3), the last of its fixed point
+    reference : what `Family.build` is given; Coulomb's law needs its solutions
 
     Raises
     ------
     InputError
-        When the form is none of these, no slave node faces its master, or nothing
-        balances the load of some body.
+        When the form is none of these, no slave node faces its master, nothing balances
+        the load of some body, the law of friction is unknown or its value negative, or
+        the fixed point does not settle.
 
     """
     if form not in FORMS:
         raise InputError(f"form {form!r}; expected one of {', '.join(FORMS)}")
-    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
-    check_balance(bodies, rows.B)
-    primal = primal_qp(bodies, rows)
+    law = FrictionLaw() if friction is None else _checked(friction, reference)
+    laws = (law,) * len(bodies.pairs)
+    linearise = linearisation(bodies, contact, basis, laws)
+    rows = linearise(np.zeros(bodies.mesh.dofs))
+    check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))  # it may hold either way
+    factorised = cache(lambda: floating(bodies))
+    if reference is None:
+        reference = _no_reference
+    primal, tangential = single_load(
+        bodies, linearise, laws, factorise=factorised, reference=reference
+    )
 
     def results(s: Solution) -> Mapping[str, Any]:
-        return quantities(bodies, primal, s)
+        return quantities(bodies, primal, s, tangential)
 
     return contact_case(
         bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies), quantities=results,
+        floating=factorised, clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies), quantities=results, friction=tangential,
     )  # fmt: skip
+
+
+def _checked(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
+    """Raise InputError for a law that is none, or that lacks what it needs."""
+    if law.kind not in LAWS:
+        raise InputError(
+            f"friction {law.kind!r} is unknown; expected one of {', '.join(LAWS)}"
+        )
+    if key := LAWS[law.kind]:
+        value = physical(f"friction {law.kind}: {key}", getattr(law, key))
+        if value < 0:
+            raise InputError(
+                f"friction {law.kind}: {key} = {value:g}; expected {NEEDED[key]}"
+            )
+    if law.mu and reference is None:
+        raise InputError(
+            "friction coulomb needs solutions; expected reference=, as build is given"
+        )
+    return law
+
+
+def _no_reference(qp: QP) -> Solution:
+    """Stand for the reference solve where nothing is to be solved."""
+    raise AssertionError("no reference solve was given")

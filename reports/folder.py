@@ -26,7 +26,7 @@ from reports.sections.answer import answer_statements
 from reports.sections.cases import cases
 from reports.sections.convergence import convergence
 from reports.sections.performance import profiles
-from reports.sections.physics import agreement, deformed, physics
+from reports.sections.physics import agreement, deformed, physics, tractions
 from reports.sections.ranking import left_out, means, ranking
 from reports.sections.results import claim_counts, claims, errors, iterations
 from reports.sections.scaling import growth, scaling
@@ -68,6 +68,7 @@ _SCALING = (
 _GROWTH = "Do iterations grow?: cases of four sizes or more are needed."
 _PHYSICS = "Physical results: no verified answer has physical quantities."
 _DEFORMED = "Deformed bodies: no verified answer has bodies to draw."
+_TRACTIONS = "Tractions along the contact: no verified answer has a contact side."
 
 
 def write_report(
@@ -169,6 +170,7 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         (growth(found), _GROWTH),
         (physics(evidence), _PHYSICS),
         (deformed(evidence), _DEFORMED),
+        (tractions(evidence), _TRACTIONS),
         (environment(evidence), ""),
         (definitions(evidence.factor), ""),
     )

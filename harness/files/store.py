@@ -31,7 +31,7 @@ _OPTIONAL = ("contact_nodes", "contact_forces")
 _NODAL = "nodal_"
 _SIDE = "side_{}_"  #: of the contact of that number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
-_ROUGH = ("shear", "friction")  #: of contacts with friction
+_SOME = ("shear", "friction", "exact")  #: with friction; of exact solutions
 _HISTORY = "history_"
 
 
@@ -79,7 +79,7 @@ def field_arrays(fields: Fields) -> Arrays:
     for i, side in enumerate(fields.contacts):
         arrays |= {
             _SIDE.format(i) + name: getattr(side, name)
-            for name in ("name", *_ALONG, *_ROUGH)
+            for name in ("name", *_ALONG, *_SOME)
         }
     return {k: np.asarray(v) for k, v in arrays.items() if v is not None}
 
@@ -109,7 +109,7 @@ def _sides(arrays: Arrays) -> Iterator[ContactSide]:
         yield ContactSide(
             name=str(side["name"]),
             **{name: side[name] for name in _ALONG},
-            **{name: side[name] for name in _ROUGH if name in side},
+            **{name: side[name] for name in _SOME if name in side},
         )
 
 

@@ -87,15 +87,15 @@ def pair_results(
         force = {slave: total.tolist()}
         if pair.master.size:
             force = {master: (0.0 - total).tolist()} | force
-        size = np.hypot(*side.force.T)
-        loaded = size > ACTIVE * size.max(initial=0.0)
+        largest = float(np.hypot(*side.force.T).max(initial=0.0))
+        pressed = side.pressed(ACTIVE * largest)
         found[side.name] = {
             "force": force,
             "largest_pressure": float(side.pressure.max()),
             "smallest_gap": (
                 None if np.isnan(side.gap).all() else float(np.nanmin(side.gap))
             ),
-            "half_width": float(side.length[loaded].sum() / 2),
+            "half_width": float(side.length[pressed].sum() / 2),
         }
     return found
 

@@ -28,12 +28,12 @@ def contact_sides(
 ) -> tuple[ContactSide, ...]:
     """Evaluate every pair along its slave side; SI units.
 
-    The force on a node is that of contact and friction. The pressure is its normal part
-    over the length of the undeformed side that belongs to the node, ∫N_j ds; the normal
-    is that of the deformed side. The gap is the slack of the node's row, c − Bu: with
-    mortar contact the mean of the gap around the node, weighted as its row is. Where
-    there is friction, the shear is along the tangent (−n_y, n_x), and a node is open,
-    sticks or slips.
+    The force on a node is that of contact and friction. The pressure is the normal part
+    of that of the contact, over the length of the undeformed side that belongs to the
+    node, ∫N_j ds; the normal is that of the deformed side. The gap is the slack of the
+    node's row, c − Bu: with mortar contact the mean of the gap around the node,
+    weighted as its row is. Where there is friction, the shear is that of its force
+    along the tangent (−n_y, n_x), and a node is open, sticks or slips.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
@@ -43,13 +43,16 @@ def contact_sides(
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)
+        pressing = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)[pair.slave]
         rough = (friction.row >= rows.start) & (friction.row < rows.stop)
+        rubbing = np.zeros_like(pressing)
         if rough.any():
-            force -= as_vectors(friction.T[rough].T @ tangential[rough]) * F
+            rubbing -= (
+                as_vectors(friction.T[rough].T @ tangential[rough])[pair.slave] * F
+            )
         side = current_polyline(points, u, pair.slave, "slave")
         length = nodal_lengths(points[pair.slave])
-        normal = np.einsum("sx,sx->s", force[pair.slave], side.node_normal)
+        normal = np.einsum("sx,sx->s", pressing, side.node_normal)
         gap = np.full(len(pair.slave), np.nan)
         place = slave_places(B[rows], pair.slave)
         gap[place] = slack[rows]
@@ -59,8 +62,8 @@ def contact_sides(
         found.append(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
-                force=force[pair.slave], pressure=(0.0 - normal) / length, gap=gap,
-                shear=np.einsum("sx,sx->s", force[pair.slave], t) / length
+                force=pressing + rubbing, pressure=(0.0 - normal) / length, gap=gap,
+                shear=np.einsum("sx,sx->s", rubbing, t) / length
                 if rough.any() else None,
                 friction=told if rough.any() else None,
             )

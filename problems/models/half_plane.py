@@ -29,15 +29,27 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 
-from harness import QP, Case, Matrix, Solution, Value, Vector, no_rows
+from harness import (
+    QP,
+    Case,
+    ContactSide,
+    Fields,
+    Matrix,
+    Solution,
+    Value,
+    Vector,
+    no_rows,
+)
 from problems.contact.sides import ACTIVE
-from problems.models.hertz import MATERIAL, RADIUS, UNIT_LOAD
+from problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
 from problems.models.line_contact import LineContact, TangentialContact
 
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: P, N/m
+SIDE = "half plane on half plane"
 REACH = 1.5  #: half width of what may touch, in a, of law=hertz
 
 #: two cylinders of the radius and the material of the families of Hertz
@@ -117,7 +129,18 @@ def _pressed(n: int) -> Case:
             "half_width_error": float(half_width / EXACT.a - 1),
         }
 
-    return _case(qp, EXACT.P, quantities)
+    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
+    exact = np.column_stack([curve, EXACT.pressure(curve), np.zeros(CURVE)])
+
+    def fields(s: Solution) -> Fields:
+        p = s.x * EXACT.P / width
+        gap = -s.z_box * _length_unit(EXACT.P)
+        return _surface(x, ContactSide(
+            name=SIDE, nodes=np.arange(n), length=np.full(n, width),
+            force=np.outer(p * width, (0.0, 1.0)), pressure=p, gap=gap, exact=exact,
+        ))  # fmt: skip
+
+    return _case(qp, EXACT.P, quantities, fields)
 
 
 def _sheared(n: int, exact: TangentialContact) -> Case:
@@ -146,7 +169,7 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
         c = exact.stick_half_width(moment, EXACT.P * EXACT.a**2 / 4)
         next_to = slice((n - 1) // 2, n // 2 + 1)
         centre, at_centre = (float(v[next_to].mean()) for v in (q, mindlin))
-        slips = np.abs(s.x) >= bound * (1 - ACTIVE)
+        slips = slipping(s)
         energy = 0.5 * s.x @ (F @ s.x) - exact.Q * (moved_before - s.y[0])
         return {
             "elements": n,
@@ -166,7 +189,21 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
             "stick_half_width_error": c / exact.c - 1,
         }
 
-    return _case(qp, F0, quantities)
+    def slipping(s: Solution) -> NDArray[np.bool_]:
+        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE))
+
+    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
+    tractions = np.column_stack([curve, EXACT.pressure(curve), -exact.traction(curve)])
+
+    def fields(s: Solution) -> Fields:
+        p, q = bound * EXACT.P / width, s.x * F0 / width
+        return _surface(x, ContactSide(
+            name=SIDE, nodes=np.arange(n), length=np.full(n, width),
+            force=width * np.column_stack([-q, p]), pressure=p, gap=np.zeros(n),
+            shear=-q, friction=np.where(slipping(s), "slip", "stick"), exact=tractions,
+        ))  # fmt: skip
+
+    return _case(qp, F0, quantities, fields)
 
 
 def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
@@ -198,16 +235,33 @@ def _dual(F: Matrix, gap: Vector, force: float, lower: Vector, upper: Vector) ->
 
 
 def _case(
-    qp: QP, force: float, quantities: Callable[[Solution], Mapping[str, Any]]
+    qp: QP,
+    force: float,
+    quantities: Callable[[Solution], Mapping[str, Any]],
+    fields: Callable[[Solution], Fields],
 ) -> Case:
     length = _length_unit(force)
     return Case(
         qp=qp,
         recover=lambda s: (qp.P @ s.x) * length,
         quantities=quantities,
+        fields=fields,
         scale=-force * length,
         matrices={"F": qp.P, "d": -qp.q, "R": np.ones((qp.q.size, 1))},
     )
+
+
+def _surface(x: Vector, side: ContactSide) -> Fields:
+    """Give tractions at the midpoints x (n,), m; half planes have no outlines.
+
+    They are those on the upper surface, which Q pushes along +x.
+    """
+    n = x.size
+    return Fields(
+        points=np.column_stack([x, np.zeros(n)]), displacement=np.zeros((n, 2)),
+        cells=np.zeros((0, 4), dtype=np.int64), bodies=np.zeros(0, dtype=np.int64),
+        contact_nodes=side.nodes, contact_forces=side.force, contacts=(side,),
+    )  # fmt: skip
 
 
 def _length_unit(force: float) -> float:

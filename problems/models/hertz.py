@@ -34,14 +34,15 @@ Their load is therefore smaller unless it is set.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, eye_array
 
-from harness import QP, Case, Friction, Reference, Solution, Value, Vector
+from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -68,6 +69,7 @@ UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
 GROWTH = 1.15  #: of neighbouring cells away from the contact
 UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
+CURVE = 601  #: points of exact tractions in pictures, over that part
 
 
 def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
@@ -104,20 +106,23 @@ def cylinder_on_cylinder(
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
     primal, friction = problem.primal, problem.friction
 
+    shear = _exact_shear(exact, params) if p["peak"] else None
+
     def results(s: Solution) -> dict[str, Any]:
         found = quantities(bodies, primal, s, friction)
         found |= pressure_quantities(bodies, primal, exact, s)
-        if p["peak"]:
-            found |= shear_quantities(bodies, primal, exact, s, friction, params)
+        if shear is not None:
+            found |= shear_quantities(bodies, primal, exact, s, friction, params, shear)
         if p["friction"] == "coulomb":
             found["tresca_problems"] = path.iterates(1)
         return found
 
-    return contact_case(
+    case = contact_case(
         bodies, primal, form,
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
     )  # fmt: skip
+    return _beside(case, exact, shear) if shear is not None else case
 
 
 def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
@@ -146,8 +151,8 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     load = pressed(mesh, sides["upper_flat"], exact.P)
     if p["peak"]:
         load += pressed(mesh, flat, -exact.P)
-        centre = flat[flat.size // 2]
-        fixed = np.array([2 * centre, 2 * centre + 1, 2 * flat[0] + 1])
+        axis = _on_axis(mesh, "lower_")  # supports that bend no symmetry
+        fixed = np.append(2 * axis, 2 * flat[flat.size // 2] + 1)
     else:
         fixed = np.concatenate([
             2 * _on_axis(mesh, "upper_"), 2 * _on_axis(mesh, "lower_"), 2 * flat + 1
@@ -159,6 +164,18 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
                else ContactPair(lower, upper),),
     )  # fmt: skip
     return bodies, exact
+
+
+def kept_on_axis(bodies: Bodies) -> Bodies:
+    """Add supports u_x = 0 on the axis of the upper one, which P does not load.
+
+    Two cylinders without friction roll on each other almost freely: nothing but the
+    polygons that their arcs are resists. The slip of the next step would begin there,
+    and Q would do work on it.
+    """
+    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh, "upper_"))
+    rows = eye_array(bodies.mesh.dofs, format="csr")[held]
+    return replace(bodies, B_D=csr_array(rows))
 
 
 def sheared(mesh: Mesh) -> Vector:
@@ -182,8 +199,9 @@ def _friction_path(
     law, mesh = law_of(p), bodies.mesh
     linearise = linearisation(bodies, p["contact"], p["basis"], (law,))
     rows = linearise(np.zeros(mesh.dofs))
+    guided = kept_on_axis(bodies)
     path = LoadPath(
-        bodies, lambda u: rows, floating(bodies), reference, steps=1,
+        bodies, lambda u: rows, floating(guided), reference, steps=1,
         transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
     )  # fmt: skip
     if not p["peak"]:
@@ -197,7 +215,7 @@ def _friction_path(
     else:
         loads = [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
     part = loads[0][0]  # of P in the step before, whose normal forces grow with P
-    pressing = replace(bodies, f=part * bodies.f)
+    pressing = replace(guided, f=part * bodies.f)
     smooth = linearisation(bodies, p["contact"], p["basis"])
     u, pressed = replace(path, bodies=pressing, linearise=smooth, laws=()).state(1)
     if static or together:
@@ -285,6 +303,7 @@ def shear_quantities(
     s: Solution,
     friction: Friction,
     params: Mapping[str, Value],
+    shear: Callable[[Vector], Vector],
 ) -> dict[str, Any]:
     """Compare the shear traction on the slave side with the exact one.
 
@@ -303,12 +322,7 @@ def shear_quantities(
     force = (friction.T.T @ tangential)[2 * slave] * (1.0 if upper else -1.0)
     mindlin = TangentialContact(exact, p["mu"], p["Q"], p["peak"])
     Q = p["Q"] * p["mu"] * exact.P
-    together = p["programme"] == "proportional" and p["loading"] == "quasi-static"
-    if together:
-        expected, centre = exact.pressure(x) * Q / exact.P, exact.p0 * Q / exact.P
-    else:
-        expected = mindlin.traction(x)
-        centre = float(mindlin.traction(np.zeros(1))[0])
+    expected, centre = shear(x), float(shear(np.zeros(1))[0])
     q = force / width
     at_centre = float(np.interp(0.0, np.sort(x), q[np.argsort(x)]))
     found = {
@@ -322,7 +336,7 @@ def shear_quantities(
             np.sqrt(width @ (q - expected) ** 2 / (width @ expected**2))
         ),
     }
-    if together:
+    if _without_slip(params):
         return found
     c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
     return found | {
@@ -330,15 +344,53 @@ def shear_quantities(
     }  # fmt: skip
 
 
+def _without_slip(params: Mapping[str, Value]) -> bool:
+    """Whether P and Q come in steps that are in proportion."""
+    together = params["programme"] == "proportional"
+    return together and params["loading"] == "quasi-static"
+
+
+def _exact_shear(
+    exact: LineContact, params: Mapping[str, Value]
+) -> Callable[[Vector], Vector]:
+    """Return the exact shear traction on the lower cylinder, Pa, as a function of x."""
+    p: Any = params
+    if _without_slip(params):
+        return lambda x: exact.pressure(x) * (p["Q"] * p["mu"])
+    return TangentialContact(exact, p["mu"], p["Q"], p["peak"]).traction
+
+
+def _beside(
+    case: Case, exact: LineContact, shear: Callable[[Vector], Vector] = np.zeros_like
+) -> Case:
+    """Give the contact in pictures its exact tractions, those on the slave side.
+
+    Its tangent (−n_y, n_x) is along x on the upper cylinder, whose traction is −q, and
+    against it on the lower one: either way the shear is −q.
+    """
+    assert case.fields is not None
+    solved = case.fields
+    x = exact.a * np.linspace(-UNIFORM, UNIFORM, CURVE)
+    curve = np.column_stack([x, exact.pressure(x), -shear(x)])
+
+    def fields(s: Solution) -> Fields:
+        found = solved(s)
+        (side,) = found.contacts
+        return replace(found, contacts=(replace(side, exact=curve),))
+
+    return replace(case, fields=fields)
+
+
 def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> Case:
     primal = primal_qp(bodies, rows)
-    return contact_case(
+    case = contact_case(
         bodies, primal, form,
         floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
     )  # fmt: skip
+    return _beside(case, exact)
 
 
 def _on_axis(mesh: Mesh, prefix: str = "") -> Nodes:

@@ -70,6 +70,11 @@ class SolverRun:
         """(rows,) number of active bounds."""
         return self._numbers("active")
 
+    @cached_property
+    def two_sided(self) -> Vector | None:
+        """(rows,) number of active bounds of components between two: rows that slip."""
+        return self._numbers("two_sided")
+
     def steps(self, kind: str) -> NDArray[np.bool_]:
         """(rows,) whether a step was of that kind."""
         kinds = self.history.get("step", np.full(self.rows, ""))

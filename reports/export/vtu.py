@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from harness import ContactSide, Fields, InputError, Vector
 from harness.files.durable import replacing
 
-IN_CONTACT = 1e-6  #: a node is in contact where its force exceeds this · the largest
+#: a node is in contact where its force exceeds this · the largest; of pairs with
+#: friction, where it is not open
+IN_CONTACT = 1e-6
 STATES = ("open", "stick", "slip")  #: of friction, as VTU files number them
 
 
@@ -41,8 +43,7 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     forces = np.zeros_like(fields.displacement, dtype=float)
     if fields.contact_nodes is not None and fields.contact_forces is not None:
         forces[fields.contact_nodes] = fields.contact_forces
-    sizes = np.linalg.norm(forces, axis=1)
-    touching = sizes > IN_CONTACT * sizes.max(initial=0.0)
+    touching = _in_contact(fields, forces)
     cells, bodies = np.asarray(fields.cells), np.asarray(fields.bodies).astype(np.int32)
     triangle = cells[:, 2] == cells[:, 3]
     blocks = [
@@ -67,6 +68,18 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
     return [path, *(_write_side(fields, side, path) for side in fields.contacts)]
+
+
+def _in_contact(fields: Fields, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which nodes (N,) are pressed; forces: on the nodes, (N, 2)."""
+    sizes = np.linalg.norm(forces, axis=1)
+    least = IN_CONTACT * float(sizes.max(initial=0.0))
+    if not fields.contacts:
+        return np.asarray(sizes > least)
+    touching = np.zeros(len(sizes), dtype=np.bool_)
+    for side in fields.contacts:
+        touching[side.nodes] |= side.pressed(least)
+    return touching
 
 
 def _along_sides(fields: Fields) -> dict[str, Vector]:

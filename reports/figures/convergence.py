@@ -75,20 +75,32 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
 
 
 def active_set_figure(c: CaseHistories) -> Figure | None:
-    """Draw the number of active bounds over the work; None if nobody counts them."""
+    """Draw the number of active bounds over the work; None if nobody counts them.
+
+    Below them those of components between two bounds, where there are some.
+    """
     counts = [(one, n) for one in c.runs if (n := one.active) is not None]
     if not counts:
         return None
+    slipping = [(one, n) for one in c.runs if (n := one.two_sided) is not None]
+    rows = [Row(panels=(_counts(c, counts, "active bounds"),), height=2.2)]
+    if slipping:
+        panel = _counts(c, slipping, "of two bounds")
+        rows.append(Row(panels=(panel,), height=1.6))
+    return _figure(c, rows, [run for run, _ in counts])
+
+
+def _counts(c: CaseHistories, counts: Curves, label: str) -> Panel:
+    """Draw numbers of components over the work, as steps."""
     most = max(*(float(np.nanmax(n)) for _, n in counts), 1.0)
-    panel = Panel(
+    return Panel(
         x=_work(c),
-        y=Axis(label="active bounds", low=0, high=1.06 * most, most=6, integers=True),
+        y=Axis(label=label, low=0, high=1.06 * most, most=6, integers=True),
         marks=tuple(
             replace(_line(c, run, c.work(run), active), step=True)
             for run, active in counts
         ),
     )
-    return _figure(c, [Row(panels=(panel,), height=2.2)], [run for run, _ in counts])
 
 
 def marked(c: CaseHistories) -> list[str]:

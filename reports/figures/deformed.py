@@ -31,7 +31,7 @@ _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the 
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
 #: arrows of nodes by what friction does; of pairs without it they are dark
-_FRICTION = {"stick": ("#0b5fa5", "blue"), "slip": ("#b3261e", "red")}
+FRICTION = {"stick": ("#0b5fa5", "blue"), "slip": ("#b3261e", "red")}
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
 _FLAT = 0.34  #: height over width of the enlargement
@@ -141,7 +141,7 @@ def _scale(fields: Fields) -> ColourScale | None:
     if limits is None:
         return None
     clipped, largest = limits
-    factor, prefix = _prefixed(clipped)
+    factor, prefix = prefixed(clipped)
     return ColourScale(
         colours="viridis", low=0, high=clipped or 1.0, unit=factor,
         label=f"von Mises stress in {prefix}Pa",
@@ -149,7 +149,7 @@ def _scale(fields: Fields) -> ColourScale | None:
     )  # fmt: skip
 
 
-def _prefixed(value: float) -> tuple[float, str]:
+def prefixed(value: float) -> tuple[float, str]:
     """Choose the unit prefix in which `value` is between 1 and 1000."""
     known = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in known if value >= p[0]), (1.0, ""))
@@ -219,9 +219,14 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return loops
 
 
+def length_unit(span: float) -> tuple[float, str]:
+    """Choose m, mm or µm for a length in m: its size, m, and its name."""
+    return next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
+
+
 def _axes(span: float) -> dict[str, Any]:
     """Choose m, mm or µm for the axes of bodies of this size."""
-    unit, name = next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
+    unit, name = length_unit(span)
     return {"xlabel": f"$x$ in {name}", "ylabel": f"$y$ in {name}", "unit": unit}
 
 
@@ -267,17 +272,17 @@ def _enlarged(
         Vectors(
             feet=(tips - drawn)[of], vectors=drawn[of],
             width=0.0032 if len(tips) < 25 else 0.002, cased=True,
-            colour=_FRICTION[state][0] if state in _FRICTION else _ARROW,
+            colour=FRICTION[state][0] if state in FRICTION else _ARROW,
         )
         for state in np.unique(contact.friction)
         if (of := contact.friction == state).any()
     ]  # fmt: skip
     counts = [
         f"{state}: {name} ({int((contact.friction == state).sum())})"
-        for state, (_, name) in _FRICTION.items()
+        for state, (_, name) in FRICTION.items()
     ]
     key = f"\n{', '.join(counts)}" if contact.friction.any() else ""
-    factor, prefix = _prefixed(largest)
+    factor, prefix = prefixed(largest)
     return FieldPanel(
         low=_pair(low), high=_pair(high), marks=(*bodies, *arrows), axes="frame",
         title=f"{title}contact forces on the slave nodes; the largest is "

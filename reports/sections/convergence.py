@@ -62,7 +62,15 @@ def _pictures(c: CaseHistories, i: int) -> list[Picture]:
         name = f"convergence-{i}"
         pictures.append(Picture(name=name, caption=caption, figure=figure))
     if figure := active_set_figure(c):
-        caption = f"Active bounds on {where}, over {over}.{ticks} Runs {runs}."
+        slipping = (
+            " Below, those of variables between two bounds: in a dual with friction "
+            "the rows that slip."
+            if any(run.two_sided is not None for run in c.runs)
+            else ""
+        )
+        caption = (
+            f"Active bounds on {where}, over {over}.{slipping}{ticks} Runs {runs}."
+        )
         pictures.append(Picture(name=f"active-set-{i}", caption=caption, figure=figure))
     return pictures
 

@@ -22,6 +22,7 @@ from reports.data.quantities import (
 from reports.document.formatting import clean, plural, power, significant, tolerance
 from reports.document.layout import Cell, Picture, Section, Table, name_cell
 from reports.figures.deformed import PERCENTILE, SCALE, clipped_at, deformed_figure
+from reports.figures.tractions import traction_figure
 
 
 def agreement(evidence: Evidence) -> Section | None:
@@ -174,6 +175,8 @@ def deformed(evidence: Evidence) -> Section | None:
     chosen = max(drawable, key=_importance)
     try:
         fields = load_fields(evidence.directory, chosen.first.fields or "")
+        if not len(fields.cells):  # half planes only
+            return None
         figure = deformed_figure(fields)
     except InputError as e:  # the journal alone must do
         missing = str(e).removeprefix(f"{evidence.directory}{os.sep}")
@@ -183,6 +186,51 @@ def deformed(evidence: Evidence) -> Section | None:
         name="deformed", caption=_deformed_caption(chosen, fields), figure=figure
     )
     return Section(name="deformed", title="Deformed bodies", pictures=(picture,))
+
+
+def tractions(evidence: Evidence) -> Section | None:
+    """Draw tractions along contacts; None where no deformed state holds any.
+
+    Of each family the largest verified case.
+    """
+    largest: dict[str, Outcome] = {}
+    for o in evidence.flat:
+        if o.verified and o.first.fields:
+            family = o.first.family
+            largest[family] = max(o, largest.get(family, o), key=_importance)
+    pictures = []
+    for family, chosen in largest.items():
+        try:
+            fields = load_fields(evidence.directory, chosen.first.fields or "")
+        except InputError:  # `deformed` says so
+            continue
+        if (figure := traction_figure(fields)) is not None:
+            pictures.append(
+                Picture(
+                    name=f"tractions-{family}",
+                    caption=_traction_caption(chosen, fields),
+                    figure=figure,
+                )
+            )
+    if not pictures:
+        return None
+    return Section(
+        name="tractions", title="Tractions along the contact", pictures=tuple(pictures)
+    )
+
+
+def _traction_caption(outcome: Outcome, fields: Fields) -> str:
+    sides = fields.contacts
+    rough = any(side.friction is not None for side in sides)
+    known = any(side.exact is not None for side in sides)
+    return (
+        f"{clean(outcome.case)}, the largest verified case of its family, as answered "
+        f"by {clean(outcome.solver, 40)} at tol {tolerance(outcome.tol)} (run "
+        f"{clean(outcome.run_ids[0], 40)}): pressure"
+        + (" and shear traction, along the tangent (-n_y, n_x)," if rough else "")
+        + " at the slave nodes, by the distance along the side from its middle."
+        + (" Lines: the exact solution." if known else "")
+    )
 
 
 def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:

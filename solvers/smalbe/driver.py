@@ -352,6 +352,7 @@ COLUMNS = (
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
     "active",  # components on their bounds
+    "two_sided",  # of them, those between two bounds; left out where there are none
     "cost",  # the augmented Lagrangian
     "seconds",  # since prepare began
 )
@@ -368,6 +369,9 @@ class History:
         """Make the observer of one inner run, whose right-hand side is `rhs`."""
         C, x_tilde = problem.rows.C, problem.rows.x_tilde
         size = float(np.linalg.norm(x_tilde))
+        lower, upper = problem.bounds
+        between = np.isfinite(lower) & np.isfinite(upper) & (lower < upper)
+        boxes = bool(between.any())
 
         def note(letter: str, at: Point, face: Face) -> None:
             error = np.linalg.norm(C @ at.x) if len(C) else 0.0
@@ -376,6 +380,7 @@ class History:
                 np.linalg.norm(face.phi), np.linalg.norm(face.beta),
                 error / (size or np.linalg.norm(at.x) or 1.0),
                 face.free.size - np.count_nonzero(face.free),
+                np.count_nonzero(between & ~face.free) if boxes else None,
                 0.5 * at.x @ (at.g - rhs), perf_counter() - self.began,
             ))  # fmt: skip
 
@@ -385,4 +390,8 @@ class History:
     def columns(self) -> dict[str, NDArray[Any]]:
         """The rows as arrays of one length."""
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(COLUMNS)
-        return {k: np.array(v) for k, v in zip(COLUMNS, columns, strict=True)}
+        return {
+            k: np.array(v)
+            for k, v in zip(COLUMNS, columns, strict=True)
+            if k != "two_sided" or any(count is not None for count in v)
+        }

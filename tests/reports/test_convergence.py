@@ -162,6 +162,15 @@ def test_the_active_set_is_drawn_as_steps_over_products(folder):
     assert line.get_drawstyle() == "steps-post"
 
 
+def test_rows_that_slip_are_drawn_below_the_active_set(folder):
+    rough = KNOWN | {"outer": [1] * 4, "two_sided": [0, 1, 3, 2]}
+    figure = convergence.active_set_figure(comparison(folder(("a", rough, {}))))
+    above, below = figure.panels
+
+    assert below.marks[0].y == (0, 1, 3, 2)
+    assert (above.y.label, below.y.label) == ("active bounds", "of two bounds")
+
+
 def test_one_solver_that_does_not_count_products_puts_all_on_iterations(folder):
     bare = {name: KNOWN[name] for name in ("free_gradient", "chopped_gradient")}
     out = folder(("a", KNOWN, {}), ("b", bare, {}))

@@ -268,6 +268,17 @@ def test_the_tangential_force_turns_no_body():
     assert abs(reference_solution(case.qp).x[:3]).max() < 1e-3  # turned contact normals
 
 
+@pytest.mark.parametrize("given", [dict(), dict(contact="nts"), dict(slave="lower")])
+def test_the_slip_begins_where_symmetry_puts_the_cylinders(given):
+    """Without friction they would roll on each other under P, however far."""
+    given |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
+    case = CYLINDER.build("dual", CYLINDER.complete(given), reference_solution)
+    friction = case.mechanics.friction
+    begins = friction.start[friction.bound > 0]
+
+    assert abs(begins.mean()) < 1e-3 * np.ptp(begins)
+
+
 def test_friction_holds_equal_cylinders_together_without_a_force():
     """None is needed: they deform alike, and the pressure is Hertz's."""
     given = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)

@@ -157,8 +157,26 @@ def test_of_friction_grid_and_table_tell_shear_and_what_sticks(tmp_path):
     assert data["friction"][SIDE.nodes].tolist() == [2, 1, 0]
     assert table.friction.tolist() == rough.friction.tolist()
     assert table.shear_Pa.tolist() == rough.shear.tolist()
+    assert data["in_contact"][SIDE.nodes].tolist() == [1, 1, 0]
     write_vtu(replace(FIELDS, contacts=(SIDE,)), tmp_path / "b.vtu")
     assert "friction" not in meshio.read(tmp_path / "b.vtu").point_data
+
+
+def test_friction_on_open_nodes_is_no_contact(tmp_path):
+    family = PROBLEMS["beam-ring"]
+    params = family.complete(dict(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8))
+    case = family.build("dual-bounds", params, reference_solution)
+    s = reference_solution(case.qp)
+    write_vtu(case.fields(s), tmp_path / "a.vtu")
+    data = meshio.read(tmp_path / "a.vtu").point_data
+    found = case.quantities(s)
+    pressed = data["in_contact"] == 1
+
+    assert pressed.sum() == found["active"] == (data["friction"] > 0).sum()
+    assert np.linalg.norm(data["contact_force"], axis=1)[~pressed].max() > 1e4
+    (side,) = case.fields(s).contacts
+    half = side.length[side.friction != "open"].sum() / 2
+    assert found["contacts"]["ring on beam"]["half_width"] == half
 
 
 @pytest.fixture

@@ -103,6 +103,20 @@ def test_bounds_that_close_and_open_again_are_followed():
         assert s.x == pytest.approx(reference_solution(qp).x, abs=1e-5 * abs(s.x).max())
 
 
+def test_the_history_ends_with_the_rows_that_slip():
+    """Where a variable has two bounds; elsewhere it has no such column."""
+    qp = emitted("greco/n=16/dual-bounds")
+    solver = replace(SOLVERS["smalbe"], history=True)
+    s = solver.prepare(qp, TOL)()
+    two = np.isfinite(qp.ub) & (qp.lb < qp.ub)
+    at_bound = np.minimum(s.x - qp.lb, qp.ub - s.x) == 0
+
+    assert s.history["two_sided"][-1] == (two & at_bound).sum() > 0
+    assert s.history["active"][-1] == at_bound.sum()
+    smooth = replace(qp, ub=np.full(qp.ub.size, np.inf))
+    assert "two_sided" not in solver.prepare(smooth, TOL)().history
+
+
 def fixed_point(qp, mu, solve, enough):
     """Solve Coulomb's law on a dual with bounds only; all solutions in turn."""
     m = qp.q.size // 2

@@ -1,0 +1,117 @@
+"""Pressure and shear traction along contact sides, beside the exact ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from harness import ContactSide, Fields, Vector
+from reports.document.figure import (
+    INK,
+    Axis,
+    Figure,
+    Key,
+    Look,
+    Panel,
+    Row,
+    Series,
+    numbers,
+)
+from reports.figures.deformed import FRICTION, length_unit, prefixed
+from reports.figures.style import below, legible
+
+SHOWN = 1e-6  #: tractions below this times the largest pressure are not looked for
+BESIDE = 0.15  #: of the loaded part, shown on either side of it
+_EXACT = Look(colour=INK, width=0.9)
+_NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)
+#: of nodes by what friction does; of pairs without it all are as open ones
+LOOKS = {"open": _NODE} | {
+    state: replace(_NODE, colour=colour, marker=marker)
+    for (state, (colour, _)), marker in zip(FRICTION.items(), "so", strict=True)
+}
+
+
+def traction_figure(fields: Fields) -> Figure | None:
+    """Draw each contact that carries load, a row of panels; None where there is none.
+
+    Places are distances along the undeformed slave side from its middle.
+    """
+    rows, states, exact = list[Row](), set[str](), False
+    for side in fields.contacts:
+        if not side.pressure.max(initial=0.0) > 0:
+            continue
+        rows.append(Row(panels=_panels(fields, side)))
+        states |= set(np.unique(_states(side)).tolist())
+        exact |= side.exact is not None
+    if not rows:
+        return None
+    rough = any(side.friction is not None for side in fields.contacts)
+    keys = [
+        Key(label=state if rough else "nodes", look=style)
+        for state, style in LOOKS.items()
+        if state in states
+    ]
+    keys += [Key(label="exact", look=_EXACT)] * exact
+    return Figure(
+        rows=tuple(rows), height=2.5 * len(rows) + 0.5, legend=below(keys, len(keys))
+    )
+
+
+def places(fields: Fields, side: ContactSide) -> Vector:
+    """Measure each node (s,) along the undeformed side from its middle, m."""
+    steps = np.linalg.norm(np.diff(fields.points[side.nodes], axis=0), axis=1)
+    along = np.append(0.0, np.cumsum(steps))
+    return np.asarray(along - along[-1] / 2)
+
+
+def _states(side: ContactSide) -> Vector:
+    if side.friction is None:
+        return np.full(side.nodes.size, "open")
+    return np.asarray(side.friction)
+
+
+def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
+    """Draw the pressure and, with friction, the shear over the part that is loaded."""
+    along = places(fields, side)
+    tractions = {"pressure": side.pressure}
+    if side.shear is not None:
+        tractions["shear"] = side.shear
+    largest = float(side.pressure.max())
+    loaded = np.any([abs(v) > SHOWN * largest for v in tractions.values()], axis=0)
+    low, high = along[loaded].min(), along[loaded].max()
+    beyond = BESIDE * (high - low) or float(side.length.max())
+    low, high = low - beyond, high + beyond
+    size, unit = length_unit(high - low)
+    axis = Axis(
+        label=f"along the side in {unit}",
+        low=float(low / size),
+        high=float(high / size),
+    )
+    name, seen = legible(side.name), (low <= along) & (along <= high)
+    panels = []
+    for column, (kind, values) in enumerate(tractions.items(), 1):
+        factor, prefix = prefixed(float(abs(values).max()))
+        marks = []
+        if side.exact is not None:
+            kept = (low <= side.exact[:, 0]) & (side.exact[:, 0] <= high)
+            x, y = side.exact[kept][:, [0, column]].T
+            marks.append(
+                Series(x=numbers(x / size), y=numbers(y / factor), look=_EXACT)
+            )
+        for state, style in LOOKS.items():
+            of = seen & (_states(side) == state)
+            if of.any():
+                marks.append(
+                    Series(
+                        x=numbers(along[of] / size), y=numbers(values[of] / factor),
+                        look=style,
+                    )
+                )  # fmt: skip
+        panels.append(
+            Panel(
+                x=axis, y=Axis(label=f"{kind} in {prefix}Pa"), marks=tuple(marks),
+                title=name if column == 1 else "",
+            )
+        )  # fmt: skip
+    return tuple(panels)

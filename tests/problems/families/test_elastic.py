@@ -1,0 +1,70 @@
+"""Friction of families of one's own: the same as that of the family that has keys."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from harness import InputError
+from problems import PROBLEMS
+from problems.elastic import FrictionLaw, one_step
+from problems.models.patch import model
+from solvers.reference.solve import reference_solution
+
+PATCH = PROBLEMS["contact-patch"]
+STRETCHED = dict(lower=3, upper=2, ratio=3.0)
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize(
+    ("law", "keys"),
+    [(FrictionLaw("tresca", bound=1e5), dict(friction="tresca", bound=1e5)),
+     (FrictionLaw("coulomb", mu=0.1), dict(friction="coulomb", mu=0.1)),
+     (None, {})],
+)  # fmt: skip
+def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
+    params = PATCH.complete(STRETCHED | keys)
+    case = PATCH.build(form, params, reference_solution)
+    own = one_step(model(params), form, friction=law, reference=reference_solution)
+
+    for name in ("P", "q", "G", "h", "A", "b"):
+        first, second = (getattr(c.qp, name) for c in (case, own))
+        assert abs(first - second).max() == 0 if first.shape[0] else True
+    np.testing.assert_array_equal(case.qp.lb, own.qp.lb)
+    np.testing.assert_array_equal(case.qp.ub, own.qp.ub)
+    s = reference_solution(own.qp)
+    found = own.quantities(s)
+    assert ("slip" in found) == (law is not None)
+    assert found["energy"] == case.quantities(s)["energy"]
+
+
+@pytest.mark.parametrize(
+    ("law", "told"),
+    [(FrictionLaw("oily"), "friction 'oily' is unknown; expected one of none, tresca"),
+     (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
+     (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
+     (FrictionLaw("coulomb", mu=0.3), "expected reference=")],
+)  # fmt: skip
+def test_laws_that_are_none_are_refused_in_one_line(law, told):
+    with pytest.raises(InputError) as e:
+        one_step(model(PATCH.complete({})), "dual", friction=law)
+
+    assert told in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_friction_may_hold_a_load_along_the_side():
+    """Without it nothing balances the shear of the upper block."""
+    bodies = model(PATCH.complete(STRETCHED))
+    upper = bodies.body_of_node == 1
+    free = ~np.isin(bodies.B_D.indices, 2 * np.flatnonzero(upper))
+    push = np.zeros(bodies.f.size)
+    push[2 * np.flatnonzero(upper)] = 0.01 / upper.sum()
+    pushed = replace(bodies, B_D=bodies.B_D[free], f=bodies.f + push)
+
+    with pytest.raises(InputError, match="upper"):
+        one_step(pushed, "dual")
+    law = FrictionLaw("tresca", bound=1e5)
+    case = one_step(pushed, "dual", friction=law)
+    found = case.quantities(reference_solution(case.qp))
+    assert found["contact_force"][0] == pytest.approx(0.01e6, rel=1e-6)
