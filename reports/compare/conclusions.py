@@ -41,6 +41,23 @@ def verdict_lines(c: Comparison) -> list[str]:
     return lines + [f"  {point}" for point in named(c)]
 
 
+def headline(c: Comparison) -> str:
+    """Say how the comparison ended in whole sentences, beside a table of ratios."""
+    if not c.pairs:
+        return _nothing(c)
+    said = (
+        _same(c),
+        _slower(c),
+        _shared(c),
+        _counted_verdicts(c),
+        _counted_others(c),
+        _environments(c),
+        _residuals(c),
+        _busy(c),
+    )
+    return " ".join(filter(None, said))
+
+
 def dates(c: Comparison) -> str:
     """Say when and on which machine, which is named once if it is the same."""
     (then, there), (now, here) = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from reports.compare.changes import Comparison, Pair, mean_ratio, side
-from reports.compare.conclusions import change_word, ratio_text, verdict_lines
+from reports.compare.conclusions import change_word, headline, ratio_text
 from reports.data.cells import case_cells, source
 from reports.data.environment import dateline
 from reports.data.evidence import Outcome
@@ -36,8 +36,7 @@ def _summary(found: Sequence[Comparison], first: str, names: Sequence[str]) -> S
         name="summary",
         title=f"What changed since {first}",
         points=tuple(
-            f"{name}: {' '.join(line.strip() for line in verdict_lines(c))}"
-            for name, c in zip(names, found, strict=True)
+            f"{name}: {headline(c)}" for name, c in zip(names, found, strict=True)
         ),
         tables=(
             Table(

@@ -394,7 +394,11 @@ def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
     assert code == 1
     assert out.splitlines()[-1] == "failed on worse"
     assert "c/report/since-a/report.md" in out
-    assert "| new |" in (tmp_path / "c/report/since-a/report.md").read_text()
+    page = (tmp_path / "c/report/since-a/report.md").read_text()
+    assert "| new |" in page
+    points = [line for line in page.splitlines() if line.startswith("- ")]
+    assert [point[:4] for point in points] == ["- b:", "- c:"]
+    assert all(point.endswith(".") for point in points)  # whole sentences
     assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
 
 
