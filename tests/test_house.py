@@ -66,7 +66,6 @@ def test_one_thing_is_done_in_one_place(name, homes):
 COLLECTIONS = {
     "solvers/adapters": "a library each",
     "problems/families": "a family each",
-    "mortarbench/cli": "a command each",
 }
 
 

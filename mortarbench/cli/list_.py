@@ -1,27 +1,148 @@
-"""The command `list`: solvers, problems and suites that there are."""
+"""The command `list`: what there is, and docs/solvers.md of a registry."""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 from argparse import Namespace
+from collections.abc import Iterator, Mapping
+from functools import cache
+from textwrap import dedent
+from typing import TYPE_CHECKING
 
 from harness.errors import InputError
+from harness.registry import options_of
+from mortarbench import listing
 from mortarbench.registries import Registries
+
+if TYPE_CHECKING:
+    from harness.plugin import Solver
+
+HEAD = """\
+# Solvers
+
+Written by `make docs` from the adapters in `solvers/`; change those, not this file.
+
+Every solver is asked for the same thing: `tol`, the relative KKT accuracy of the
+non-dimensional QP. How each one maps that to its own stopping test is said below. What
+it then claims is recorded beside our own verdict and never believed.
+
+`mortarbench test-solver NAME` runs the conformance suite on any of them, and on one of
+your own with `--plugin FILE.py`. A solver whose library is missing declines, and names
+the command that installs it; `make setup` installs all of them (the extra `fleet`).
+
+Whether units, order, scaled or repeated rows, an offset or a mirror change what each
+answers is measured in [weaknesses.md](weaknesses.md).
+"""
 
 
 def run(registries: Registries, options: Namespace) -> int:
     """List what there is, one line each or as one JSON array."""
-    from mortarbench.listing import problems, solvers, suites
-
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
             raise InputError("--markdown is for list solvers only")
-        from mortarbench.cli.solvers_page import solvers_page
-
         print(solvers_page(registries.solvers), end="")
         return 0
-    found = {"problems": problems, "solvers": solvers, "suites": suites}
+    found = {
+        "problems": listing.problems,
+        "solvers": listing.solvers,
+        "suites": listing.suites,
+    }
     rows = found[options.what](registries=registries)
     print(json.dumps(list(rows)) if options.json else rows)
     return 0
+
+
+def solvers_page(solvers: Mapping[str, Solver]) -> str:
+    """Describe the solvers of a registry in Markdown, one section per class."""
+    groups: dict[type, list[str]] = {}
+    for name, solver in solvers.items():
+        groups.setdefault(type(solver), []).append(name)
+    parts = [HEAD, *_overview(solvers)]
+    for kind, names in groups.items():
+        parts.append(_section(kind, names, solvers))
+    return "\n".join(parts)
+
+
+def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
+    yield "| name | library | method | licence | sequences |"
+    yield "| --- | --- | --- | --- | --- |"
+    for name, solver in solvers.items():
+        facts = listing.about(solver)
+        cells = (
+            [facts.title, facts.method, facts.licence] if facts else ["ours", "", ""]
+        )
+        chains = "yes" if hasattr(solver, "chain") else "no"
+        yield f"| `{name}` | {' | '.join(cells)} | {chains} |"
+    yield ""
+
+
+def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str:
+    facts = listing.about(solvers[names[0]])
+    title = facts.title if facts else kind.__name__
+    lines = [f"## {title}", "", *_docstring(kind)]
+    if facts:
+        rows = {
+            "Install": f"`pip install {facts.package}`" if facts.package else "",
+            "Method": facts.method,
+            "Licence": facts.licence,
+            "Linear solver": facts.linear_solver,
+            "Phases": facts.phases,
+            "Sequences": facts.sequence,
+        }
+        lines += [f"- {key}: {value}." for key, value in rows.items() if value]
+        if facts.limits:
+            lines += ["", "Known limits:", "", *(f"- {x}" for x in facts.limits)]
+        lines.append("")
+    lines += _options(kind, names, solvers)
+    return "\n".join(lines)
+
+
+def _docstring(kind: type) -> list[str]:
+    """Give the paragraphs of a class's docstring, indented blocks as code."""
+    return [dedent(inspect.getdoc(kind) or ""), ""]
+
+
+def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
+    """Tabulate the options: a column of values per name in the registry."""
+    columns = {name: options_of(solvers[name]) for name in names}
+    options = list(columns[names[0]])
+    if not options:
+        return []
+    meanings = _meanings(kind)
+    heads = [f"`{name}`" for name in names]
+    lines = [
+        f"| option | {' | '.join(heads)} | |",
+        f"| --- |{' --- |' * (len(names) + 1)}",
+    ]
+    for option in options:
+        values = " | ".join(f"{columns[name][option]!r}" for name in names)
+        lines.append(f"| `{option}` | {values} | {meanings.get(option, '')} |")
+    return [*lines, ""]
+
+
+def _meanings(kind: type) -> dict[str, str]:
+    """Read the `#:` comments behind the fields of a dataclass and of its bases."""
+    known: dict[str, str] = {}
+    for base in kind.__mro__:
+        known = {**_own_meanings(base), **known}
+    return known
+
+
+@cache
+def _own_meanings(kind: type) -> dict[str, str]:
+    try:
+        source = dedent(inspect.getsource(kind))
+    except (OSError, TypeError):  # not from a file
+        return {}
+    lines = source.splitlines()
+    (body,) = ast.parse(source).body
+    return {
+        node.target.id: lines[node.end_lineno - 1].partition("#:")[2].strip()
+        for node in getattr(body, "body", ())
+        if isinstance(node, ast.AnnAssign)
+        and isinstance(node.target, ast.Name)
+        and node.end_lineno is not None
+    }

@@ -61,7 +61,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
     if argv[:1] in (["worker"], ["generator"]):  # how runs start their processes
-        from mortarbench.cli import processes
+        from mortarbench import processes
 
         start = processes.worker if argv[0] == "worker" else processes.case_worker
         return start(registries, argv[1:])

@@ -9,9 +9,9 @@ import yaml
 from harness import InputError, kkt_residuals
 from harness.registry import load_plugin
 from mortarbench.case import build
+from mortarbench.cli.list_ import solvers_page
 from mortarbench.cli.main import _parser as command_line_parser
 from mortarbench.cli.main import main
-from mortarbench.cli.solvers_page import solvers_page
 from mortarbench.listing import about
 from mortarbench.registries import Registries
 from problems import elastic

@@ -34,7 +34,7 @@ LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIM
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 
 #: what is loaded for plug-ins, which start as ``python -P FILE``
-PLUGINS = ("mortarbench.cli.main", "mortarbench.cli.processes")
+PLUGINS = ("mortarbench.cli.main", "mortarbench.processes")
 #: what is loaded for ``python -P -m mortarbench``, whose solvers and cases are ours
 OURS = (
     *PLUGINS, "solvers.smalbe.solver", "problems.fem.kernels", "sksparse.cholmod",
