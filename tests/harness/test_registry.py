@@ -34,7 +34,7 @@ class Method:
         return None
 
     def prepare(self, qp, tol):
-        raise NotImplementedError
+        raise AssertionError("it is only named, never run")
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ from dataclasses import dataclass
 class Mine:
     tries: int = 3
     def declines(self, qp): return None
-    def prepare(self, qp, tol): raise NotImplementedError
+    def prepare(self, qp, tol): raise AssertionError("it is only named, never run")
 
 SOLVERS = {"mine": Mine(), "mine-9": Mine(9)}
 """
@@ -295,7 +295,7 @@ class Mine:
         from late import WHY
         import tools.speed as speed
         return f"{WHY} {helper.VERSION} {FAST} {speed.FAST}"
-    def prepare(self, qp, tol): raise NotImplementedError
+    def prepare(self, qp, tol): raise AssertionError("it is only named, never run")
 
 SOLVERS = {"mine": Mine()}
 """

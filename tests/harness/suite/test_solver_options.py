@@ -36,7 +36,7 @@ class Method:
         return None
 
     def prepare(self, qp, tol):
-        raise NotImplementedError
+        raise AssertionError("it is only named, never run")
 
 
 @dataclass(frozen=True)
