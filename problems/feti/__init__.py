@@ -1,0 +1,1 @@
+"""Total FETI: bodies torn into subdomains, glued by multipliers."""
