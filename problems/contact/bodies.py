@@ -97,7 +97,12 @@ class Bodies:
     @property
     def D(self) -> NDArray[np.float64]:
         """Elasticity matrix of each cell, (E, 3, 3), Pa."""
-        return _elasticity_matrices(self.materials, self.plane)[self.body]
+        return self.elasticity[self.body]
+
+    @property
+    def elasticity(self) -> NDArray[np.float64]:
+        """Elasticity matrix of each body, (bodies, 3, 3), Pa."""
+        return _elasticity_matrices(self.materials, self.plane)
 
 
 def assemble(
