@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from problems.fem.mesh import Nodes
 
@@ -51,14 +50,6 @@ class Decomposition:
     def subdomain(self) -> NDArray[np.int64]:
         """Subdomain of each torn node, (M,)."""
         return np.repeat(np.arange(self.kind.size), np.diff(self.start))
-
-    @property
-    def incidence(self) -> csr_array:
-        """One unit entry per torn node (row) at the node that it is a copy of, M × n."""
-        M = self.node.size
-        return csr_array(
-            (np.ones(M), self.node, np.arange(M + 1)), shape=(M, self.nodes)
-        )
 
 
 def blocks(divisions: tuple[int, ...], most: int) -> NDArray[np.int64]:
