@@ -119,23 +119,13 @@ def subdomains(torn: Torn) -> Subdomains:
 def kernel(torn: Torn) -> csr_array:
     """Return R = diag(R_1 … R_S) (N, Σr)."""
     modes = np.array([kind.R.shape[1] for kind in torn.kinds])[torn.kind]
-    first = np.cumsum(modes) - modes
-    rows, columns, entries = [], [], []
-    domains = subdomains(torn)
-    for kind, members, place in zip(
-        torn.kinds, domains.members, domains.places(), strict=True
-    ):
-        column = first[members, None] + np.arange(kind.R.shape[1])
-        where = np.broadcast_arrays(place[..., None], column, kind.R[:, None])
-        for found, part in zip((rows, columns, entries), where, strict=True):
-            found.append(part.ravel())
-    return csr_array(
-        (
-            np.concatenate(entries),
-            (np.concatenate(rows), np.concatenate(columns)),
-        ),
-        shape=(torn.start[-1], modes.sum()),
-    )
+    sizes = np.diff(torn.start)
+    entries = np.concatenate([torn.kinds[k].R.ravel() for k in torn.kind])
+    per_row = np.repeat(modes, sizes)
+    ends = np.concatenate([[0], np.cumsum(per_row)])
+    along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
+    columns = np.repeat(np.cumsum(modes) - modes, sizes * modes) + along
+    return csr_array((entries, columns, ends), shape=(sizes.sum(), modes.sum()))
 
 
 def _symmetric(M: Dense) -> Dense:

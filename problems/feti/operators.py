@@ -1,4 +1,4 @@
-"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners, as plain arrays.
+"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners; plain arrays.
 
 Only components that rows touch matter: with B_b the columns of B there and all of them
 packed group by group, a product is sparse, dense, sparse:
@@ -15,13 +15,13 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999)
     B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
 
 with D = K_bb (lumped) or S_bb = K_bb − K_bi K_ii⁻¹K_ib (Dirichlet), and the weights
-W = 1 (multiplicity) or 1/diag(K) (stiffness). Redundant rows make B W Bᵀ singular; which
-generalised inverse is taken changes λ by what Bᵀ does not feel.
+W = 1 (multiplicity) or 1/diag(K) (stiffness). Redundant rows make B W Bᵀ singular:
+which generalised inverse is taken changes λ by what Bᵀ does not feel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
@@ -32,12 +32,12 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
 from sksparse.cholmod import cholesky
 
-from harness import Matrix, Vector
-from harness.operators import Arrays, Maker, Product, SerialisableOperator
+from harness import Vector
+from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
 from problems.feti.local import Dense, Local, Subdomains, eliminated
 
-NAME = "tfeti"  #: of the maker
+NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 #: of the diagonal of B W Bᵀ, added where rows are redundant
 SHIFT = 1e-8
@@ -157,9 +157,7 @@ class DualOperator:
             raise ValueError(f"preconditioner {kind!r}; known: {', '.join(BLOCKS)}")
         if scaling not in WEIGHTS:
             raise ValueError(f"scaling {scaling!r}; known: {', '.join(WEIGHTS)}")
-        touching = packed(
-            self.B, self.domains, groups_by_touch(self.B, self.domains)
-        )
+        touching = packed(self.B, self.domains, groups_by_touch(self.B, self.domains))
         blocks = BLOCKS[kind](self.domains.kinds, touching.groups)
         weights = WEIGHTS[scaling](self.domains.kinds, touching.groups)
         return _scaled(touching, blocks, weights)
@@ -201,7 +199,9 @@ def _dirichlet(kinds: Sequence[Local], groups: Sequence[Group]) -> list[Any]:
     for g in groups:
         union[g.kind] = np.union1d(union.get(g.kind, g.touched), g.touched)
     schur = {k: kinds[k].schur(b) for k, b in union.items()}
-    return [eliminated(schur[g.kind], np.isin(union[g.kind], g.touched)) for g in groups]
+    return [
+        eliminated(schur[g.kind], np.isin(union[g.kind], g.touched)) for g in groups
+    ]
 
 
 def _ones(kinds: Sequence[Local], groups: Sequence[Group]) -> Vector:
@@ -210,9 +210,9 @@ def _ones(kinds: Sequence[Local], groups: Sequence[Group]) -> Vector:
 
 def _softness(kinds: Sequence[Local], groups: Sequence[Group]) -> Vector:
     diagonals = [kinds[g.kind].K.diagonal()[g.touched] for g in groups]
-    return 1 / np.concatenate([
-        np.repeat(d, g.members.size) for d, g in zip(diagonals, groups, strict=True)
-    ])
+    return 1 / np.concatenate(
+        [np.repeat(d, g.members.size) for d, g in zip(diagonals, groups, strict=True)]
+    )
 
 
 BLOCKS = MappingProxyType({"lumped": _lumped, "dirichlet": _dirichlet})
@@ -225,7 +225,7 @@ def _scaled(touching: Packed, blocks: Sequence[Any], weights: Vector) -> Product
     WB, solve = csr_array(BW.T), _gram_inverse(csr_array(BW @ touching.BT))
 
     def product(x: Dense) -> Dense:
-        return solve(BW @ touching.multiplied(blocks, WB @ solve(x)))
+        return solve(np.asarray(BW @ touching.multiplied(blocks, WB @ solve(x))))
 
     return product
 
@@ -238,14 +238,14 @@ def _gram_inverse(gram: csr_array) -> Product:
     couples = (rows != gram.indices) & (np.abs(gram.data) > 1e-12 * size)
     coupled = np.unique(rows[couples])
     if not coupled.size:
-        return lambda x: (x.T / diagonal).T
+        return lambda x: np.asarray((x.T / diagonal).T)
     block = csc_array(gram[coupled][:, coupled])
     factor = cholesky(
         csc_matrix(block + diags_array(SHIFT * diagonal[coupled], format="csc"))
     )
 
     def solve(x: Dense) -> Dense:
-        y = (x.T / diagonal).T
+        y = np.asarray((x.T / diagonal).T)
         y[coupled] = factor(x[coupled])
         return y
 
@@ -268,7 +268,7 @@ def dual_operator(B: csr_array, domains: Subdomains) -> SerialisableOperator:
         "kind": domains.kind,
         "explicit": _explicit(B, domains),
     }
-    return SerialisableOperator(B.shape[0], NAME, arrays, MAKERS)
+    return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
 
 
 def _explicit(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
@@ -276,11 +276,13 @@ def _explicit(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
     found = np.zeros(len(domains.kinds), dtype=bool)
     groups = sorted(groups_by_kind(B, domains), key=lambda g: g.touched.size)
     mib = np.cumsum([8 * g.touched.size**2 / 2**20 for g in groups])
-    found[[g.kind for g in groups[: np.searchsorted(mib, EXPLICIT_MIB, "right")]]] = True
+    found[[g.kind for g in groups[: np.searchsorted(mib, EXPLICIT_MIB, "right")]]] = (
+        True
+    )
     return found
 
 
-def _made(arrays: Arrays) -> DualOperator:
+def made(arrays: Arrays) -> DualOperator:
     """Put F together from the arrays of `dual_operator`."""
     sizes, kind = arrays["sizes"], arrays["kind"]
     ends, fixed = np.cumsum(sizes), np.cumsum(arrays["fixings"])
@@ -293,10 +295,7 @@ def _made(arrays: Arrays) -> DualOperator:
         K = csc_array(parts, shape=(n, n))
         at = slice(last - p, last)
         kinds.append(Local(K, arrays["fixing"][at], arrays["star"][at]))
-    parts = tuple(arrays[f"B_{part}"] for part in _PARTS)
-    shape = (parts[2].size - 1, int(sizes[kind].sum()))
     domains = Subdomains(tuple(kinds), kind)
-    return DualOperator(csr_array(parts, shape=shape), domains, arrays["explicit"])
-
-
-MAKERS: Mapping[str, Maker] = MappingProxyType({NAME: _made})
+    shape = arrays["B_indptr"].size - 1, domains.start[-1]
+    B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
+    return DualOperator(B, domains, arrays["explicit"])
