@@ -19,6 +19,7 @@ PROBLEMS: Registry[Family] = Registry(
         "half-plane": entry("problems.families.half_plane", "HalfPlane"),
         "greco": entry("problems.families.greco", "Greco"),
         "obstacle": entry("problems.families.obstacle", "Obstacle"),
+        "membranes": entry("problems.families.membranes", "Membranes"),
         "string": entry("problems.families.variational", "String"),
         "journal-bearing": entry("problems.families.variational", "JournalBearing"),
         "torsion": entry("problems.families.variational", "Torsion"),
