@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
@@ -31,6 +30,8 @@ class Local:
     K: csc_array  #: (n, n) positive semidefinite
     fixing: Nodes  #: (p,) components
     star: Dense  #: (p, r) rows of R* there; columns of zeros may follow
+    boundary: Nodes  #: components that S condenses onto, ascending
+    stiffness: Vector  #: (n,) modulus around each component
 
     def inverse(self, b: Dense) -> Dense:
         """Apply K⁺ to columns (n, k)."""
@@ -42,18 +43,19 @@ class Local:
         unit[b, np.arange(b.size)] = 1
         return _symmetric(self.inverse(unit)[b])
 
-    def stiffness(self, b: Nodes) -> csc_array:
+    def lumped(self, b: Nodes) -> csr_array:
         """Return K_bb."""
-        return csc_array(self.K[b][:, b])
+        return csr_array(self.K[b][:, b])
 
     def schur(self, b: Nodes) -> Dense:
-        """Return  S_bb = K_bb − K_bi K_ii⁻¹K_ib,  where i are all other components."""
-        i = np.setdiff1d(np.arange(self.K.shape[0]), b)
-        K_bb, K_ib = self.stiffness(b).toarray(), self.K[i][:, b]
-        if not i.size:
-            return np.asarray(K_bb)
-        harmonic = cholesky(csc_matrix(self.K[i][:, i]))(K_ib.toarray())
-        return _symmetric(K_bb - K_ib.T @ harmonic)
+        """Return S_bb of  S = K_gg − K_gi K_ii⁻¹K_ig  on g: boundary and b."""
+        g = np.union1d(self.boundary, b)
+        S, i = self.lumped(g).toarray(), np.setdiff1d(np.arange(self.K.shape[0]), g)
+        if i.size:
+            K_ig = self.K[i][:, g]
+            S -= K_ig.T @ cholesky(csc_matrix(self.K[i][:, i]))(K_ig.toarray())
+        kept = np.isin(g, b)
+        return _symmetric(S[kept][:, kept])
 
     @cached_property
     def _factor(self) -> Factor:
@@ -66,16 +68,8 @@ class Local:
 
 def local(kind: Kind) -> Local:
     """Fix one kind:  R* = Q at the fixing components of R = QT."""
-    return Local(kind.K, kind.fixing, np.linalg.qr(kind.R[kind.fixing])[0])
-
-
-def eliminated(S: Dense, keep: NDArray[np.bool_]) -> Dense:
-    """Eliminate all other components from a Schur complement S."""
-    if keep.all():
-        return S
-    S_ib = S[~keep][:, keep]
-    inner = cho_factor(S[~keep][:, ~keep], lower=True)
-    return _symmetric(S[keep][:, keep] - S_ib.T @ cho_solve(inner, S_ib))
+    star = np.linalg.qr(kind.R[kind.fixing])[0]
+    return Local(kind.K, kind.fixing, star, kind.boundary, kind.stiffness)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,23 +113,13 @@ def subdomains(torn: Torn) -> Subdomains:
 def kernel(torn: Torn) -> csr_array:
     """Return R = diag(R_1 … R_S) (N, Σr)."""
     modes = np.array([kind.R.shape[1] for kind in torn.kinds])[torn.kind]
-    first = np.cumsum(modes) - modes
-    rows, columns, entries = [], [], []
-    domains = subdomains(torn)
-    for kind, members, place in zip(
-        torn.kinds, domains.members, domains.places(), strict=True
-    ):
-        column = first[members, None] + np.arange(kind.R.shape[1])
-        where = np.broadcast_arrays(place[..., None], column, kind.R[:, None])
-        for found, part in zip((rows, columns, entries), where, strict=True):
-            found.append(part.ravel())
-    return csr_array(
-        (
-            np.concatenate(entries),
-            (np.concatenate(rows), np.concatenate(columns)),
-        ),
-        shape=(torn.start[-1], modes.sum()),
-    )
+    sizes = np.diff(torn.start)
+    entries = np.concatenate([torn.kinds[k].R.ravel() for k in torn.kind])
+    per_row = np.repeat(modes, sizes)
+    ends = np.concatenate([[0], np.cumsum(per_row)])
+    along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
+    columns = np.repeat(np.cumsum(modes) - modes, sizes * modes) + along
+    return csr_array((entries, columns, ends), shape=(sizes.sum(), modes.sum()))
 
 
 def _symmetric(M: Dense) -> Dense:

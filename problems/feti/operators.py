@@ -1,4 +1,4 @@
-"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners, as plain arrays.
+"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners; plain arrays.
 
 Only components that rows touch matter: with B_b the columns of B there and all of them
 packed group by group, a product is sparse, dense, sparse:
@@ -14,17 +14,17 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999)
 
     B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
 
-with D = K_bb (lumped) or S_bb = K_bb − K_bi K_ii⁻¹K_ib (Dirichlet), and the weights
-W = 1 (multiplicity) or 1/diag(K) (stiffness). Redundant rows make B W Bᵀ singular; which
+with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
+condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
+or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular: which
 generalised inverse is taken changes λ by what Bᵀ does not feel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,24 +32,26 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
 from sksparse.cholmod import cholesky
 
-from harness import Matrix, Vector
-from harness.operators import Arrays, Maker, Product, SerialisableOperator
+from harness import Vector
+from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
-from problems.feti.local import Dense, Local, Subdomains, eliminated
+from problems.feti.local import Dense, Local, Subdomains
 
-NAME = "tfeti"  #: of the maker
+NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 #: of the diagonal of B W Bᵀ, added where rows are redundant
 SHIFT = 1e-8
+ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
 _PARTS = ("data", "indices", "indptr")
 
 
 class Group(NamedTuple):
-    """Subdomains of one kind whose rows touch the same components."""
+    """The subdomains of one kind, with what rows touch of any of them."""
 
-    kind: int
+    local: Local
+    explicit: bool  #: whether (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
-    touched: Nodes  #: (n_g,) components within each, ascending
+    touched: Nodes  #: b (n_g,) components within each, ascending
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,6 @@ class Packed:
     """
 
     groups: tuple[Group, ...]
-    number: NDArray[np.int64]  #: (N,) packed number of each torn unknown, or −1
     B: csr_array  #: (m, M) columns of B, packed
     BT: csr_array  #: (M, m) its transpose by rows
 
@@ -79,67 +80,45 @@ class Packed:
         return Y
 
 
-def packed(B: csr_array, domains: Subdomains, groups: Sequence[Group]) -> Packed:
+def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
     """Pack the columns of B (m, N)."""
-    number, end = np.full(B.shape[1], -1, dtype=np.int64), 0
-    for group in groups:
-        places = domains.start[group.members] + group.touched[:, None]
+    groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
+    parts = touched(B, domains)
+    for k, (local, members) in enumerate(
+        zip(domains.kinds, domains.members, strict=True)
+    ):
+        groups.append(Group(local, bool(explicit[k]), members, parts[k]))
+        places = domains.start[members] + parts[k][:, None]
         number[places.ravel()] = np.arange(end, end + places.size)
         end += places.size
     indices = number[B.indices].astype(B.indices.dtype)
     B_b = csr_array((B.data, indices, B.indptr), shape=(B.shape[0], end))
-    return Packed(tuple(groups), number, B_b, csr_array(B_b.T))
+    return Packed(tuple(groups), B_b, csr_array(B_b.T))
 
 
-def groups_by_kind(B: csr_array, domains: Subdomains) -> list[Group]:
-    """Group the subdomains by kind, with all that rows touch of any of them."""
-    sub, at = _touched(B, domains)
-    kind, largest = domains.kind[sub], int(np.diff(domains.start).max())
-    kind, at = np.divmod(np.unique(kind * largest + at), largest)
-    ends = np.cumsum(np.bincount(kind, minlength=len(domains.kinds)))
-    parts = np.split(at, ends[:-1])
-    return [
-        Group(k, members, touched)
-        for k, (members, touched) in enumerate(zip(domains.members, parts, strict=True))
-        if touched.size
-    ]
-
-
-def groups_by_touch(B: csr_array, domains: Subdomains) -> list[Group]:
-    """Group the subdomains by kind and by what rows touch of each."""
-    sub, at = _touched(B, domains)
-    ends = np.cumsum(np.bincount(sub, minlength=domains.kind.size))
-    alike: dict[tuple[int, bytes], list[int]] = {}
-    parts = np.split(at, ends[:-1])
-    for s, (kind, part) in enumerate(zip(domains.kind, parts, strict=True)):
-        if part.size:
-            alike.setdefault((int(kind), part.tobytes()), []).append(s)
-    return [
-        Group(kind, np.array(members), parts[members[0]])
-        for (kind, _), members in alike.items()
-    ]
-
-
-def _touched(B: csr_array, domains: Subdomains) -> tuple[Nodes, Nodes]:
-    """List the touched torn unknowns in turn: their subdomain, their place in it."""
+def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
+    """List the components that rows touch of any subdomain of each kind, ascending."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     found = np.flatnonzero(columns)
     sub = np.searchsorted(domains.start, found, side="right") - 1
-    return sub, found - domains.start[sub]
+    largest = int(np.diff(domains.start).max())
+    kind, at = np.divmod(
+        np.unique(domains.kind[sub] * largest + found - domains.start[sub]), largest
+    )
+    ends = np.cumsum(np.bincount(kind, minlength=len(domains.kinds)))
+    return np.split(at, ends[:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class DualOperator:
     """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
 
-    B: csr_array  #: (m, N)
-    domains: Subdomains
-    explicit: NDArray[np.bool_]  #: (kinds,) whose (K⁺)_bb is formed
+    packed: Packed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
-        return self._packed.congruence(self._blocks, x)
+        return self.packed.congruence(self._blocks, x)
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
@@ -153,29 +132,30 @@ class DualOperator:
             For other names.
 
         """
-        if kind not in BLOCKS:
-            raise ValueError(f"preconditioner {kind!r}; known: {', '.join(BLOCKS)}")
-        if scaling not in WEIGHTS:
-            raise ValueError(f"scaling {scaling!r}; known: {', '.join(WEIGHTS)}")
-        touching = packed(
-            self.B, self.domains, groups_by_touch(self.B, self.domains)
-        )
-        blocks = BLOCKS[kind](self.domains.kinds, touching.groups)
-        weights = WEIGHTS[scaling](self.domains.kinds, touching.groups)
-        return _scaled(touching, blocks, weights)
-
-    @cached_property
-    def _packed(self) -> Packed:
-        return packed(self.B, self.domains, groups_by_kind(self.B, self.domains))
+        for name, value, known in (
+            ("preconditioner", kind, ("lumped", "dirichlet")),
+            ("scaling", scaling, ("multiplicity", "stiffness")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
+        groups = self.packed.groups
+        if kind == "lumped":
+            blocks: list[Any] = [g.local.lumped(g.touched) for g in groups]
+        else:
+            blocks = [g.local.schur(g.touched) for g in groups]
+        softness = [
+            np.repeat(1 / g.local.stiffness[g.touched], g.members.size) for g in groups
+        ]
+        weights = np.concatenate(softness)
+        if scaling == "multiplicity":
+            weights = np.ones_like(weights)
+        return _scaled(self.packed, blocks, weights)
 
     @cached_property
     def _blocks(self) -> list[Any]:
-        kinds = self.domains.kinds
         return [
-            kinds[g.kind].compliance(g.touched)
-            if self.explicit[g.kind]
-            else _Solved(kinds[g.kind], g.touched)
-            for g in self._packed.groups
+            g.local.compliance(g.touched) if g.explicit else _Solved(g.local, g.touched)
+            for g in self.packed.groups
         ]
 
 
@@ -191,41 +171,13 @@ class _Solved(NamedTuple):
         return self.local.inverse(whole)[self.b]
 
 
-def _lumped(kinds: Sequence[Local], groups: Sequence[Group]) -> list[Any]:
-    return [csr_array(kinds[g.kind].stiffness(g.touched)) for g in groups]
-
-
-def _dirichlet(kinds: Sequence[Local], groups: Sequence[Group]) -> list[Any]:
-    """Form S_bb of each group; of those of one kind, from the one of all they touch."""
-    union: dict[int, Nodes] = {}
-    for g in groups:
-        union[g.kind] = np.union1d(union.get(g.kind, g.touched), g.touched)
-    schur = {k: kinds[k].schur(b) for k, b in union.items()}
-    return [eliminated(schur[g.kind], np.isin(union[g.kind], g.touched)) for g in groups]
-
-
-def _ones(kinds: Sequence[Local], groups: Sequence[Group]) -> Vector:
-    return np.ones(sum(g.touched.size * g.members.size for g in groups))
-
-
-def _softness(kinds: Sequence[Local], groups: Sequence[Group]) -> Vector:
-    diagonals = [kinds[g.kind].K.diagonal()[g.touched] for g in groups]
-    return 1 / np.concatenate([
-        np.repeat(d, g.members.size) for d, g in zip(diagonals, groups, strict=True)
-    ])
-
-
-BLOCKS = MappingProxyType({"lumped": _lumped, "dirichlet": _dirichlet})
-WEIGHTS = MappingProxyType({"multiplicity": _ones, "stiffness": _softness})
-
-
-def _scaled(touching: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
+def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
     """Make x ↦ B_D diag(blocks) B_Dᵀx,  B_D = (B W Bᵀ)⁻¹B W."""
-    BW = csr_array(touching.B @ diags_array(weights))
-    WB, solve = csr_array(BW.T), _gram_inverse(csr_array(BW @ touching.BT))
+    BW = csr_array(of.B @ diags_array(weights))
+    WB, solve = csr_array(BW.T), _gram_inverse(csr_array(BW @ of.BT))
 
     def product(x: Dense) -> Dense:
-        return solve(BW @ touching.multiplied(blocks, WB @ solve(x)))
+        return solve(np.asarray(BW @ of.multiplied(blocks, WB @ solve(x))))
 
     return product
 
@@ -235,17 +187,15 @@ def _gram_inverse(gram: csr_array) -> Product:
     diagonal = gram.diagonal()
     rows = np.repeat(np.arange(diagonal.size), np.diff(gram.indptr))
     size = np.sqrt(diagonal[rows] * diagonal[gram.indices])
-    couples = (rows != gram.indices) & (np.abs(gram.data) > 1e-12 * size)
+    couples = (rows != gram.indices) & (np.abs(gram.data) > ROUNDING * size)
     coupled = np.unique(rows[couples])
     if not coupled.size:
-        return lambda x: (x.T / diagonal).T
-    block = csc_array(gram[coupled][:, coupled])
-    factor = cholesky(
-        csc_matrix(block + diags_array(SHIFT * diagonal[coupled], format="csc"))
-    )
+        return lambda x: np.asarray((x.T / diagonal).T)
+    shift = diags_array(SHIFT * diagonal[coupled])
+    factor = cholesky(csc_matrix(gram[coupled][:, coupled] + shift))
 
     def solve(x: Dense) -> Dense:
-        y = (x.T / diagonal).T
+        y = np.asarray((x.T / diagonal).T)
         y[coupled] = factor(x[coupled])
         return y
 
@@ -262,41 +212,51 @@ def dual_operator(B: csr_array, domains: Subdomains) -> SerialisableOperator:
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
         **{f"B_{part}": getattr(B, part) for part in _PARTS},
         "sizes": np.array([local.K.shape[0] for local in kinds]),
-        "fixing": np.concatenate([local.fixing for local in kinds]),
         "fixings": np.array([local.fixing.size for local in kinds]),
+        "fixing": np.concatenate([local.fixing for local in kinds]),
         "star": np.concatenate(star),
+        "boundaries": np.array([local.boundary.size for local in kinds]),
+        "boundary": np.concatenate([local.boundary for local in kinds]),
+        "stiffness": np.concatenate([local.stiffness for local in kinds]),
         "kind": domains.kind,
         "explicit": _explicit(B, domains),
     }
-    return SerialisableOperator(B.shape[0], NAME, arrays, MAKERS)
+    return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
+
+
+def made(arrays: Arrays) -> DualOperator:
+    """Put F together from the arrays of `dual_operator`."""
+    ends = {
+        name: np.append(0, np.cumsum(arrays[name]))
+        for name in ("sizes", "fixings", "boundaries")
+    }
+    data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
+
+    def kind(k: int) -> Local:
+        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends.values())
+        columns = indptr[own.start : own.stop + 1]
+        within = slice(columns[0], columns[-1])
+        n = own.stop - own.start
+        K = (data[within], indices[within] - own.start, columns - columns[0])
+        return Local(
+            K=csc_array(K, shape=(n, n)),
+            fixing=arrays["fixing"][fixing],
+            star=arrays["star"][fixing],
+            boundary=arrays["boundary"][boundary],
+            stiffness=arrays["stiffness"][own],
+        )
+
+    kinds = tuple(map(kind, range(arrays["sizes"].size)))
+    domains = Subdomains(kinds, arrays["kind"])
+    shape = arrays["B_indptr"].size - 1, domains.start[-1]
+    B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
+    return DualOperator(packed(B, domains, arrays["explicit"]))
 
 
 def _explicit(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
     """Choose the kinds whose block is formed: the smallest, as many as fit."""
-    found = np.zeros(len(domains.kinds), dtype=bool)
-    groups = sorted(groups_by_kind(B, domains), key=lambda g: g.touched.size)
-    mib = np.cumsum([8 * g.touched.size**2 / 2**20 for g in groups])
-    found[[g.kind for g in groups[: np.searchsorted(mib, EXPLICIT_MIB, "right")]]] = True
+    sizes = np.array([part.size for part in touched(B, domains)])
+    order = np.argsort(sizes, kind="stable")
+    found = np.zeros(sizes.size, dtype=bool)
+    found[order] = np.cumsum(8 * sizes[order] ** 2) <= EXPLICIT_MIB * 2**20
     return found
-
-
-def _made(arrays: Arrays) -> DualOperator:
-    """Put F together from the arrays of `dual_operator`."""
-    sizes, kind = arrays["sizes"], arrays["kind"]
-    ends, fixed = np.cumsum(sizes), np.cumsum(arrays["fixings"])
-    data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
-    kinds = []
-    for n, end, p, last in zip(sizes, ends, arrays["fixings"], fixed, strict=True):
-        columns = indptr[end - n : end + 1]
-        within = slice(columns[0], columns[-1])
-        parts = (data[within], indices[within] - (end - n), columns - columns[0])
-        K = csc_array(parts, shape=(n, n))
-        at = slice(last - p, last)
-        kinds.append(Local(K, arrays["fixing"][at], arrays["star"][at]))
-    parts = tuple(arrays[f"B_{part}"] for part in _PARTS)
-    shape = (parts[2].size - 1, int(sizes[kind].sum()))
-    domains = Subdomains(tuple(kinds), kind)
-    return DualOperator(csr_array(parts, shape=shape), domains, arrays["explicit"])
-
-
-MAKERS: Mapping[str, Maker] = MappingProxyType({NAME: _made})

@@ -102,3 +102,11 @@ def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
     assert_allclose(B[E:] @ B[:E].T, 0, atol=1e-14)
     root_E = np.linalg.norm(pair.B.toarray(), axis=1)
     assert_allclose(np.unique(root_E.round(6)), np.sqrt([400.0, 4000.0]).round(6))
+
+
+def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
+    _, _, pair = torn_pair(most=4)
+    beam = pair.kinds[0]  # 4 × 4 cells
+    assert beam.boundary.size == 2 * 16
+    assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
+    assert np.unique(np.concatenate([k.stiffness for k in pair.kinds])).size == 2

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness import QP, Friction, Solution, Vector, no_rows
-from harness.mechanics import NO_FRICTION
+from harness.mechanics import NO_FRICTION, contact_rows
 from problems.duality.dualisation import Transformed
 from problems.feti.local import kernel, subdomains
 from problems.feti.operators import dual_operator
@@ -29,7 +29,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
 
     The way back takes  v = K⁺(f − Bᵀλ) − Rα  with α the multipliers of RᵀBᵀλ = Rᵀf,
     and averages the copies of a node, which are the same at the solution:
-    u = (TᵀT)⁻¹Tᵀv. Multipliers of a support are the forces on all of its copies.
+    u = (TᵀT)⁻¹Tᵀv. Multipliers of the supports are the reactions, from stationarity.
 
     Parameters
     ----------
@@ -51,17 +51,15 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
-    B_E = B[:m_E]
+    B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:
         v = domains.inverse(f - B.T @ s.x) - R @ s.y
         return np.asarray((T.T @ v) / copies)
 
     def recover(s: Solution) -> Solution:
-        u = displacement(s)
-        reactions = primal.A @ (T.T @ (B_E.T @ s.x[:m_E]))
-        return replace(
-            s, x=u, y=reactions, z=scale[m_E:] * s.x[m_E:], z_box=np.zeros(u.size)
-        )
+        u, z = displacement(s), scale[m_E:] * s.x[m_E:]
+        reactions = -primal.A @ (primal.P @ u + primal.q + B_I.T @ z)
+        return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
