@@ -23,6 +23,7 @@ PROBLEMS: Registry[Family] = Registry(
         "string": entry("problems.families.variational", "String"),
         "journal-bearing": entry("problems.families.variational", "JournalBearing"),
         "torsion": entry("problems.families.variational", "Torsion"),
+        "plate": entry("problems.families.plate", "Plate"),
         "bodies": entry("problems.families.gmsh_bodies", "GmshBodies"),
         "file": entry("problems.families.from_file", "FromFile"),
     }

@@ -24,7 +24,8 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array, diags_array, eye_array, vstack
+from scipy.linalg import null_space, qr
+from scipy.sparse import bsr_array, csc_array, csr_array, diags_array, eye_array, vstack
 
 from harness import Vector
 from problems.fem.mesh import Nodes
@@ -156,3 +157,48 @@ def _rotation(decomposition: Decomposition, d: int) -> csr_array:
     )
     Q.eliminate_zeros()
     return Q
+
+
+def without_supports(torn: Torn, held: Nodes) -> Torn:
+    """Eliminate what supports hold, as FETI-1 does: such subdomains do not float.
+
+    Parameters
+    ----------
+    torn : its supports hold components at zero, in the axes of the whole
+    held : these components of the whole
+
+    """
+    N, E = torn.f.size, torn.equalities
+    free = np.ones(N, dtype=bool)
+    free[csr_array(torn.spread[:, held]).nonzero()[0]] = False
+    kept = np.flatnonzero(free)
+    B = csr_array(torn.B[:, kept])
+    rows = np.flatnonzero((np.diff(B.indptr) > 0) | (np.arange(B.shape[0]) >= E))
+    kinds, kind = list[Kind](), np.empty_like(torn.kind)
+    known = dict[tuple[int, bytes], int]()
+    for s, k in enumerate(torn.kind):
+        mine = free[torn.start[s] : torn.start[s + 1]]
+        found = known.setdefault((int(k), mine.tobytes()), len(kinds))
+        if found == len(kinds):
+            kinds.append(_held(torn.kinds[k], mine))
+        kind[s] = found
+    return Torn(
+        kinds=tuple(kinds), kind=kind, spread=csr_array(torn.spread[kept]),
+        B=csr_array(B[rows]), c=torn.c[rows], scale=torn.scale[rows], f=torn.f[kept],
+        equalities=int((rows < E).sum()),
+    )  # fmt: skip
+
+
+def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:
+    """Return a subdomain without all but its free components (n_k,)."""
+    if free.all():
+        return kind
+    R = kind.R @ null_space(kind.R[~free])
+    R = np.linalg.qr(R[free])[0]
+    number = np.cumsum(free) - 1
+    return Kind(
+        K=csc_array(kind.K[free][:, free]), R=R,
+        fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
+        boundary=number[kind.boundary[free[kind.boundary]]],
+        stiffness=kind.stiffness[free],
+    )  # fmt: skip

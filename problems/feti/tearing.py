@@ -52,15 +52,17 @@ class Decomposition:
         return np.repeat(np.arange(self.kind.size), np.diff(self.start))
 
 
-def blocks(divisions: tuple[int, ...], most: int) -> NDArray[np.int64]:
+def blocks(
+    divisions: tuple[int, ...], most: int | tuple[int, ...]
+) -> NDArray[np.int64]:
     """Label the cells of a structured mesh by blocks of at most `most` cells a side.
 
-    The blocks of a direction are as equal as whole numbers allow.
+    The blocks along a direction are as equal as whole numbers allow.
 
     Parameters
     ----------
     divisions : cells along each direction, the one that is numbered fastest first
-    most : H/h
+    most : H/h; of each direction, where these differ
 
     Returns
     -------
@@ -68,8 +70,9 @@ def blocks(divisions: tuple[int, ...], most: int) -> NDArray[np.int64]:
 
     """
     label = np.zeros(1, dtype=np.int64)
-    for cells in divisions[::-1]:
-        count = -(-cells // most)
+    sides = np.broadcast_to(most, len(divisions))
+    for cells, side in zip(divisions[::-1], sides[::-1], strict=True):
+        count = -(-cells // int(side))
         along = np.arange(cells) * count // cells
         label = (label[:, None] * count + along).ravel()
     return label
