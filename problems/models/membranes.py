@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any
 
@@ -32,6 +32,7 @@ from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
 from problems.fem.mesh import Mesh, Nodes, boundary_edges, join, prefixed, rectangle
 from problems.feti.gluing import glue
+from problems.feti.substructures import local_problems
 from problems.feti.tearing import Part, blocks, decompose
 from problems.feti.torn import Kind, Torn
 
@@ -44,10 +45,12 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     start = perf_counter()
+    tear = None
     if form == "primal":
         new = posed(pair.qp)
     else:
-        new = torn_dual(pair.torn(p["glue"]), pair.qp)
+        torn = pair.torn(p["glue"])
+        new, tear = torn_dual(torn, pair.qp), partial(local_problems, torn, 1)
     seconds = None if form == "primal" else perf_counter() - start
     dofs = pair.qp.q.size
     return Case(
@@ -61,6 +64,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
             primal=pair.qp, back=new.recover, factorise=pair.factorise,
             mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
+            tear=tear,
         ),
     )  # fmt: skip
 
