@@ -16,7 +16,7 @@ the last row of the tridiagonal matrix says.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,8 @@ from scipy.sparse import coo_array, csc_matrix, csr_array, vstack
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import QP, Vector
+from harness import Vector
+from problems.feti.operators import dual_operator, made
 from problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
@@ -150,30 +151,25 @@ def spectrum(
     return found
 
 
-def spectrum_of_equations(
-    torn: Torn, dual: QP, preconditioner: tuple[str, str] | None = None,
+def spectra_of_equations(
+    torn: Torn,
+    preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
-) -> Spectrum:  # fmt: skip
-    """Find the extreme eigenvalues for the rows of supports and gluing alone.
-
-    Contact rows are left out, as if they were open: supports hold every body.
+) -> list[Spectrum]:
+    """Find the spectra for the rows of supports and gluing, as if no contact was there.
 
     Parameters
     ----------
-    dual : of the torn problem, with P from `problems.feti.operators`
-    preconditioner : its kind and scaling, see there
+    torn : its supports hold every body
+    preconditioners : kind and scaling of each, see `problems.feti.operators`, or none
     tol : as of `spectrum`
 
     """
-    E, m = torn.equalities, torn.c.size
-
-    def on_equations(product: Product) -> Product:
-        return lambda x: product(np.append(x, np.zeros(m - E)))[:E]
-
-    G = vstack([csr_array(dual.A)[:, :E], dependencies(torn.B[:E])], format="csr")
-    made = dual.P.build()
-    M = made.preconditioner(*preconditioner) if preconditioner else None
-    return spectrum(on_equations(made), G, M and on_equations(M), tol)
+    B_E = torn.B[: torn.equalities]
+    F = made(dual_operator(B_E, torn.domains).arrays)
+    G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
+    inverses = [p and F.preconditioner(*p) for p in preconditioners]
+    return [spectrum(F, G, M, tol) for M in inverses]
 
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:
