@@ -102,6 +102,10 @@ class Projected:
             kept = 0
         return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
+    def penalty(self, rho: float) -> BoxModel:
+        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        return self.rows.model(1.0, np.zeros(0), np.zeros((0, self.b.size)), rho)
+
     def plain_model(self, rho: float, *, alpha: float) -> Model:
         """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
         norm = max(1.0, rho if len(self.rows.C) else 0.0)

@@ -34,7 +34,6 @@ from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
-IN_FACE = 1e-6  #: κ of the projector on a face: C_F may have dependent rows
 
 
 class Transposed(Protocol):
@@ -94,10 +93,6 @@ class Rows(ABC):
         """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC, without what is not above τ."""
 
     @abstractmethod
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        """Return v → v_F less its part in the span of the rows C_F."""
-
-    @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
         """Find the a (r,) with the least ‖(r + Cᵀa)_F‖."""
 
@@ -117,12 +112,6 @@ class DenseRows(Rows):
     ) -> Model:
         w = np.append(above, np.full(len(self.C), rho))
         return Model(0.0, np.vstack([U, self.C]), w).with_tail(tau)
-
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        if not len(self.C):
-            return lambda v: np.where(free, v, 0.0)
-        inverse = Model(IN_FACE, self.C, np.ones(len(self.C))).inverse_in(free)
-        return lambda v: IN_FACE * inverse(v)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
         a, *_ = np.linalg.lstsq(self.C.T[free], -r[free], rcond=FREE_RANK)
@@ -148,10 +137,6 @@ class SparseRows(Rows):
             return Model.of_norm(tau, self.x_tilde.size)
         return PenaltyModel(tau, self, rho - tau)
 
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        inverse = PenaltyModel(IN_FACE, self, 1.0).inverse_in(free)
-        return lambda v: IN_FACE * inverse(v)
-
     def fitted(self, free: Mask, r: Vector) -> Vector:
         solve = self.factor_in(free, FREE_RANK)
         y = -solve(self.unit @ np.where(free, r, 0.0))
@@ -160,7 +145,7 @@ class SparseRows(Rows):
     def factor_in(self, free: Mask, shift: float) -> Factor:
         """Factorise G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
         held = self.unit[:, np.flatnonzero(~free)]
-        return self.factor.cholesky(csc_matrix((1 + shift) * self.gram - held @ held.T))
+        return self.factor.cholesky(_csc((1 + shift) * self.gram - held @ held.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +272,8 @@ def sparse_rows(G: csr_array, e: Vector) -> SparseRows | None:
     if not (size > 0).all():
         return None
     unit = csr_array(diags_array(1 / size) @ G)
-    gram = csc_matrix(unit @ unit.T)
-    factor = analyze(gram)
+    gram = _csc(unit @ unit.T)
+    factor = analyze(gram, use_long=False)
     try:
         factor.cholesky_inplace(gram)
     except CholmodNotPositiveDefiniteError:
@@ -302,6 +287,13 @@ def sparse_rows(G: csr_array, e: Vector) -> SparseRows | None:
         multipliers=lambda a: _backward(factor, a) / size,
         unit=unit, gram=gram, factor=factor,
     )  # fmt: skip
+
+
+def _csc(M: Matrix) -> csc_matrix:
+    """Have entries numbered by 32-bit integers, as the factor does."""
+    M = csc_matrix(M)
+    M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
+    return M
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:

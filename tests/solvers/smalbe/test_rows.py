@@ -72,16 +72,6 @@ def test_the_least_squares_multipliers_on_a_face(pair, face):
     assert sparse == pytest.approx(dense, abs=1e-8)
 
 
-def test_the_projector_on_a_face_is_that_of_its_columns(pair, G, face):
-    at_face = G.toarray()[:, face]
-    expected = np.eye(face.sum()) - np.linalg.pinv(at_face) @ at_face
-
-    for rows in pair:
-        found = columns(rows.in_face(face), 40)
-        assert found[np.ix_(face, face)] == pytest.approx(expected, abs=1e-4)
-        assert not found[~face].any()
-
-
 @pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
 def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
     x = np.zeros(40)
