@@ -7,7 +7,7 @@ whatever form of the problem the solver was handed; see `harness.verify.certific
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -67,6 +67,7 @@ class Friction:
     row: NDArray[np.int64]  #: (k,) the contact row of each
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
+    unsettled: float = 0.0  #: `residual` at the solution with this bound, where known
 
     def demanded(self, normal: Vector) -> Vector:
         """Return cohesion + mu·λ_n (k,), never negative, for normal forces (m,)."""
@@ -79,8 +80,8 @@ class Friction:
 
     def __getitem__(self, kept: NDArray[Any]) -> Friction:
         """Keep some of the rows."""
-        data = {name: value[kept] for name, value in vars(self).items()}
-        return Friction(**data)
+        rows = {k: v[kept] for k, v in vars(self).items() if k != "unsettled"}
+        return replace(self, **rows)
 
 
 _NOTHING = np.zeros(0)

@@ -77,6 +77,7 @@ def contact_case(
             ),
             friction=friction,
         ),
+        unsettled=friction.unsettled,
     )  # fmt: skip
 
 
