@@ -17,6 +17,8 @@ CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 #: values of the keys that choose the method; node-to-segment takes no notice of basis
 METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
 PLANES = {"plane": ("strain", "stress")}
+#: how copies of a node are held together, `problems.feti.gluing`
+GLUES = {"glue": ("orthonormal", "chain", "redundant")}
 #: the keys of friction with their defaults; -1 is no bound and no mu
 LAW: Mapping[str, Value] = {
     "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static"

@@ -30,6 +30,10 @@ class Kind:
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
     fixing: Nodes  #: components of few nodes that no motion of R leaves at rest
+    #: components of all nodes on the boundary of the subdomain, ascending: those that
+    #: Dirichlet preconditioners condense onto, glued or free
+    boundary: Nodes
+    stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
