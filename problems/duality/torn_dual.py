@@ -51,6 +51,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
+    copies[copies == 0] = 1  # eliminated components are zero
     B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:

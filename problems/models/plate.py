@@ -26,10 +26,10 @@ from scipy.sparse import csr_array, eye_array, vstack
 
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
 from problems.duality.dualisation import Transformed, posed
+from problems.duality.torn_dual import torn_dual
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
-from problems.feti.dual import torn_dual
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
 from problems.feti.spectrum import Spectrum, dependencies, spectrum
