@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -16,6 +17,7 @@ from problems.contact.results import fields
 from problems.duality.dualisation import dual_bounds, dualise, posed
 from problems.duality.torn_dual import torn_dual
 from problems.fem.inverse import GeneralisedInverse
+from problems.feti.substructures import local_problems
 from problems.feti.torn import Torn
 
 FORMS = ("primal", "dual", "dual-bounds")
@@ -56,14 +58,15 @@ def contact_case(
 
     """
     matrices: Mapping[str, Any] = {}
-    seconds = None
+    seconds, tear = None, None
     if torn is not None:
         if form != "dual":
             raise InputError(
                 f"feti with form {form} is not built; expected form dual, or no feti"
             )
         start = perf_counter()
-        new = torn_dual(torn(), primal, friction)
+        pieces = torn()
+        new, tear = torn_dual(pieces, primal, friction), partial(local_problems, pieces)
         seconds = perf_counter() - start
     elif form == "primal":
         new = posed(primal, friction)
@@ -92,7 +95,7 @@ def contact_case(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction,
+            friction=friction, tear=tear,
         ),
         unsettled=friction.unsettled,
     )  # fmt: skip
