@@ -22,8 +22,10 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
     """Choose `parts` (a power of two) of the nodes (N, 2) of one body by geometry.
 
     Recursive bisection across the longest principal axis; of each part, the node
-    nearest to its centroid.
+    nearest to its centroid. All of them, where there are no more.
     """
+    if len(points) <= parts:
+        return np.arange(len(points))
     groups = [np.arange(len(points))]
     while len(groups) < parts:
         groups = [half for group in groups for half in _halves(points, group)]

@@ -78,6 +78,15 @@ def blocks(
     return label
 
 
+def side_by_side(*labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Label the cells of bodies one after another, each labelled from 0 on."""
+    counts = [int(label.max()) + 1 for label in labels]
+    first = np.cumsum([0, *counts])
+    return np.concatenate(
+        [label + start for label, start in zip(labels, first, strict=False)]
+    )
+
+
 def decompose(
     points: NDArray[np.float64],
     cells: Nodes,

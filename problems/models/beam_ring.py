@@ -29,7 +29,7 @@ from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
 from problems.feti.elastic import SubdividedBodies, subdivide, torn
-from problems.feti.tearing import blocks
+from problems.feti.tearing import blocks, side_by_side
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -89,8 +89,7 @@ def _subdivided(
     Nr: int, Nh: int, radial: int, plane: Plane, most: int
 ) -> SubdividedBodies:
     beam, ring = blocks((8 * Nr, Nr), most), blocks((12 * Nh, radial), most)
-    label = np.append(beam, ring + beam.max() + 1)
-    return subdivide(model(Nr, Nh, radial, plane), label)
+    return subdivide(model(Nr, Nh, radial, plane), side_by_side(beam, ring))
 
 
 @lru_cache(maxsize=4)

@@ -43,6 +43,7 @@ import numpy as np
 from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vector
+from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -61,7 +62,11 @@ from problems.duality.dualisation import dualise
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
+from problems.feti.elastic import subdivide, torn
+from problems.feti.tearing import blocks, side_by_side
+from problems.feti.torn import Torn
 from problems.models.line_contact import LineContact, TangentialContact
+from problems.ranges import DECOMPOSITION
 
 RADIUS = 8e-3  #: m
 MATERIAL = Material(E=200e9, nu=0.3)
@@ -86,7 +91,8 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    return _case(bodies, above_plane(mesh, mesh.boundaries["arc"]), form, exact)
+    rows = above_plane(mesh, mesh.boundaries["arc"])
+    return _case(bodies, rows, form, exact, params)
 
 
 def cylinder_on_cylinder(
@@ -100,8 +106,9 @@ def cylinder_on_cylinder(
     if p["friction"] == "none":
         bodies, exact = two_cylinders(params)
         linearise = linearisation(bodies, p["contact"], p["basis"])
-        return _case(bodies, linearise(np.zeros(bodies.mesh.dofs)), form, exact)
-    same_path = {**params, "iterate": 0}
+        rows = linearise(np.zeros(bodies.mesh.dofs))
+        return _case(bodies, rows, form, exact, params)
+    same_path = {**params, "iterate": 0, **DECOMPOSITION}
     path, exact = _friction_path(tuple(same_path.items()), reference)
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
     primal, friction = problem.primal, problem.friction
@@ -118,7 +125,7 @@ def cylinder_on_cylinder(
         return found
 
     case = contact_case(
-        bodies, primal, form,
+        bodies, primal, form, torn=torn_halves(bodies, primal, params, friction),
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
     )  # fmt: skip
@@ -164,6 +171,29 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
                else ContactPair(lower, upper),),
     )  # fmt: skip
     return bodies, exact
+
+
+def torn_halves(
+    bodies: Bodies,
+    primal: QP,
+    params: Mapping[str, Value],
+    friction: Friction = NO_FRICTION,
+) -> Callable[[], Torn] | None:
+    """Give what tears half discs into blocks of rings and sectors, if `feti` says so.
+
+    The triangles at the centre of a disc are one more ring of cells; their sectors meet
+    in one node.
+    """
+    p: Any = params
+    if not p["feti"]:
+        return None
+    sides = bodies.mesh.boundaries
+    arcs = [sides[name].size - 1 for name in sides if name.endswith("arc")]
+    counts = np.bincount(bodies.body)
+    label = side_by_side(
+        *(blocks((arc, n // arc), p["feti"]) for arc, n in zip(arcs, counts, strict=True))
+    )
+    return lambda: torn(subdivide(bodies, label), primal, friction, p["glue"])
 
 
 def kept_on_axis(bodies: Bodies) -> Bodies:
@@ -381,10 +411,16 @@ def _beside(
     return replace(case, fields=fields)
 
 
-def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> Case:
+def _case(
+    bodies: Bodies,
+    rows: ContactRows,
+    form: str,
+    exact: LineContact,
+    params: Mapping[str, Value],
+) -> Case:
     primal = primal_qp(bodies, rows)
     case = contact_case(
-        bodies, primal, form,
+        bodies, primal, form, torn=torn_halves(bodies, primal, params),
         floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)

@@ -62,9 +62,14 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     p: Any = params
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start = problem.qp, perf_counter()
+    rows, start, tear = problem.qp, perf_counter(), None
     if form == "primal":
         new = with_bounds(rows)
+    elif p["feti"]:
+        pieces = torn(problem, p["feti"], p["glue"])
+        new, tear = torn_dual(pieces, rows), partial(local_problems, pieces, 1)
+    elif form == "dual":
+        new = dualise(rows, problem.floating())
     else:
         new = dual_bounds(rows, problem.factorise())
     seconds = None if form == "primal" else perf_counter() - start
@@ -79,6 +84,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         mechanics=Mechanics(
             primal=rows, back=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
+            tear=tear,
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,
