@@ -19,7 +19,6 @@ from scipy.sparse import csr_array
 from harness import QP, Friction, Solution, Vector, no_rows
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.duality.dualisation import Transformed
-from problems.feti.local import kernel, subdomains
 from problems.feti.operators import dual_operator
 from problems.feti.torn import Torn
 
@@ -38,7 +37,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
     friction : with a given bound
 
     """
-    domains, R, T = subdomains(torn), kernel(torn), torn.spread
+    domains, R, T = torn.domains, torn.domains.kernel, torn.spread
     B, f, m_E, scale = torn.B, torn.f, torn.equalities, torn.scale
     free = domains.inverse(f)
     m_I = primal.h.size
