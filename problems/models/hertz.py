@@ -188,11 +188,9 @@ def torn_halves(
     if not p["feti"]:
         return None
     sides = bodies.mesh.boundaries
-    arcs = [sides[name].size - 1 for name in sides if name.endswith("arc")]
-    counts = np.bincount(bodies.body)
-    label = side_by_side(
-        *(blocks((arc, n // arc), p["feti"]) for arc, n in zip(arcs, counts, strict=True))
-    )
+    along = [sides[name].size - 1 for name in sides if name.endswith("arc")]
+    cells = zip(along, np.bincount(bodies.body), strict=True)
+    label = side_by_side(*(blocks((arc, n // arc), p["feti"]) for arc, n in cells))
     return lambda: torn(subdivide(bodies, label), primal, friction, p["glue"])
 
 
