@@ -26,7 +26,8 @@ from scipy.sparse import coo_array, csc_matrix, csr_array, vstack
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import Vector
+from harness import QP, Vector
+from problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 
@@ -147,6 +148,32 @@ def spectrum(
                 break
         beta.append(length)
     return found
+
+
+def spectrum_of_equations(
+    torn: Torn, dual: QP, preconditioner: tuple[str, str] | None = None,
+    tol: float = 1e-5,
+) -> Spectrum:  # fmt: skip
+    """Find the extreme eigenvalues for the rows of supports and gluing alone.
+
+    Contact rows are left out, as if they were open: supports hold every body.
+
+    Parameters
+    ----------
+    dual : of the torn problem, with P from `problems.feti.operators`
+    preconditioner : its kind and scaling, see there
+    tol : as of `spectrum`
+
+    """
+    E, m = torn.equalities, torn.c.size
+
+    def on_equations(product: Product) -> Product:
+        return lambda x: product(np.append(x, np.zeros(m - E)))[:E]
+
+    G = vstack([csr_array(dual.A)[:, :E], dependencies(torn.B[:E])], format="csr")
+    made = dual.P.build()
+    M = made.preconditioner(*preconditioner) if preconditioner else None
+    return spectrum(on_equations(made), G, M and on_equations(M), tol)
 
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:

@@ -11,6 +11,7 @@ each is the best one in the sense of least squares (Kabsch 1976).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -78,13 +79,21 @@ def blocks(
     return label
 
 
-def side_by_side(*labels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Label the cells of bodies one after another, each labelled from 0 on."""
-    counts = [int(label.max()) + 1 for label in labels]
-    first = np.cumsum([0, *counts])
-    return np.concatenate(
-        [label + start for label, start in zip(labels, first, strict=False)]
-    )
+def structured_bodies(
+    divisions: Sequence[tuple[int, ...]], most: int
+) -> NDArray[np.int64]:
+    """Label the cells of structured meshes, one after another, each by its `blocks`.
+
+    Parameters
+    ----------
+    divisions : of each body, as of `blocks`
+    most : H/h
+
+    """
+    labels = [np.zeros(0, dtype=np.int64)]
+    for body in divisions:
+        labels.append(blocks(body, most) + labels[-1].max(initial=-1) + 1)
+    return np.concatenate(labels)
 
 
 def decompose(

@@ -43,7 +43,6 @@ import numpy as np
 from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vector
-from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -62,11 +61,9 @@ from problems.duality.dualisation import dualise
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
-from problems.feti.elastic import subdivide, torn
-from problems.feti.tearing import blocks, side_by_side
-from problems.feti.torn import Torn
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 from problems.models.line_contact import LineContact, TangentialContact
-from problems.ranges import DECOMPOSITION
 
 RADIUS = 8e-3  #: m
 MATERIAL = Material(E=200e9, nu=0.3)
@@ -108,7 +105,7 @@ def cylinder_on_cylinder(
         linearise = linearisation(bodies, p["contact"], p["basis"])
         rows = linearise(np.zeros(bodies.mesh.dofs))
         return _case(bodies, rows, form, exact, params)
-    same_path = {**params, "iterate": 0, **DECOMPOSITION}
+    same_path = {**params, "iterate": 0}
     path, exact = _friction_path(tuple(same_path.items()), reference)
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
     primal, friction = problem.primal, problem.friction
@@ -125,9 +122,10 @@ def cylinder_on_cylinder(
         return found
 
     case = contact_case(
-        bodies, primal, form, torn=torn_halves(bodies, primal, params, friction),
+        bodies, primal, form,
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal, friction),
     )  # fmt: skip
     return _beside(case, exact, shear) if shear is not None else case
 
@@ -173,25 +171,18 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     return bodies, exact
 
 
-def torn_halves(
-    bodies: Bodies,
-    primal: QP,
-    params: Mapping[str, Value],
-    friction: Friction = NO_FRICTION,
-) -> Callable[[], Torn] | None:
-    """Give what tears half discs into blocks of rings and sectors, if `feti` says so.
+def subdivided(bodies: Bodies, most: int) -> SubdividedBodies:
+    """Cut the half discs into blocks of rings and sectors.
 
-    The triangles at the centre of a disc are one more ring of cells; their sectors meet
-    in one node.
+    most : cells a side; the triangles at a centre are the last ring
     """
-    p: Any = params
-    if not p["feti"]:
-        return None
-    sides = bodies.mesh.boundaries
-    along = [sides[name].size - 1 for name in sides if name.endswith("arc")]
-    cells = zip(along, np.bincount(bodies.body), strict=True)
-    label = side_by_side(*(blocks((arc, n // arc), p["feti"]) for arc, n in cells))
-    return lambda: torn(subdivide(bodies, label), primal, friction, p["glue"])
+    sides, cells = bodies.mesh.boundaries, np.bincount(bodies.body)
+    arcs = [sides[name] for name in ("arc", "upper_arc", "lower_arc") if name in sides]
+    divisions = [
+        (arc.size - 1, int(count) // (arc.size - 1))
+        for arc, count in zip(arcs, cells, strict=True)
+    ]
+    return subdivide(bodies, structured_bodies(divisions, most))
 
 
 def kept_on_axis(bodies: Bodies) -> Bodies:
@@ -410,19 +401,18 @@ def _beside(
 
 
 def _case(
-    bodies: Bodies,
-    rows: ContactRows,
-    form: str,
-    exact: LineContact,
+    bodies: Bodies, rows: ContactRows, form: str, exact: LineContact,
     params: Mapping[str, Value],
-) -> Case:
+) -> Case:  # fmt: skip
+    p: Any = params
     primal = primal_qp(bodies, rows)
     case = contact_case(
-        bodies, primal, form, torn=torn_halves(bodies, primal, params),
+        bodies, primal, form,
         floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal),
     )  # fmt: skip
     return _beside(case, exact)
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array, vstack
+from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
 from harness.mechanics import Substructures
@@ -33,14 +33,15 @@ from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
-from problems.feti.spectrum import Spectrum, dependencies, spectrum
+from problems.feti.spectrum import Spectrum, spectrum_of_equations
 from problems.feti.substructures import local_problems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
 NU = 0.3
 #: preconditioner and scaling, by the names under which their spectra are reported
-PRECONDITIONERS = {
+PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
+    "none": None,
     "lumped": ("lumped", "multiplicity"),
     "dirichlet": ("dirichlet", "multiplicity"),
     "dirichlet_stiffness": ("dirichlet", "stiffness"),
@@ -117,13 +118,10 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        F = self.dual.qp.P
-        G = vstack([self.dual.qp.A, dependencies(self.torn.B)], format="csr")
-        found = {"none": spectrum(F.matvec, G)}
-        for name, (kind, scaling) in PRECONDITIONERS.items():
-            M = F.build().preconditioner(kind, scaling)
-            found[name] = spectrum(F.matvec, G, M)
-        return found
+        return {
+            name: spectrum_of_equations(self.torn, self.dual.qp, preconditioner)
+            for name, preconditioner in PRECONDITIONERS.items()
+        }
 
     @property
     def held(self) -> NDArray[np.int64]:
