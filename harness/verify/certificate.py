@@ -71,6 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
+from harness.verify.substructured import equilibrated, torn_norm
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -90,7 +91,7 @@ class Certificate:
 
     u: Extended  #: û (n,)
     multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    equilibrium: Extended  #: u_λ (n,)
+    equilibrium: Extended  #: u_λ (n,); of substructures torn, (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
@@ -167,7 +168,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     if not found:
         raise UncertifiableError(f"no admissible pair near the answer: {tried[0]}")
     best = min(found, key=lambda c: c.error)
-    if best.least >= best.error:
+    if best.least >= best.error or mechanics.tear is not None:
         return best
     return replace(best, least=max(best.least, _least_norm(mechanics)))
 
@@ -200,16 +201,17 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     proven = min(
         (c.bound for c in (own, other) if isinstance(c, Certificate)), default=np.inf
     )
-    floats = mechanics.inverse.kernel.shape[1] > 0
-    if floats and GOOD < proven <= NEAR and not _sharp(other):
+    exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
+    if exchangeable and GOOD < proven <= NEAR and not _sharp(other):
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
         yield _proved(mechanics, claimed, v, mu, states == CLOSED)
 
 
 def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
     """Evaluate the proof, or say why there is none."""
+    prove = proof if mechanics.tear is None else _substructured_proof
     try:
-        return proof(mechanics, *pair)
+        return prove(mechanics, *pair)
     except UncertifiableError as e:
         return str(e)
 
@@ -244,31 +246,90 @@ def proof(
     deformed, left = equilibrium(mechanics, force)
     at_rest = deformed + motions.felt @ alpha
     apart = mechanics.norm(feasible - at_rest)
-    total, nearest = apart + left, apart - left
     works = exact.friction_work(feasible) + lam * gaps
-    work, sliding = float(works.sum()), float(works[~exact.contact].sum())
-    square = total * total + 2 * work
+    total = apart + left
+    square = total * total + 2 * float(works.sum())
     unbalanced = motions.felt.T @ force - motions.KR.T @ deformed
     held, _ = held_and_loose(motions.G, relative(exact.interior(lam)))
     rounding = _rounding(
         mechanics, _reach(mechanics, held, lam, gaps, square), unbalanced, left, square
     )
-    gap = 0.5 * (square + rounding)
     middle = (feasible + at_rest) * Real(0.5)
+    return _certificate(
+        mechanics, u=feasible, multipliers=lam, equilibrium=at_rest,
+        norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
+        apart=apart, left=left, works=works, rounding=rounding,
+        from_middle=_length(mechanics, claimed - middle, held),
+        moved=mechanics.norm(claimed - feasible),
+    )  # fmt: skip
+
+
+def _certificate(
+    mechanics: Mechanics, *, u: Extended, multipliers: Extended, equilibrium: Extended,
+    norms: list[float], apart: float, left: float, works: Extended, rounding: float,
+    from_middle: float, moved: float,
+) -> Certificate:  # fmt: skip
+    """Put the terms of (2) and (3) together.
+
+    Parameters
+    ----------
+    norms : of û, of u_λ and of M
+    apart, left : ‖û − u_λ‖ as computed, and what the solve for u_λ left undone
+    works : (m,) that make up `work`
+    from_middle : from the answer to M
+
+    Raises
+    ------
+    UncertifiableError
+        When the answer is too large for arithmetic.
+
+    """
+    total, nearest = apart + left, apart - left
+    work = float(works.sum())
+    gap = 0.5 * (total * total + 2 * work + rounding)
     around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
-    norms = [mechanics.norm(v) for v in (feasible, at_rest, middle)]
     pair = np.sqrt(2 * gap)
     found = Certificate(
-        u=feasible, multipliers=lam, equilibrium=at_rest, norm=norms[0],
-        distance=total, work=work, sliding=sliding, rounding=rounding,
-        claimed=_length(mechanics, claimed - middle, held) + float(around),
+        u=u, multipliers=multipliers, equilibrium=equilibrium, norm=norms[0],
+        distance=total, work=work, sliding=float(works[~mechanics.exact.contact].sum()),
+        rounding=rounding, claimed=from_middle + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
-        moved=mechanics.norm(claimed - feasible),
-        seminorm=mechanics.inverse.kernel.shape[1] > 0,
+        moved=moved, seminorm=mechanics.kernel.shape[1] > 0,
     )  # fmt: skip
     if not np.isfinite(found.error):
         raise UncertifiableError("the answer is too large for arithmetic")
     return found
+
+
+def _substructured_proof(
+    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
+    closed: Any,
+) -> Certificate:  # fmt: skip
+    """Evaluate (1) and (3) with the u_λ of `harness.verify.substructured`.
+
+    Raises
+    ------
+    UncertifiableError
+        When u or λ cannot be mended.
+
+    """
+    exact, motions, parts = mechanics.exact, mechanics.motions, mechanics.substructures
+    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    if feasible is None:
+        raise UncertifiableError("the answer penetrates beyond repair")
+    lam = balanced(mechanics, multipliers, feasible)
+    d, left = equilibrated(mechanics, feasible, lam)
+    apart = torn_norm(parts, d.astype(Real))
+    works = exact.friction_work(feasible) - lam * exact.motion(feasible)
+    T, half = parts.spread.astype(Real), d * Real(0.5)
+    torn = T @ feasible
+    norms = [torn_norm(parts, torn - shift) for shift in (0 * d, d, half)]
+    moved = T @ (claimed - feasible)
+    return _certificate(
+        mechanics, u=feasible, multipliers=lam, equilibrium=torn - d, norms=norms,
+        apart=apart, left=left, works=works, rounding=0.0,
+        from_middle=torn_norm(parts, moved + half), moved=torn_norm(parts, moved),
+    )  # fmt: skip
 
 
 def _length(mechanics: Mechanics, v: Extended, held: NDArray[np.float64]) -> float:
@@ -276,7 +337,7 @@ def _length(mechanics: Mechanics, v: Extended, held: NDArray[np.float64]) -> flo
     R = mechanics.motions.felt @ held
     deformed = mechanics.still(v)
     whole = deformed + R @ (R.T @ v)
-    squares = [x @ (mechanics.exact.K @ x) for x in (deformed, whole)]
+    squares = [x @ (mechanics.stiffness @ x) for x in (deformed, whole)]
     return float(np.sqrt(max(*squares, Real(0))))
 
 
