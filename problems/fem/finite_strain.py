@@ -45,7 +45,7 @@ from problems.fem.mesh import Mesh, triangular
 from problems.fem.tangents import add_tangents, cell_tangents
 
 #: Poisson's ratio from which on cells take the mean dilatation
-NEARLY_INCOMPRESSIBLE = 0.45
+NEARLY_INCOMPRESSIBLE = 0.4
 #: eigenvalues of a cell's tangent below −ROUNDING times its largest are negative
 ROUNDING = 1e-12
 #: what negative ones are raised to, as a part of the cell's largest eigenvalue
