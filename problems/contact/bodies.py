@@ -76,9 +76,8 @@ class Bodies:
     @property
     def interface(self) -> Nodes:
         """Displacement components that contact rows can touch, ascending."""
-        return np.unique(
-            dofs_of(np.concatenate([np.concatenate(p) for p in self.pairs]))
-        )
+        sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
+        return np.unique(dofs_of(np.concatenate(sides)))
 
     @property
     def rigid(self) -> NDArray[np.float64]:
