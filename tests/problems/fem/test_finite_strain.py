@@ -165,6 +165,37 @@ def test_a_rotated_state_gives_rotated_forces(name, nu):
     assert np.abs(rotated - Q @ sigma @ Q.T).max() < 1e-13
 
 
+@pytest.mark.parametrize(
+    ("name", "size", "along", "curvature"),
+    [
+        ("neo-hooke", 0.9124619375117772, -0.2384264993276412, 41.241874223133976),
+        ("svk", 0.7337017368637873, -0.20988356405745323, 31.129611479376656),
+    ],
+)
+def test_an_independent_code_has_the_same_forces_and_tangent(
+    name, size, along, curvature
+):
+    """FElupe 11.3.0 (FieldPlaneStrain, RegionQuad) on this mesh and displacement.
+
+    Its NeoHookeCompressible and saint_venant_kirchhoff, with our Lamé constants: ‖r‖,
+    rᵀv and vᵀKv. All entries agree with ours to 2e-15; they are not kept here.
+    """
+    mesh = rectangle((0.0, 0.0), (2.0, 1.0), (4, 3))
+    x, y = mesh.points.T
+    moved = np.column_stack([np.sin(5 * x + 3 * y), np.cos(4 * x - 2 * y)])
+    mesh = replace(mesh, points=mesh.points + 0.03 * moved)
+    X, Y = mesh.points.T
+    u = 0.2 * np.column_stack([np.sin(2 * X + Y), np.cos(X - 3 * Y)]) * X[:, None] / 2
+    v = np.sin(np.arange(mesh.dofs) + 1.0)
+
+    c = cells_of(mesh, [hyperelastic(name, SOFT)], np.zeros(12, dtype=np.int64))
+    at = evaluate(c, u.ravel())
+
+    assert np.linalg.norm(at.forces) == pytest.approx(size, rel=1e-13)
+    assert at.forces @ v == pytest.approx(along, rel=1e-12)
+    assert v @ (assemble(c, at.tangents) @ v) == pytest.approx(curvature, rel=1e-13)
+
+
 @every_material
 def test_the_tangent_without_strain_is_that_of_linear_elasticity(name):
     mesh, body, linear = mixed(0.3)
