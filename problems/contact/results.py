@@ -26,9 +26,6 @@ def quantities(
     `pair_results`. With friction those of `frictional`, too.
     """
     l, F = bodies.length, bodies.force
-    slave, master = bodies.pairs[0]
-    side = master if master.size else slave
-    held = bodies.body_of_node == bodies.body_of_node[side[0]]
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
     stress = nodal_stresses(bodies, s.x * l)["von_mises"]
@@ -40,7 +37,7 @@ def quantities(
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
         "energy": primal.objective(s.x) * F * l,
-        "contact_force": forces[held].sum(axis=0).tolist(),
+        "contact_force": forces[_loaded(bodies)].sum(axis=0).tolist(),
         "multiplier_sum": float(normal.sum() * F),
         "max_von_mises": {
             name: float(stress[bodies.body_of_node == b].max())
@@ -48,6 +45,15 @@ def quantities(
         },
         "contacts": pair_results(bodies, primal, s, friction),
     } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
+
+
+def _loaded(bodies: Bodies) -> NDArray[np.bool_]:
+    """Mark the nodes (N,) of the body that `contact_force` acts on; none if nothing."""
+    owner = bodies.body_of_node
+    if not bodies.pairs:
+        return np.zeros(owner.size, dtype=bool)
+    slave, master = bodies.pairs[0]
+    return np.asarray(owner == owner[(master if master.size else slave)[0]])
 
 
 def frictional(
@@ -105,7 +111,8 @@ def fields(
 ) -> Fields:
     """Collect the deformed state for pictures."""
     u = s.x * bodies.length
-    slaves = np.concatenate([pair.slave for pair in bodies.pairs])
+    sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
+    slaves = np.concatenate(sides)
     return Fields(
         points=bodies.mesh.points,
         cells=bodies.mesh.cells,
