@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,12 @@ from problems.fem.stress import centre_stress, recover, von_mises
 
 
 def quantities(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
-) -> dict[str, Any]:
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    stresses: Mapping[str, Vector] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Report counts, energy, contact forces and stresses.
+
+    stresses : at the nodes (N,), where they are not those of linear elasticity
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
     its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
@@ -28,7 +32,7 @@ def quantities(
     l, F = bodies.length, bodies.force
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
-    stress = nodal_stresses(bodies, s.x * l)["von_mises"]
+    stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
     return {
         "nodes": len(bodies.mesh.points),
         "elements": len(bodies.mesh.cells),
@@ -107,9 +111,10 @@ def pair_results(
 
 
 def fields(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
-) -> Fields:
-    """Collect the deformed state for pictures."""
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    stresses: Mapping[str, Vector] | None = None,
+) -> Fields:  # fmt: skip
+    """Collect the deformed state for pictures; stresses as of `quantities`."""
     u = s.x * bodies.length
     sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
     slaves = np.concatenate(sides)
@@ -118,7 +123,7 @@ def fields(
         cells=bodies.mesh.cells,
         bodies=bodies.body,
         displacement=as_vectors(u),
-        nodal=nodal_stresses(bodies, u),
+        nodal=stresses or nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
         contacts=contact_sides(bodies, primal, s, friction),

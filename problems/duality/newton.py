@@ -31,8 +31,8 @@ that halves the least residual so far is taken without, as curved constraints ma
 grow near the solution (Maratos effect); that can happen a finite number of times only.
 
 *Convergence*: equilibrium and gaps at the new u, with the multipliers of the QP, to
-SETTLED; see `_residual`. *Load*: where an iteration fails, the load step is halved, and
-what is left of it follows, down to κ/2^HALVINGS.
+SETTLED; see `NewtonPath.residual`. *Load*: where that is not reached, the load step is
+halved and what is left of it follows, down to its part 2^−HALVINGS.
 """
 
 from __future__ import annotations
@@ -100,7 +100,9 @@ class Iteration:
     residual: float = np.inf  #: after it
 
 
-class _Configuration(NamedTuple):
+class Configuration(NamedTuple):
+    """A displacement, with everything that is evaluated there."""
+
     u: Vector
     rows: ContactRows
     gap: Vector  #: (m,) without dimensions
@@ -153,6 +155,22 @@ class NewtonPath:
         self.iterations(k)
         return self._parts[k - 1]
 
+    def state(self, at: Iteration, s: Solution) -> tuple[float, float, float]:
+        """Evaluate Π, the residual and the largest penetration at a solution of a QP.
+
+        Without dimensions; s is of `at.primal`.
+
+        Raises
+        ------
+        InvertedCellError
+            When a cell is inverted there.
+
+        """
+        lam = self._at_places(replace(at, answer=s))
+        reached = self._configuration(s.x, at.load_factor)
+        penetration = float((-reached.gap).max(initial=0.0))
+        return reached.energy, self.residual(reached, lam, at.load_factor), penetration
+
     def _stepped(self, k: int) -> tuple[list[Iteration], int]:
         """Go from step k − 1 to step k, in halves of what is left where it fails."""
         if self._turning:
@@ -203,7 +221,7 @@ class NewtonPath:
     def _solved(self, load_factor: float, u: Vector, lam: Vector) -> list[Iteration]:
         """Iterate at one load, from u and the multipliers (places,)."""
         at = self._configuration(u, load_factor)
-        best, weight = self._residual(at, lam, load_factor), 0.0
+        best, weight = self.residual(at, lam, load_factor), 0.0
         found: list[Iteration] = []
         while len(found) < MOST_ITERATIONS:
             posed = self._posed(at, lam, load_factor)
@@ -225,15 +243,15 @@ class NewtonPath:
             f"{best:.1e}"
         )
 
-    def _configuration(self, u: Vector, load_factor: float) -> _Configuration:
+    def _configuration(self, u: Vector, load_factor: float) -> Configuration:
         rows = self.linearise(u * self.bodies.length)
         gap = rows.c / self.bodies.length - rows.B @ u
         cells, f = evaluate(self.cells, u), load_factor * self.bodies.f
-        return _Configuration(
+        return Configuration(
             u, rows, gap, cells, cells.energy - float(f @ u), cells.forces - f
         )
 
-    def _residual(self, at: _Configuration, lam: Vector, load_factor: float) -> float:
+    def residual(self, at: Configuration, lam: Vector, load_factor: float) -> float:
         """Measure equilibrium and contact at u, with multipliers (places,).
 
         The larger of ‖r + Bᵀλ‖ on the free components, over that of the load or of Bᵀλ;
@@ -259,7 +277,7 @@ class NewtonPath:
         stiffest = float(posed.tangent.K.diagonal().max())
         return ROUNDING * stiffest / max(1.0, float(np.abs(self.bodies.f).max()))
 
-    def _posed(self, at: _Configuration, lam: Vector, load_factor: float) -> Iteration:
+    def _posed(self, at: Configuration, lam: Vector, load_factor: float) -> Iteration:
         """Pose (1) and solve it."""
         K, inverse, clipped = self._convex(at, lam)
         tangent = replace(self.bodies, K=K, f=K @ at.u - at.r)
@@ -272,7 +290,7 @@ class NewtonPath:
         )  # fmt: skip
 
     def _convex(
-        self, at: _Configuration, lam: Vector
+        self, at: Configuration, lam: Vector
     ) -> tuple[csc_array, GeneralisedInverse, int]:
         """Make the tangent positive definite where it is not, and factorise it.
 
@@ -303,7 +321,7 @@ class NewtonPath:
         return *found[-1], clipped
 
     def _contact_stiffness(
-        self, at: _Configuration, lam: Vector, *, convex: bool = False
+        self, at: Configuration, lam: Vector, *, convex: bool = False
     ) -> csc_array:
         """Assemble −Σ λ_i g_i'', without dimensions; empty where it is left out."""
         n = at.u.size
@@ -354,9 +372,9 @@ class NewtonPath:
         return new.recover(s)
 
     def _moved(
-        self, at: _Configuration, posed: Iteration, lam: Vector, weight: float,
+        self, at: Configuration, posed: Iteration, lam: Vector, weight: float,
         best: float,
-    ) -> tuple[_Configuration, float, float]:  # fmt: skip
+    ) -> tuple[Configuration, float, float]:  # fmt: skip
         """Search along the step: the new configuration, the length, the residual."""
         load_factor = posed.load_factor
         d = posed.answer.x - at.u
@@ -369,7 +387,7 @@ class NewtonPath:
             except InvertedCellError as e:
                 inverted = e
             else:
-                residual = self._residual(new, lam, load_factor)
+                residual = self.residual(new, lam, load_factor)
                 if (length == 1 and residual <= best / 2) or (
                     _merit(new, weight) <= merit + ARMIJO * length * min(slope, 0.0)
                 ):
@@ -380,7 +398,7 @@ class NewtonPath:
         )
 
 
-def _merit(at: _Configuration, weight: float) -> float:
+def _merit(at: Configuration, weight: float) -> float:
     """Evaluate φ."""
     return at.energy + weight * float(np.maximum(-at.gap, 0.0).sum())
 

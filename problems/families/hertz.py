@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 from harness import Family, InputError
 from problems.ranges import (
     FRICTION,
+    KINEMATICS,
     METHODS,
     MOST_STEPS,
     PLANES,
     at_least,
     at_most,
+    deformed,
     fits,
     one_of,
     positive,
@@ -34,7 +36,7 @@ class HertzPlane(Family):
     name: str = "hertz-plane"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
-            "n": 10, "load": 10.0, "plane": "strain", "halvings": 0,
+            "n": 10, "load": 10.0, "plane": "strain", "halvings": 0, **KINEMATICS,
         }),
         hash=False,
     )  # fmt: skip
@@ -48,9 +50,16 @@ class HertzPlane(Family):
         fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         positive(self.name, params, ("load",))
         one_of(self.name, params, PLANES)
+        deformed(self.name, params)
 
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return the case with every cell halved; the arcs are other polygons."""
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        """Return the case with every cell halved; the arcs are other polygons.
+
+        At finite strain there is none: the QP of another mesh is linearised at another
+        state.
+        """
+        if params["kinematics"] == "finite":
+            return None
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
@@ -59,9 +68,8 @@ class HertzPlane(Family):
         """Emit the QP in one form."""
         from problems.models.hertz import cylinder_on_plane
 
-        del reference  # the gap to a plane is linear in u
         self.check(params)
-        return cylinder_on_plane(form, params)
+        return cylinder_on_plane(form, params, reference)
 
 
 @dataclass(frozen=True)
