@@ -25,7 +25,7 @@ from harness.verify.substructured import neighbour
 from problems import PROBLEMS
 from problems.contact.bodies import Bodies
 from problems.feti.elastic import subdivide, torn
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems, local_problems
 from problems.models import beam_ring, hertz, patch
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -238,10 +238,9 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
 
 
 def test_local_problems_are_those_of_the_torn_bodies() -> None:
-    mechanics = known(CASES[0]).mechanics
-    parts = mechanics.substructures
-    kinds = parts.domains.kinds  # type: ignore[attr-defined]
-    K = block_diag([kinds[k].K for k in parts.domains.kind])  # type: ignore[attr-defined]
+    parts = known(CASES[0]).mechanics.substructures
+    assert isinstance(parts, LocalProblems)
+    K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)
