@@ -15,7 +15,7 @@ from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.contact.results import fields
 from problems.duality.dualisation import dual_bounds, dualise, posed
-from problems.duality.torn_dual import torn_dual
+from problems.duality.torn_dual import torn_dual, torn_matrices
 from problems.fem.inverse import GeneralisedInverse
 from problems.feti.substructures import local_problems
 from problems.feti.torn import Torn
@@ -68,6 +68,7 @@ def contact_case(
         pieces = torn()
         new, tear = torn_dual(pieces, primal, friction), partial(local_problems, pieces)
         seconds = perf_counter() - start
+        matrices = torn_matrices(pieces, new.qp)
     elif form == "primal":
         new = posed(primal, friction)
     else:
@@ -97,6 +98,7 @@ def contact_case(
             ),
             friction=friction, tear=tear,
         ),
+        unsettled=friction.unsettled,
     )  # fmt: skip
 
 

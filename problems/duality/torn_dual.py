@@ -12,6 +12,7 @@ an operator of plain arrays (`problems.feti.operators`), and RᵀBᵀ is sparse.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -63,3 +64,9 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
+
+
+def torn_matrices(torn: Torn, dual: QP) -> dict[str, Any]:
+    """Name the matrices of the dual as the paper does: F, d, B, c and R."""
+    R = torn.domains.kernel
+    return {"F": dual.P, "d": -dual.q, "B": torn.B, "c": torn.c, "R": R}

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Vector
+from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
@@ -120,7 +121,7 @@ def projected_problem(
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
     """
     F = Product(qp.P, qp.q.size)
-    rows = equality_rows(qp.A, qp.b)
+    rows = equality_rows(qp.A, qp.b, boxed(qp))
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     return _normalised(qp, F, rows, spectrum)
 
