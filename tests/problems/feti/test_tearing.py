@@ -48,7 +48,8 @@ def test_a_mirror_image_is_of_another_kind() -> None:
     points = np.array([[0, 0], [3, 0], [2, 1], [0, 1]], dtype=float)
     mirrored = points * [-1, 1] + [10, 0]
     cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
-    both = decompose(np.vstack([points, mirrored]), cells, np.arange(2), np.arange(2) * 0)
+    of_one = np.zeros(2, dtype=np.int64)
+    both = decompose(np.vstack([points, mirrored]), cells, np.arange(2), of_one)
     assert both.kind.tolist() == [0, 1]
 
 
