@@ -120,7 +120,7 @@ def test_the_mat_file_holds_the_dual_in_the_notation_of_the_paper(tmp_path):
         for name, M in read_mat(tmp_path / "m.mat").items()
         if name != "meta"
     }
-    K = block_diag(*[stiffness(2).toarray()] * 8)
+    K = block_diag(*[grid_stiffness((2, 2)).toarray()] * 8)
     expected = M["B"] @ np.linalg.pinv(K) @ M["B"].T
     G = M["R"].T @ M["B"].T
     P = np.eye(len(expected)) - np.linalg.pinv(G) @ G
