@@ -32,66 +32,67 @@ can hold; along these λ̂ balances the load, see `harness.verify.admissible.bal
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
 from scipy.sparse import csc_matrix, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from harness.mechanics import Extended, Mechanics, Real, Substructures
+from harness.mechanics import Extended, Mechanics
 from harness.qp import Vector
 
 
-def equilibrated(
-    mechanics: Mechanics, u: Extended, multipliers: Extended
-) -> tuple[Vector, float]:
-    """Return d (N,) for an admissible u (n,) and λ̂ (m,), and what is undone of it.
+class Neighbour(NamedTuple):
+    """The u_λ near a displacement û, as torn displacements (N,)."""
 
-    That is the energy norm of what one refinement left, as of `equilibrium` in
-    `harness.verify.active_set_refinement`.
-    """
+    u: Extended  #: Tû
+    Ku: Extended  #: K_T Tû
+    d: Vector  #: Tû − u_λ, as far as it was solved for
+    Kd: Vector  #: K_T d
+    left: float  #: energy norm of the rest of d
+
+
+def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neighbour:
+    """Find u_λ from an admissible û (n,) and λ̂ (m,)."""
     exact, parts = mechanics.exact, mechanics.substructures
-    T = parts.spread
-    pull = parts.product(_deformed(parts, T.astype(Real) @ u))
-    residual = T.T @ pull - exact.f + exact.B.T @ multipliers
+    torn = parts.spread @ u
+    pull = parts.product(torn)
+    residual = parts.spread.T @ pull - exact.f + exact.B.T @ multipliers
     residual[exact.held] = 0
-    b = _sharing(mechanics)(residual.astype(np.float64))
-    d = np.zeros(b.size)
-    for _ in range(2):
-        left = b - parts.product(d.astype(Real)).astype(np.float64)
-        left = _deformed(parts, left)
-        step = _deformed(parts, parts.solve(left))
-        d = d + step
-    return d - step, float(np.sqrt(abs(float(left @ step))))
+    b = _shared(mechanics, residual.astype(np.float64))
+    d = parts.solve(b)
+    Kd = parts.product(d)
+    step = parts.solve(b - Kd)
+    return Neighbour(torn, pull, d, Kd, float(np.sqrt(abs(float((b - Kd) @ step)))))
 
 
-def torn_norm(parts: Substructures, v: Extended) -> float:
-    """Return √(Σ v_sᵀK_s v_s) of a torn displacement (N,)."""
-    v = _deformed(parts, v)
-    return float(np.sqrt(max(float(v @ parts.product(v)), 0.0)))
+def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
+    """Share ρ (n,) among the subdomains, balanced in each: b (N,).
 
-
-def _sharing(mechanics: Mechanics) -> Callable[[Vector], Vector]:
-    """Return the map from a residual ρ (n,) to forces b (N,) of subdomains."""
+    Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
+    """
     parts, held = mechanics.substructures, mechanics.exact.held
-    T, R, w = parts.spread, parts.kernel, parts.weight
-    total = T.multiply(T).T @ w
-    total[held] = np.inf
-    WT = csr_array(diags_array(w) @ T)
+    squares = parts.spread.copy()
+    squares.data **= 2
+    total = squares.T @ parts.weight
+    part = parts.weight / (squares @ total)
+    single = np.ones(total.size, dtype=bool)
+    single[held] = False
+    inner = (part > 1 - 1e-9) & (squares @ single > 1 - 1e-9)
+    at = np.flatnonzero(~inner)
+    T, R, w = parts.spread[at], parts.kernel[at], parts.weight[at]
+    inverse = 1 / total
+    inverse[held] = 0
     WR = csr_array(diags_array(w) @ R)
     TWR = csr_array(T.T @ WR)
-    coarse = R.T @ WR - TWR.T @ (diags_array(1 / total) @ TWR)
+    coarse = R.T @ WR - TWR.T @ (diags_array(inverse) @ TWR)
     solve = _coarse_solve(csr_array(coarse), _moved_together(mechanics))
-
-    def share(residual: Vector) -> Vector:
-        b = WT @ (residual / total)
-        for _ in range(2):  # the second one for the digits that the first one lost
-            mu = solve(R.T @ b)
-            b = b - WR @ mu + WT @ ((TWR @ mu) / total)
-        return np.asarray(b)
-
-    return share
+    b = part * (parts.spread @ residual)
+    for _ in range(2):  # the second time for the digits that the first one lost
+        mu = solve(parts.kernel.T @ b)
+        b[at] -= WR @ mu - w * (T @ (inverse * (TWR @ mu)))
+    return np.asarray(b)
 
 
 def _moved_together(mechanics: Mechanics) -> Any:
@@ -115,9 +116,3 @@ def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
         return x
 
     return solve
-
-
-def _deformed(parts: Substructures, v: Any) -> Any:
-    """Take the rigid motions of every subdomain out of torn `v` (N,)."""
-    R = parts.kernel
-    return np.asarray(v - R @ (R.T @ v))

@@ -21,6 +21,7 @@ from problems.ranges import (
     SETTINGS,
     at_least,
     at_most,
+    deformed,
     one_of,
     rough,
     torn_by,
@@ -41,19 +42,12 @@ class GmshBodies(Family):
     name: str = "bodies"
     path_suffix: str = ".toml"
     defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType(
-            {
-                "path": "",
-                "sha256": "",
-                **SETTINGS,
-                "step": 0,
-                "iterate": 0,
-                "parts": 0,
-                "glue": DECOMPOSITION["glue"],
-            }
-        ),
+        default_factory=lambda: MappingProxyType({
+            "path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0,
+            "parts": 0, "glue": DECOMPOSITION["glue"],
+        }),
         hash=False,
-    )
+    )  # fmt: skip
     forms: tuple[str, ...] = CONTACT_FORMS
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
@@ -92,6 +86,7 @@ class GmshBodies(Family):
         table = read_description(path)
         own = any(key in entry for entry in table["contacts"] for key in LAW)
         rough(self.name, p, elsewhere=own)
+        deformed(self.name, p)
         with located(str(path)):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]

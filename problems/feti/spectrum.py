@@ -6,9 +6,10 @@ With P the orthogonal projector onto ker G ∩ range B, the condition numbers ar
     P M P F               in the inner product  xᵀF y,
 
 the latter with a preconditioner M ≈ F⁻¹; both on the range of P. Both are self-adjoint
-there, so that one Lanczos process serves both (Parlett 1998, Chapter 13):
-orthogonalised against all earlier vectors, twice, it keeps what it found. Every vector
-is projected anew, as what rounding leaves of a kernel grows from step to step.
+there, so that one Lanczos process serves both (Parlett 1998, Chapter 13). Each vector
+is orthogonalised against the last two, as the recurrence says, then against all, so
+that nothing is found twice; and it is projected anew, as what rounding leaves of a
+kernel grows from step to step.
 
 Of a Ritz value θ with residual r an eigenvalue is no farther than ‖r‖, and ‖r‖ is what
 the last row of the tridiagonal matrix says.
@@ -16,7 +17,7 @@ the last row of the tridiagonal matrix says.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,8 @@ from scipy.sparse import coo_array, csc_matrix, csr_array, vstack
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import QP, Vector
+from harness import Vector
+from problems.feti.operators import dual_operator, made
 from problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
@@ -137,8 +139,8 @@ def spectrum(
         V[k], WV[k] = v / length, Wv / length
         v = image(WV[k])
         alpha.append(float(v @ WV[k]))
-        for _ in range(2):
-            v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
+        v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
+        v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)
@@ -150,30 +152,25 @@ def spectrum(
     return found
 
 
-def spectrum_of_equations(
-    torn: Torn, dual: QP, preconditioner: tuple[str, str] | None = None,
+def spectra_of_equations(
+    torn: Torn,
+    preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
-) -> Spectrum:  # fmt: skip
-    """Find the extreme eigenvalues for the rows of supports and gluing alone.
-
-    Contact rows are left out, as if they were open: supports hold every body.
+) -> list[Spectrum]:
+    """Find the spectra for the rows of supports and gluing, as if no contact was there.
 
     Parameters
     ----------
-    dual : of the torn problem, with P from `problems.feti.operators`
-    preconditioner : its kind and scaling, see there
+    torn : its supports hold every body
+    preconditioners : kind and scaling of each, see `problems.feti.operators`, or none
     tol : as of `spectrum`
 
     """
-    E, m = torn.equalities, torn.c.size
-
-    def on_equations(product: Product) -> Product:
-        return lambda x: product(np.append(x, np.zeros(m - E)))[:E]
-
-    G = vstack([csr_array(dual.A)[:, :E], dependencies(torn.B[:E])], format="csr")
-    made = dual.P.build()
-    M = made.preconditioner(*preconditioner) if preconditioner else None
-    return spectrum(on_equations(made), G, M and on_equations(M), tol)
+    B_E = torn.B[: torn.equalities]
+    F = made(dual_operator(B_E, torn.domains).arrays)
+    G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
+    inverses = [p and F.preconditioner(*p) for p in preconditioners]
+    return [spectrum(F, G, M, tol) for M in inverses]
 
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:

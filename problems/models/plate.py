@@ -27,13 +27,13 @@ from scipy.sparse import csr_array, eye_array
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
 from harness.mechanics import Substructures
 from problems.duality.dualisation import Transformed, posed
-from problems.duality.torn_dual import torn_dual
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
-from problems.feti.spectrum import Spectrum, spectrum_of_equations
+from problems.feti.spectrum import Spectrum, spectra_of_equations
 from problems.feti.substructures import local_problems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
@@ -71,6 +71,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         ),
         scale=new.sign,
         constant=new.constant,
+        matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal, back=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells))),
@@ -118,10 +119,8 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        return {
-            name: spectrum_of_equations(self.torn, self.dual.qp, preconditioner)
-            for name, preconditioner in PRECONDITIONERS.items()
-        }
+        found = spectra_of_equations(self.torn, list(PRECONDITIONERS.values()))
+        return dict(zip(PRECONDITIONERS, found, strict=True))
 
     @property
     def held(self) -> NDArray[np.int64]:
@@ -194,16 +193,14 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
 
 
 def dual_quantities(plate: Plate) -> dict[str, Any]:
-    """Report the dual: its size, ‖PFP‖, and condition numbers with error bounds.
+    """Report how the plate is torn, ‖PFP‖, and condition numbers with error bounds.
 
     kappa: κ(PFP). kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
     preconditioners, by multiplicity but for the last. Each has an `…_error`.
     """
-    torn, spectra = plate.torn, plate.spectra
+    spectra = plate.spectra
     found: dict[str, Any] = {
-        "subdomains": torn.kind.size,
-        "torn_dofs": torn.f.size,
-        "multipliers": torn.c.size,
+        **torn_quantities(plate.torn, plate.dual.qp),
         "norm_PFP": spectra["none"].largest,
         "norm_PFP_error": spectra["none"].largest_error,
     }
