@@ -117,7 +117,9 @@ def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
 
-    packed: Packed
+    B: csr_array  #: (m, N)
+    domains: Subdomains
+    explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
@@ -133,6 +135,17 @@ class DualOperator:
         ------
         ValueError
             For other names.
+
+        """
+        return _scaled(self.packed, *self.weighted_blocks(kind, scaling))
+
+    def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
+        """Return D of each group, and the weights W of all that rows touch.
+
+        Raises
+        ------
+        ValueError
+            As of `preconditioner`.
 
         """
         for name, value, known in (
@@ -152,7 +165,12 @@ class DualOperator:
         weights = np.concatenate(softness)
         if scaling == "multiplicity":
             weights = np.ones_like(weights)
-        return _scaled(self.packed, blocks, weights)
+        return blocks, weights
+
+    @cached_property
+    def packed(self) -> Packed:
+        """Its rows on what they touch."""
+        return packed(self.B, self.domains, self.explicit)
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:
@@ -279,7 +297,7 @@ def made(arrays: Arrays) -> DualOperator:
     domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    return DualOperator(packed(B, domains, arrays["explicit"]))
+    return DualOperator(B, domains, arrays["explicit"])
 
 
 def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
