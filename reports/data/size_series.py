@@ -40,6 +40,15 @@ class SizeSeries:
         counted = [(s, o.iterations) for s, o in self._sized(solver, against)]
         return _law([(s, sum(i) / 2) for s, i in counted if i is not None])
 
+    def counts(self, solver: str) -> tuple[str, ...]:
+        """Name what one solver counts on every size that it is verified on."""
+        named = [list(o.first.counts) for _, o in self.curve(solver)]
+        return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
+
+    def count_law(self, solver: str, name: str) -> PowerLaw | None:
+        """Fit one count ~ nᵖ, repeats averaged; None below three sizes."""
+        return _law([(n, o.counted(name) or 0.0) for n, o in self.curve(solver)])
+
     def _sized(self, solver: str, against: str) -> list[tuple[int, Outcome]]:
         """Sizes n or m and the answers of one solver; those without are left out."""
         return [

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from reports.data.cells import source
 from reports.data.evidence import Outcome
+from reports.data.size_series import SIZES as SERIES
 from reports.data.size_series import SizeSeries
 from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
 from reports.document.layout import Cell, Section, Table
@@ -180,3 +181,63 @@ def _predicted(fit: Growth | None, n: int) -> Cell:
     except ValueError as e:
         return Cell(text="refused", kind="quiet", title=f"{e}")
     return Cell(text=seconds(time), value=time.value)
+
+
+#: what is read before other counts; the rest in a solver's own order
+FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
+
+
+def steps(found: Sequence[SizeSeries]) -> Section | None:
+    """Tabulate what solvers count, each kind apart; None where nothing is counted."""
+    tables = [t for series in found for t in _step_tables(series)]
+    if not tables:
+        return None
+    return Section(
+        name="steps",
+        title="Steps of each kind against size",
+        prose=(
+            "What a solver says it counted: products with P, the start included, "
+            "applications of a preconditioner, and for active-set methods conjugate "
+            "gradient (cg), expansion and proportioning steps apart. Conditioning "
+            "shows in cg; the search for the active set shows in the other two. "
+            "Verified answers only, the mean of the repeats. p is the exponent of "
+            "c·nᵖ with Student's 95 % interval, p at most its one-sided 95 % bound; "
+            "the test is that of iterations.",
+        ),
+        tables=tuple(tables),
+    )
+
+
+def _step_tables(series: SizeSeries) -> list[Table]:
+    found = []
+    for solver in series.solvers:
+        names = series.counts(solver)
+        curve = series.curve(solver)
+        if not names or len(curve) < SERIES:
+            continue
+        ordered = [name for name in FIRST if name in names]
+        ordered += [name for name in names if name not in FIRST]
+        found.append(Table(
+            caption=f"Counts of {clean(solver, 40)} against size: {series.title}.",
+            columns=(
+                "count", *(f"n = {n}" for n, _ in curve), "p [95 %]", "p at most",
+                "p-value", "growth",
+            ),
+            rows=tuple(_step_row(series, solver, name) for name in ordered),
+        ))  # fmt: skip
+    return found
+
+
+def _step_row(series: SizeSeries, solver: str, name: str) -> tuple[Cell, ...]:
+    curve = series.curve(solver)
+    counted = [(n, o.counted(name) or 0.0) for n, o in curve]
+    fit = _fit(counted)
+    return (
+        Cell(text=clean(name, 40)),
+        *(
+            Cell(text=f"{v:.4g}", value=v, title=source(o))
+            for (_, v), (_, o) in zip(counted, curve, strict=True)
+        ),
+        _exponent(series.count_law(solver, name), source(*(o for _, o in curve))),
+        *_tested(fit)[1:],
+    )
