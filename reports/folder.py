@@ -13,7 +13,7 @@ from reports.data.comparison_groups import ComparisonGroup, all_groups
 from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
 from reports.data.fastest import answers_of, fastest_solvers
-from reports.data.size_series import SizeSeries, size_series
+from reports.data.size_series import SizeSeries, size_series, sweeps
 from reports.document.formatting import TIMED, clean
 from reports.document.layout import Page, Picture, Section
 from reports.export.csv_tables import csv_tables
@@ -171,7 +171,7 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         (agreement(evidence), _AGREEMENT),
         (_grown(found, evidence), _SCALING),
         (growth(found), _GROWTH),
-        (steps(found), _STEPS),
+        (steps(found, sweeps(evidence, "feti")), _STEPS),
         (physics(evidence), _PHYSICS),
         (deformed(evidence), _DEFORMED),
         (tractions(evidence), _TRACTIONS),

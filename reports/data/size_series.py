@@ -86,6 +86,39 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
     ]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sweep:
+    """Cases that differ in one key only, and one solver's verified answers on each."""
+
+    title: str  #: family, other parameters, form, tolerance
+    solver: str
+    answers: tuple[tuple[int, Outcome], ...]  #: by the value of the key
+
+
+def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
+    """Find where one key alone takes at least three positive values."""
+    groups: dict[tuple[Any, ...], dict[int, Outcome]] = {}
+    for o in evidence.flat:
+        params = dict(o.first.params)
+        value = params.pop(key, 0)
+        if o.verified and isinstance(value, int) and value > 0:
+            case = "/".join(
+                part
+                for part in o.first.case.split("/")
+                if not part.startswith(f"{key}=")
+            )
+            same = (case, tuple(sorted(params.items())), o.tol, o.solver)
+            groups.setdefault(same, {})[value] = o
+    return [
+        Sweep(
+            title=f"{clean(case)}, tol {tolerance(tol)}", solver=solver,
+            answers=tuple(sorted(found.items())),
+        )
+        for (case, _, tol, solver), found in groups.items()
+        if len(found) >= SIZES
+    ]  # fmt: skip
+
+
 def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
     """Name, per family, the keys in which cases of equal size differ."""
     seen: dict[tuple[str, int, str], set[Any]] = {}

@@ -497,6 +497,22 @@ def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
     assert found["cg"]["n = 6400"].value == 72
 
 
+def test_one_mesh_torn_more_or_less_finely_has_a_table_of_its_own(record, evidence):
+    records = [
+        record("s", cells, 1.0, counts={"P_products": 10 + cells}).but(
+            case=f"toy/Nr=3/feti={cells}/dual", params={"Nr": 3, "feti": cells},
+            quantities={"dofs": 100, "subdomains": 64 // cells},
+        )
+        for cells in (8, 4, 16)
+    ]  # fmt: skip
+    (table,) = section(compose(evidence(records)), "steps").tables
+    assert "toy/Nr=3/dual" in table.caption
+    found = rows(table)
+    assert list(found) == ["4", "8", "16"]
+    assert [row["P_products"].value for row in found.values()] == [14, 18, 26]
+    assert [row["subdomains"].value for row in found.values()] == [16, 8, 4]
+
+
 def test_without_counts_there_is_no_section_on_steps(record, evidence):
     page = compose(evidence(some_records(record, 2, cases=3)))
     assert section(page, "steps") is None
