@@ -41,6 +41,7 @@ from problems.feti.torn import Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
+COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
 #: of the diagonal of B W Bᵀ, added where rows are redundant
 SHIFT = 1e-8
 ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
@@ -82,6 +83,31 @@ class Packed:
             Y[begin:end] = (block @ part.reshape(n, -1)).reshape(part.shape)
         return Y
 
+    def diagonal(self, blocks: Sequence[Any]) -> Vector:
+        """Return the diagonal of  B_b diag(blocks) B_bᵀ.
+
+        Row r has the sum of B_ri M_ij B_rj over pairs of its entries that are in one
+        subdomain, with the block M of that.
+        """
+        B, begin = self.B, 0
+        entries = np.diff(B.indptr)
+        row = np.repeat(np.arange(entries.size), entries)
+        left = np.repeat(np.arange(B.nnz), entries[row])
+        before = np.cumsum(entries[row]) - entries[row]
+        right = B.indptr[row[left]] + np.arange(left.size) - before[left]
+        total = np.zeros(entries.size)
+        for block, group in zip(blocks, self.groups, strict=True):
+            S = group.members.size
+            end = begin + group.touched.size * S
+            i, j = B.indices[left] - begin, B.indices[right] - begin
+            one = (np.minimum(i, j) >= 0) & (np.maximum(i, j) < end - begin)
+            one &= i % S == j % S
+            pairs = _entries(block, i[one] // S, j[one] // S)
+            pairs *= B.data[left[one]] * B.data[right[one]]
+            total += np.bincount(row[left[one]], pairs, total.size)
+            begin = end
+        return total
+
 
 def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
     """Pack the columns of B (m, N)."""
@@ -117,11 +143,17 @@ def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
 
-    packed: Packed
+    B: csr_array  #: (m, N)
+    domains: Subdomains
+    explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
         return self.packed.congruence([inverse for inverse, _ in self._blocks], x)
+
+    def diagonal(self) -> Vector:
+        """Give the diagonal of F."""
+        return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
@@ -133,6 +165,17 @@ class DualOperator:
         ------
         ValueError
             For other names.
+
+        """
+        return _scaled(self.packed, *self.weighted_blocks(kind, scaling))
+
+    def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
+        """Return D of each group, and the weights W of all that rows touch.
+
+        Raises
+        ------
+        ValueError
+            As of `preconditioner`.
 
         """
         for name, value, known in (
@@ -152,7 +195,16 @@ class DualOperator:
         weights = np.concatenate(softness)
         if scaling == "multiplicity":
             weights = np.ones_like(weights)
-        return _scaled(self.packed, blocks, weights)
+        return blocks, weights
+
+    @cached_property
+    def packed(self) -> Packed:
+        """Its rows on what they touch."""
+        return packed(self.B, self.domains, self.explicit)
+
+    @cached_property
+    def _diagonal(self) -> Vector:
+        return self.packed.diagonal([inverse for inverse, _ in self._blocks])
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:
@@ -203,6 +255,21 @@ class _Part(NamedTuple):
         whole = np.zeros((self.n, X.shape[1]))
         whole[self.b] = X
         return self.product(whole)[self.b]
+
+
+def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
+    """Read entries of a block; one that only multiplies is multiplied out in parts."""
+    if isinstance(block, _Triangle):
+        i, j = np.minimum(i, j), np.maximum(i, j)
+        return np.asarray(block.entries[j * (j + 1) // 2 + i])
+    if not isinstance(block, _Part):
+        return np.asarray(block[i, j])
+    found, n = np.empty(i.size), block.b.size
+    for first in range(0, n, COLUMNS):
+        part = (first <= j) & (j < first + COLUMNS)
+        unit = np.eye(n, min(COLUMNS, n - first), -first)
+        found[part] = (block @ unit)[i[part], j[part] - first]
+    return found
 
 
 def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
@@ -279,7 +346,7 @@ def made(arrays: Arrays) -> DualOperator:
     domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    return DualOperator(packed(B, domains, arrays["explicit"]))
+    return DualOperator(B, domains, arrays["explicit"])
 
 
 def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:

@@ -22,6 +22,11 @@ TABLE = {
     (2, 16): (2312, 200, 33, 8), (4, 4): (800, 256, 17, 32),
     (4, 8): (2592, 480, 33, 32), (8, 4): (3200, 1088, 33, 128),
 }  # fmt: skip
+#: products with F of the best of PERMON 3.25's settings, at its tolerance 1e-6
+PERMON = {
+    (1, 8): 59, (2, 4): 56, (2, 8): 57, (2, 16): 66, (4, 4): 89,
+    (4, 8): 97, (4, 16): 106, (8, 4): 90, (8, 8): 103, (12, 4): 100,
+}  # fmt: skip
 
 
 def built(form, **params):
@@ -102,6 +107,17 @@ def test_smalbe_solves_it_as_an_operator(glue):
 
     assert kkt_residuals(case.qp, s).worst <= 1e-5
     assert case.quantities(s)["contact_force"] == pytest.approx(0.25, rel=1e-5)
+
+
+@pytest.mark.parametrize(("size", "best"), PERMON.items(), ids=str)
+def test_products_stay_below_those_of_the_best_settings_of_permon(size, best):
+    S, n = size
+    case = built("dual", S=S, n=n)
+    s = SMALBE().prepare(case.qp, 1e-6)()
+
+    assert kkt_residuals(case.qp, s).worst <= 1e-5
+    assert s.counts["P_products"] < best
+    assert s.counts["preconditioner_applies"] < best
 
 
 def test_energies_fall_to_a_limit_as_the_mesh_is_refined():
