@@ -70,6 +70,7 @@ ROUNDING = 64 * float(np.finfo(float).eps)  #: of the forces, relative to the st
 MOST_ITERATIONS = 60  #: of Newton's method at one load
 HALVINGS = 8  #: of a load step
 SHORTEST = 2.0**-16  #: step of the line search
+NOISE = 8 * float(np.finfo(float).eps)  #: of the merit function, relative to energies
 ARMIJO = 1e-4  #: part of the predicted decrease that a step has to bring
 ABOVE = 1.5  #: weight of the penalty over the largest multiplier
 TURNING = 1e-8  #: part of a rigid motion that is a rotation, beyond rounding
@@ -189,9 +190,9 @@ class NewtonPath:
                 size /= 2
                 if size < least:
                     raise InputError(
-                        f"load step {k} of {self.steps}: no equilibrium beyond the "
-                        f"load factor {reached:.6g}, the last one found: {e}; expected "
-                        "a smaller load or more supports"
+                        f"load step {k} of {self.steps}: the last equilibrium is that "
+                        f"at the load factor {reached:.6g}; beyond it, {e}; expected a "
+                        "smaller load, or supports that hold the bodies better"
                     ) from None
                 continue
             parts += 1
@@ -231,15 +232,15 @@ class NewtonPath:
                 at, length, residual = self._moved(at, posed, lam, weight, best)
             except NoEquilibriumError as e:
                 raise NoEquilibriumError(
-                    f"iteration {len(found) + 1} at {load_factor:.6g}, {e}, residual "
-                    f"{best:.1e}"
+                    f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
+                    f"residual of {best:.1e}: {e}"
                 ) from None
             best = min(best, residual)
             found.append(replace(posed, length=length, residual=residual))
             if length == 1 and residual <= SETTLED + self._rounding(posed):
                 return found
         raise NoEquilibriumError(
-            f"{MOST_ITERATIONS} iterations at {load_factor:.6g} left a residual of "
+            f"at {load_factor:.6g}, {MOST_ITERATIONS} iterations left a residual of "
             f"{best:.1e}"
         )
 
@@ -379,6 +380,7 @@ class NewtonPath:
         load_factor = posed.load_factor
         d = posed.answer.x - at.u
         merit = _merit(at, weight)
+        noise = NOISE * (abs(at.cells.energy) + abs(at.energy))
         slope = float(at.r @ d) - weight * float(np.maximum(-at.gap, 0.0).sum())
         length, inverted = 1.0, None
         while length >= SHORTEST:
@@ -389,7 +391,8 @@ class NewtonPath:
             else:
                 residual = self.residual(new, lam, load_factor)
                 if (length == 1 and residual <= best / 2) or (
-                    _merit(new, weight) <= merit + ARMIJO * length * min(slope, 0.0)
+                    _merit(new, weight)
+                    <= merit + ARMIJO * length * min(slope, 0.0) + noise
                 ):
                     return new, length, residual
             length /= 2
