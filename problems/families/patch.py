@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from harness import Family, InputError
 from problems.ranges import (
     CONTACT_STIFFNESS,
+    DECOMPOSITION,
     FRICTION,
     KINEMATICS,
     METHODS,
@@ -22,6 +23,7 @@ from problems.ranges import (
     one_of,
     positive,
     rough,
+    torn_by,
 )
 
 if TYPE_CHECKING:
@@ -37,7 +39,8 @@ class ContactPatch(Family):
         default_factory=lambda: MappingProxyType({
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
-            **FRICTION, **KINEMATICS, **CONTACT_STIFFNESS, "stretch": 1.0,
+            **FRICTION, **DECOMPOSITION,
+            **KINEMATICS, **CONTACT_STIFFNESS, "stretch": 1.0,
         }),
         hash=False,
     )  # fmt: skip
@@ -52,6 +55,7 @@ class ContactPatch(Family):
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
         rough(self.name, params)
+        torn_by(self.name, params)
         deformed(self.name, params)
         self._check_stretch(params)
 
