@@ -100,7 +100,17 @@ class Bodies:
     @property
     def D(self) -> NDArray[np.float64]:
         """Elasticity matrix of each cell, (E, 3, 3), Pa."""
-        return _elasticity_matrices(self.materials, self.plane)[self.body]
+        return self.elasticity[self.body]
+
+    @property
+    def moduli(self) -> Vector:
+        """Young's modulus of each body, (bodies,), as K has it: without dimension."""
+        return np.array([m.E for m in self.materials]) * (self.length / self.force)
+
+    @property
+    def elasticity(self) -> NDArray[np.float64]:
+        """Elasticity matrix of each body, (bodies, 3, 3), Pa."""
+        return _elasticity_matrices(self.materials, self.plane)
 
 
 def assemble(

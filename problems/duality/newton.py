@@ -71,7 +71,7 @@ from problems.fem.inverse import GeneralisedInverse, Interface, floating_inverse
 from problems.fem.mesh import dofs_of
 
 SETTLED = 1e-9  #: residual of equilibrium and gaps at the end of a step
-ROUNDING = 64 * float(np.finfo(float).eps)  #: of the forces, relative to the stiffness
+ROUNDING = 2 * float(np.finfo(float).eps)  #: of the forces |K||u| within cells
 MOST_ITERATIONS = 60  #: of Newton's method at one load
 KEEP_AFTER = 20  #: of them after which nodes that press keep their segments
 HALVINGS = 8  #: of a load step
@@ -259,7 +259,9 @@ class NewtonPath:
                 else:
                     best = min(best, residual)
                     found.append(replace(posed, length=length, residual=residual))
-                    if length == 1 and residual <= SETTLED + self._rounding(posed):
+                    if length == 1 and residual <= SETTLED + self._rounding(
+                        at, lam, posed
+                    ):
                         return found
                     continue
             if gaps.keeping is None:
@@ -295,22 +297,32 @@ class NewtonPath:
         """
         pressing = lam[at.rows.place]
         contact = at.rows.B.T @ pressing
-        free = np.ones(at.u.size, dtype=bool)
-        free[self.bodies.B_D.indices] = False
-        scale = max(
-            float(np.linalg.norm(v[free]))
-            for v in (load_factor * self.bodies.f, contact)
-        )
-        left = float(np.linalg.norm((at.r + contact)[free])) / (scale or 1.0)
+        left = self._free_norm(at.r + contact) / self._forces(at, lam, load_factor)
         most = pressing.max(initial=0.0) or 1.0
         penetration = float((-at.gap).max(initial=0.0))
         apart = float((pressing / most * np.abs(at.gap)).max(initial=0.0))
         return max(left, penetration, apart)
 
-    def _rounding(self, posed: Iteration) -> float:
-        """Bound what rounding leaves of the forces: strains are known to 1e-16."""
-        stiffest = float(posed.tangent.K.diagonal().max())
-        return ROUNDING * stiffest / max(1.0, float(np.abs(self.bodies.f).max()))
+    def _forces(self, at: Configuration, lam: Vector, load_factor: float) -> float:
+        """Return the larger norm of the load and of Bᵀλ; 1 where there is neither."""
+        contact = at.rows.B.T @ lam[at.rows.place]
+        load = self._free_norm(load_factor * self.bodies.f)
+        return max(load, self._free_norm(contact)) or 1.0
+
+    def _free_norm(self, force: Vector) -> float:
+        """Return the norm of a force (n,) on the components that no support holds."""
+        free = np.ones(force.size, dtype=bool)
+        free[self.bodies.B_D.indices] = False
+        return float(np.linalg.norm(force[free]))
+
+    def _rounding(self, at: Configuration, lam: Vector, posed: Iteration) -> float:
+        """Bound what rounding leaves of `residual`.
+
+        The strains of a cell are differences of displacements, which are known to their
+        own rounding: of forces Ku it leaves a part of |K||u|.
+        """
+        rounded = self._free_norm(abs(posed.tangent.K) @ np.abs(at.u))
+        return ROUNDING * rounded / self._forces(at, lam, posed.load_factor)
 
     def _posed(
         self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps

@@ -11,6 +11,7 @@ from harness import Family, InputError
 from problems.ranges import (
     CONTACT_FORMS,
     CONTACT_STIFFNESS,
+    DECOMPOSITION,
     FRICTION,
     KINEMATICS,
     METHODS,
@@ -23,6 +24,7 @@ from problems.ranges import (
     fits,
     one_of,
     rough,
+    torn_by,
     without_friction,
 )
 
@@ -41,7 +43,8 @@ class BeamRing(Family):
         default_factory=lambda: MappingProxyType({
             "Nr": 10, "Nh": 5, "radial": 0, "steps": 10, "step": 0,
             "contact": "nts", "basis": "dual", "relin": 1, "plane": "strain",
-            **FRICTION, **KINEMATICS, **CONTACT_STIFFNESS,
+            **FRICTION, **DECOMPOSITION,
+            **KINEMATICS, **CONTACT_STIFFNESS,
         }),
         hash=False,
     )  # fmt: skip
@@ -74,6 +77,7 @@ class BeamRing(Family):
             )
         one_of(self.name, p, METHODS | PLANES)
         rough(self.name, p)
+        torn_by(self.name, p)
         deformed(self.name, p)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
+    DECOMPOSITION,
     FRICTION,
     KINEMATICS,
     METHODS,
@@ -21,6 +22,7 @@ from problems.ranges import (
     one_of,
     positive,
     rough,
+    torn_by,
 )
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ class ContactPatch(Family):
         default_factory=lambda: MappingProxyType({
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
-            **FRICTION, **KINEMATICS, "stretch": 1.0,
+            **FRICTION, **DECOMPOSITION, **KINEMATICS, "stretch": 1.0,
         }),
         hash=False,
     )  # fmt: skip
@@ -51,6 +53,7 @@ class ContactPatch(Family):
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
         rough(self.name, params)
+        torn_by(self.name, params)
         deformed(self.name, params)
         self._check_stretch(params)
 

@@ -13,7 +13,7 @@ per unit thickness are not stated but implied.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -61,8 +63,10 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     )  # fmt: skip
     problem = path.problem(p["step"], p["iterate"])
     primal, friction = problem.primal, problem.friction
+    subdivided = partial(_subdivided, p["feti"], *geometry)
     return contact_case(
         bodies, primal, form,
+        torn=posed_on(params, subdivided, primal, friction),
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
@@ -89,6 +93,14 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
 
 
 @lru_cache(maxsize=4)
+def _subdivided(
+    most: int, Nr: int, Nh: int, radial: int, plane: Plane
+) -> SubdividedBodies:
+    label = structured_bodies([(8 * Nr, Nr), (12 * Nh, radial)], most)
+    return subdivide(model(Nr, Nh, radial, plane), label)
+
+
+@lru_cache(maxsize=4)
 def _floating(*geometry: Any) -> GeneralisedInverse:
     return floating(model(*geometry))
 
@@ -110,8 +122,8 @@ def _path(
 ) -> LoadPath:
     linearise = linearisation(model(*geometry), *method, [law])
     return LoadPath(
-        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin,
-        laws=(law,), quasi_static=quasi_static,
+        model(*geometry), linearise, lambda: _clamped(*geometry), reference,
+        steps, relin, laws=(law,), quasi_static=quasi_static,
     )  # fmt: skip
 
 
