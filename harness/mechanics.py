@@ -7,12 +7,13 @@ whatever form of the problem the solver was handed; see `harness.verify.certific
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
 
 from harness.qp import QP, Matrix, Vector, no_rows
@@ -45,6 +46,34 @@ class Inverse(Protocol):
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n)."""
 
 
+class Substructures(Protocol):
+    """The stiffness as a sum over subdomains that float:  K = Tᵀ diag(K_1 … K_S) T.
+
+    Torn unknowns v (N,) have a copy of each component in every subdomain around it, in
+    axes of that subdomain. The rigid motions R_s of a subdomain are exactly the kernel
+    of what is meant by K_s, that is of P_s K_s P_s with P_s = I − R_sR_sᵀ: what
+    rounding left of K_s R_s is no part of the problem.
+    """
+
+    @property
+    def spread(self) -> csr_array:
+        """T (N, n): copies a displacement u of the whole into the subdomains."""
+
+    @property
+    def kernel(self) -> csr_array:
+        """Orthonormal rigid motions R (N, r), each of one subdomain."""
+
+    @property
+    def weight(self) -> Vector:
+        """Relative stiffness (N,) of the copies, one for all components of a node."""
+
+    def product(self, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply PKP to v (N,), in its precision."""
+
+    def solve(self, b: Vector) -> Vector:
+        """Apply PK⁺P to forces (N,)."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Friction:
     """Friction with a given bound, as Tresca's law has it; none without rows.
@@ -67,6 +96,7 @@ class Friction:
     row: NDArray[np.int64]  #: (k,) the contact row of each
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
+    unsettled: float = 0.0  #: `residual` at the solution with this bound, where known
 
     def demanded(self, normal: Vector) -> Vector:
         """Return cohesion + mu·λ_n (k,), never negative, for normal forces (m,)."""
@@ -79,8 +109,8 @@ class Friction:
 
     def __getitem__(self, kept: NDArray[Any]) -> Friction:
         """Keep some of the rows."""
-        data = {name: value[kept] for name, value in vars(self).items()}
-        return Friction(**data)
+        rows = {k: v[kept] for k, v in vars(self).items() if k != "unsettled"}
+        return replace(self, **rows)
 
 
 _NOTHING = np.zeros(0)
@@ -128,14 +158,13 @@ def with_friction(primal: QP, friction: Friction) -> QP:
 
 
 class Exact(NamedTuple):
-    """The data of the contact problem in extended precision.
+    """The data of the contact problem but K, in extended precision.
 
     The rows are those of the contact and, below them, those of the friction. With
     v = Bu − c all have one law: the multiplier is between its bounds, v = 0 where it is
     strictly between them, v ≤ 0 at the lower and v ≥ 0 at the upper one.
     """
 
-    K: Any  #: (n, n) sparse
     f: Extended  #: (n,)
     B: Any  #: (m, n) sparse, contact and friction
     c: Extended  #: (m,)
@@ -218,6 +247,8 @@ class Mechanics:
         None  #: to compare meshes, see `harness.crossval.discretisation`
     )
     friction: Friction = NO_FRICTION
+    #: called once, if at all; with it, certificates need no factor of the whole K
+    tear: Callable[[], Substructures] | None = None
 
     @cached_property
     def rows(self) -> csr_array:
@@ -247,44 +278,73 @@ class Mechanics:
     @cached_property
     def exact(self) -> Exact:
         """The data in extended precision."""
-        K, B = csr_array(self.primal.P), self.rows
+        diagonal, B = self.primal.P.diagonal(), self.rows
         c = contact_rows(self.primal, self._carrying)[1]
         bound, contact = self._carrying.bound.astype(Real), self.primal.h.size
         held = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
-        softness = 1 / np.where(K.diagonal() > 0, K.diagonal(), np.inf)
+        softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
         softness[held] = 0
         return Exact(
-            K=K.astype(Real), f=-self.primal.q.astype(Real), B=B.astype(Real),
+            f=-self.primal.q.astype(Real), B=B.astype(Real),
             c=c.astype(Real), held=held,
             lower=np.append(np.zeros(contact, dtype=Real), -bound),
             upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
             loose=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 
+    @cached_property
+    def stiffness(self) -> Any:
+        """K (n, n), sparse, in extended precision."""
+        return csr_array(self.primal.P).astype(Real)
+
+    @cached_property
+    def substructures(self) -> Substructures:
+        """K as a sum over subdomains, torn at the first use."""
+        assert self.tear is not None
+        return self.tear()
+
+    @cached_property
+    def whole(self) -> Mechanics:
+        """The same without subdomains: for what needs K⁺, or u_λ without jumps."""
+        return self if self.tear is None else replace(self, tear=None)
+
     def energy(self, u: Extended) -> float:
         """Return the potential energy of `u` (n,), SI, summed in extended precision.
 
         The work of friction is a part of it.
         """
-        objective = 0.5 * (u @ (self.exact.K @ u)) - self.exact.f @ u
+        objective = 0.5 * (u @ (self.stiffness @ u)) - self.exact.f @ u
         objective = objective + self.exact.friction_work(u).sum()
         return float(self.scale * objective + self.constant)
 
     @cached_property
+    def _unsupported(self) -> NDArray[np.float64]:
+        """Orthonormal rigid motions (n, r) that the supports leave."""
+        if self.tear is None:
+            return self.inverse.kernel
+        held = self.exact.held
+        R = self.rigid @ null_space(self.rigid[held]) if held.size else self.rigid
+        R[held] = 0
+        return np.asarray(np.linalg.qr(R)[0])
+
+    @cached_property
     def kernel(self) -> Any:
         """All rigid motions that the supports leave (n, r), sparse, in extended."""
-        return _orthonormal(self.inverse.kernel)
+        return _orthonormal(self._unsupported)
 
     @cached_property
     def motions(self) -> RigidMotions:
         """These motions, split by whether contact feels them."""
-        exact, B, R = self.exact, self.rows, self.inverse.kernel
+        exact, B, R = self.exact, self.rows, self._unsupported
         turn, p = felt_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
         felt = turned[:, :p]
-        KR = _cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
-        KR[exact.held] = 0
-        bent = [self.relaxed(column) for column in KR.T]
+        KR = np.zeros(felt.shape, dtype=Real)
+        if self.tear is None:  # KR is exactly zero of subdomains
+            K = csr_array(self.primal.P)
+            KR = _cancelling(K, np.asarray(felt.toarray()))
+            KR[exact.held] = 0
+        bent = [self.relaxed(k) if k.any() else k for k in KR.T]
         strain = np.array([[float(k @ b) for b in bent] for k in KR.T])
         return RigidMotions(
             felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
@@ -329,7 +389,7 @@ class Mechanics:
         motion that is large beside the deformation would show.
         """
         v = self.still(v)
-        return float(np.sqrt(max(v @ (self.exact.K @ v), Real(0))))
+        return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 
 def _orthonormal(R: NDArray[np.float64]) -> Any:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,29 @@ Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 #: takes plain arrays and returns x ↦ Px, which must also take (n, k) matrices
 Maker = Callable[[Arrays], Product]
 NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
+
+
+@runtime_checkable
+class Preconditioned(Protocol):
+    """A product x ↦ Px that also knows approximate inverses of P.
+
+    A maker may return one; solvers find it by `SerialisableOperator.build`.
+    """
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Multiply (n,) or (n, k) with P."""
+
+    def preconditioner(self, kind: str, scaling: str) -> Product:
+        """Make x ↦ Mx, symmetric positive semidefinite, for (n,) and (n, k).
+
+        kind, scaling : names of its own
+
+        Raises
+        ------
+        ValueError
+            When there is none of these names; the message lists what there is.
+
+        """
 
 
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
@@ -72,3 +95,11 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
     def _adjoint(self) -> SerialisableOperator:
         return self
+
+
+def assembled(P: LinearOperator) -> NDArray[np.float64]:
+    """Multiply an operator out: the symmetric part of P·1, (n, n)."""
+    M = np.asarray(P @ np.eye(P.shape[0]))
+    M += M.T.copy()
+    M /= 2
+    return M

@@ -22,7 +22,7 @@ from harness.registry import (
     load_plugin,
     merged,
 )
-from problems import PROBLEMS
+from problems import OPERATORS, PROBLEMS
 from solvers import SOLVERS
 
 if TYPE_CHECKING:
@@ -114,9 +114,10 @@ class Registries:
     reference: Reference = reference
     report: Reporter = _report
     validation_page: ValidationPage = _validation_page
-    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.operators`
+    #: what puts an operator P together, see `harness.operators`
+    operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     #: those of them that did not come in a file
-    own_operators: Mapping[str, Maker] = field(default_factory=dict)
+    own_operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     suites: Path = field(default_factory=suites_folder)
     files: tuple[
         PluginFile, ...
@@ -168,7 +169,7 @@ class Registries:
         return (
             self.families is PROBLEMS
             and self.solvers is SOLVERS
-            and not self.operators
+            and self.operators is OPERATORS
             and not self.files
         )
 

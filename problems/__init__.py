@@ -1,7 +1,14 @@
 """Families of problems: each emits the same contact problem as several QPs."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from harness.plugin import Family
 from harness.registry import Registry, entry
+
+if TYPE_CHECKING:
+    from harness.operators import Maker
 
 PROBLEMS: Registry[Family] = Registry(
     {
@@ -12,10 +19,17 @@ PROBLEMS: Registry[Family] = Registry(
         "half-plane": entry("problems.families.half_plane", "HalfPlane"),
         "greco": entry("problems.families.greco", "Greco"),
         "obstacle": entry("problems.families.obstacle", "Obstacle"),
+        "membranes": entry("problems.families.membranes", "Membranes"),
         "string": entry("problems.families.variational", "String"),
         "journal-bearing": entry("problems.families.variational", "JournalBearing"),
         "torsion": entry("problems.families.variational", "Torsion"),
+        "plate": entry("problems.families.plate", "Plate"),
         "bodies": entry("problems.families.gmsh_bodies", "GmshBodies"),
         "file": entry("problems.families.from_file", "FromFile"),
     }
+)
+
+#: what puts an operator P of these families together, see `harness.operators`
+OPERATORS: Registry[Maker] = Registry(
+    {"tfeti": entry("problems.feti.operators", "made")}
 )

@@ -77,9 +77,10 @@ def assess(
     gap, contact = -exact.motion(u), exact.contact
     at_rest, _ = equilibrium(mechanics, exact.f - exact.B.T @ lam)
     off, off_rest = u - truth.u, at_rest - truth.equilibrium
-    slope = exact.K @ truth.u - exact.f
+    K = mechanics.stiffness
+    slope = K @ truth.u - exact.f
     rubbed = exact.friction_work(u) - exact.friction_work(truth.u)
-    energy = float(slope @ off + 0.5 * (off @ (exact.K @ off)) + rubbed.sum())
+    energy = float(slope @ off + 0.5 * (off @ (K @ off)) + rubbed.sum())
     length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
     small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
     closed, strict = _closed(exact, lam, gap, small)

@@ -36,7 +36,7 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
     Returns u, without rigid motion, and the energy norm of what one refinement left
     undone, √(rᵀK⁺r) with the residual r, in extended precision.
     """
-    K, held = mechanics.exact.K, mechanics.exact.held
+    K, held = mechanics.stiffness, mechanics.exact.held
     u = np.zeros(force.size, dtype=Real)
     for _ in range(3):
         r = force - K @ u

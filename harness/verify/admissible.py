@@ -85,14 +85,46 @@ def _shrunk(mechanics: Mechanics, u: Extended) -> Extended | None:
 def _nearest(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
-    """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t."""
+    """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t.
+
+    Smallest in the energy norm, or in that of diag(K) where K⁺ is not to be had: then
+    only nodes move that rows touch.
+    """
     B_V = mechanics.rows[np.flatnonzero(rows)]
+    if mechanics.tear is not None:
+        return _nearest_at_rows(mechanics, B_V)
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
     felt = mechanics.motions.felt.astype(np.float64)
 
     def step(t: Vector) -> Vector:
         mu, alpha = solve(t, np.zeros(mechanics.motions.felt.shape[1]))
         return np.asarray(felt @ alpha - inverse(B_V.T @ mu))
+
+    return step
+
+
+def _nearest_at_rows(
+    mechanics: Mechanics, B_V: csr_array
+) -> Callable[[Vector], Vector]:
+    """Return the map from t to δ with  B_V(δ + Rα) = −t,  smallest in the norm of D.
+
+    D is diag(K), infinite where a support holds. The rigid motions R that contact feels
+    cost nothing.
+    """
+    softness = 1 / mechanics.primal.P.diagonal()
+    softness[mechanics.exact.held] = 0
+    moved = csr_array(diags_array(softness) @ B_V.T)
+    S = csc_array(B_V @ moved)
+    shift = 1e-13 * S.diagonal().max() + np.finfo(float).tiny
+    factor = splu(csc_matrix(S + shift * eye_array(S.shape[0])))
+    R = mechanics.motions.felt.toarray().astype(np.float64)
+    G = B_V @ R
+    SG = factor.solve(G) if G.size else G
+    stiff = np.linalg.pinv(G.T @ SG, hermitian=True)
+
+    def step(t: Vector) -> Vector:
+        alpha = -(stiff @ (SG.T @ t))
+        return np.asarray(R @ alpha - moved @ factor.solve(t + G @ alpha))
 
     return step
 

@@ -71,6 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
+from harness.verify.substructured import neighbour
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -90,7 +91,7 @@ class Certificate:
 
     u: Extended  #: û (n,)
     multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    equilibrium: Extended  #: u_λ (n,)
+    equilibrium: Extended  #: u_λ (n,); of substructures torn, (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
@@ -167,7 +168,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     if not found:
         raise UncertifiableError(f"no admissible pair near the answer: {tried[0]}")
     best = min(found, key=lambda c: c.error)
-    if best.least >= best.error:
+    if best.least >= best.error or mechanics.tear is not None:
         return best
     return replace(best, least=max(best.least, _least_norm(mechanics)))
 
@@ -188,28 +189,29 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    none = np.zeros(multipliers.size, dtype=bool)
-    own = _proved(mechanics, claimed, u, multipliers, none)
-    yield own
-    if _sharp(own):
-        return
     states = suggested(mechanics, u, multipliers)
-    tidied = at_bounds(mechanics, states, multipliers)
-    other = _proved(mechanics, claimed, u, tidied, states == CLOSED)
-    yield other
-    proven = min(
-        (c.bound for c in (own, other) if isinstance(c, Certificate)), default=np.inf
-    )
-    floats = mechanics.inverse.kernel.shape[1] > 0
-    if floats and GOOD < proven <= NEAR and not _sharp(other):
+    tidied = at_bounds(mechanics, states, multipliers), states == CLOSED
+    pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
+    if mechanics.tear is not None:
+        pairs.reverse()  # of large problems what mostly is enough comes first
+    proven = np.inf
+    for pair in pairs:
+        found = _proved(mechanics, claimed, u, *pair)
+        yield found
+        if _sharp(found):
+            return
+        proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
+    exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
+    if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
         yield _proved(mechanics, claimed, v, mu, states == CLOSED)
 
 
 def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
     """Evaluate the proof, or say why there is none."""
+    prove = proof if mechanics.tear is None else _substructured_proof
     try:
-        return proof(mechanics, *pair)
+        return prove(mechanics, *pair)
     except UncertifiableError as e:
         return str(e)
 
@@ -244,31 +246,95 @@ def proof(
     deformed, left = equilibrium(mechanics, force)
     at_rest = deformed + motions.felt @ alpha
     apart = mechanics.norm(feasible - at_rest)
-    total, nearest = apart + left, apart - left
     works = exact.friction_work(feasible) + lam * gaps
-    work, sliding = float(works.sum()), float(works[~exact.contact].sum())
-    square = total * total + 2 * work
+    total = apart + left
+    square = total * total + 2 * float(works.sum())
     unbalanced = motions.felt.T @ force - motions.KR.T @ deformed
     held, _ = held_and_loose(motions.G, relative(exact.interior(lam)))
     rounding = _rounding(
         mechanics, _reach(mechanics, held, lam, gaps, square), unbalanced, left, square
     )
-    gap = 0.5 * (square + rounding)
     middle = (feasible + at_rest) * Real(0.5)
+    return _certificate(
+        mechanics, u=feasible, multipliers=lam, equilibrium=at_rest,
+        norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
+        apart=apart, left=left, works=works, rounding=rounding,
+        from_middle=_length(mechanics, claimed - middle, held),
+        moved=mechanics.norm(claimed - feasible),
+    )  # fmt: skip
+
+
+def _certificate(
+    mechanics: Mechanics, *, u: Extended, multipliers: Extended, equilibrium: Extended,
+    norms: list[float], apart: float, left: float, works: Extended, rounding: float,
+    from_middle: float, moved: float,
+) -> Certificate:  # fmt: skip
+    """Put the terms of (2) and (3) together.
+
+    Parameters
+    ----------
+    norms : of û, of u_λ and of M
+    apart, left : ‖û − u_λ‖ as computed, and what the solve for u_λ left undone
+    works : (m,) that make up `work`
+    from_middle : from the answer to M
+
+    Raises
+    ------
+    UncertifiableError
+        When the answer is too large for arithmetic.
+
+    """
+    total, nearest = apart + left, apart - left
+    work = float(works.sum())
+    gap = 0.5 * (total * total + 2 * work + rounding)
     around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
-    norms = [mechanics.norm(v) for v in (feasible, at_rest, middle)]
     pair = np.sqrt(2 * gap)
     found = Certificate(
-        u=feasible, multipliers=lam, equilibrium=at_rest, norm=norms[0],
-        distance=total, work=work, sliding=sliding, rounding=rounding,
-        claimed=_length(mechanics, claimed - middle, held) + float(around),
+        u=u, multipliers=multipliers, equilibrium=equilibrium, norm=norms[0],
+        distance=total, work=work, sliding=float(works[~mechanics.exact.contact].sum()),
+        rounding=rounding, claimed=from_middle + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
-        moved=mechanics.norm(claimed - feasible),
-        seminorm=mechanics.inverse.kernel.shape[1] > 0,
+        moved=moved, seminorm=mechanics.kernel.shape[1] > 0,
     )  # fmt: skip
     if not np.isfinite(found.error):
         raise UncertifiableError("the answer is too large for arithmetic")
     return found
+
+
+def _substructured_proof(
+    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
+    closed: Any,
+) -> Certificate:  # fmt: skip
+    """Evaluate (1) and (3) with the u_λ of `harness.verify.substructured`.
+
+    Raises
+    ------
+    UncertifiableError
+        When u or λ cannot be mended.
+
+    """
+    exact, motions, parts = mechanics.exact, mechanics.motions, mechanics.substructures
+    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    if feasible is None:
+        raise UncertifiableError("the answer penetrates beyond repair")
+    lam = balanced(mechanics, multipliers, feasible)
+    near = neighbour(mechanics, feasible, lam)
+    moved = (parts.spread @ (claimed - feasible)).astype(np.float64)
+    stretched = (near.Ku, near.Kd, parts.product(moved))
+    energy = np.array([[v @ Kw for Kw in stretched] for v in (near.u, near.d, moved)])
+
+    def length(*combined: float) -> float:
+        """Return the norm of a combination of Tû, d and T(u − û)."""
+        w = np.array(combined, dtype=Real)
+        return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
+
+    return _certificate(
+        mechanics, u=feasible, multipliers=lam, equilibrium=near.u - near.d,
+        norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
+        apart=length(0, 1, 0), left=near.left,
+        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
+        rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
+    )  # fmt: skip
 
 
 def _length(mechanics: Mechanics, v: Extended, held: NDArray[np.float64]) -> float:
@@ -276,7 +342,7 @@ def _length(mechanics: Mechanics, v: Extended, held: NDArray[np.float64]) -> flo
     R = mechanics.motions.felt @ held
     deformed = mechanics.still(v)
     whole = deformed + R @ (R.T @ v)
-    squares = [x @ (mechanics.exact.K @ x) for x in (deformed, whole)]
+    squares = [x @ (mechanics.stiffness @ x) for x in (deformed, whole)]
     return float(np.sqrt(max(*squares, Real(0))))
 
 

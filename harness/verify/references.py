@@ -72,6 +72,7 @@ def reference_point(
         When no admissible pair was found, or `solve` failed.
 
     """
+    mechanics = mechanics.whole
     path = folder / f"{qp_digest(mechanics.program)}.npz" if folder else None
     rows = mechanics.exact.c.size
     stored = _stored(path, rows) if path is not None and path.exists() else None

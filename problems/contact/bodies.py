@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import InputError, Vector
@@ -26,7 +25,7 @@ from problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from problems.fem.mesh import Mesh, Nodes, dofs_of
+from problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
 
 
 class ContactPair(NamedTuple):
@@ -76,28 +75,44 @@ class Bodies:
     @property
     def interface(self) -> Nodes:
         """Displacement components that contact rows can touch, ascending."""
-        return np.unique(
-            dofs_of(np.concatenate([np.concatenate(p) for p in self.pairs]))
-        )
+        sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
+        return np.unique(dofs_of(np.concatenate(sides)))
 
     @property
     def rigid(self) -> NDArray[np.float64]:
         """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
         owner, points = self.body_of_node, self.mesh.points
-        modes = [rigid_modes(points[owner == b]) for b in range(len(self.names))]
-        return np.asarray(block_diag(*modes))
+        motions = np.zeros((points.size, 3 * len(self.names)))
+        for b in range(len(self.names)):
+            own = dofs_of(np.flatnonzero(owner == b))
+            motions[own, 3 * b : 3 * b + 3] = rigid_modes(points[owner == b])
+        return motions
 
     @property
     def mesh_size(self) -> float:
-        """Mean distance of neighbours on the slave sides, in lengths `length`."""
-        sides = [self.mesh.points[pair.slave] for pair in self.pairs]
+        """Mean distance of neighbours on the slave sides, in lengths `length`.
+
+        Where there are none, on all sides.
+        """
+        chains = [pair.slave for pair in self.pairs] or boundary_edges(self.mesh.cells)
+        sides = [self.mesh.points[chain] for chain in chains]
         steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
         return float(np.concatenate(steps).mean() / self.length)
 
     @property
     def D(self) -> NDArray[np.float64]:
         """Elasticity matrix of each cell, (E, 3, 3), Pa."""
-        return _elasticity_matrices(self.materials, self.plane)[self.body]
+        return self.elasticity[self.body]
+
+    @property
+    def moduli(self) -> Vector:
+        """Young's modulus of each body, (bodies,), as K has it: without dimension."""
+        return np.array([m.E for m in self.materials]) * (self.length / self.force)
+
+    @property
+    def elasticity(self) -> NDArray[np.float64]:
+        """Elasticity matrix of each body, (bodies, 3, 3), Pa."""
+        return _elasticity_matrices(self.materials, self.plane)
 
 
 def assemble(

@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
+    DECOMPOSITION,
     FRICTION,
+    KINEMATICS,
     METHODS,
     MOST_STEPS,
     PLANES,
     at_least,
     at_most,
+    deformed,
     fits,
     one_of,
     positive,
     rough,
     tangential,
+    torn_by,
     without_friction,
 )
 
@@ -35,6 +39,7 @@ class HertzPlane(Family):
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "n": 10, "load": 10.0, "plane": "strain", "halvings": 0,
+            **DECOMPOSITION, **KINEMATICS,
         }),
         hash=False,
     )  # fmt: skip
@@ -48,9 +53,17 @@ class HertzPlane(Family):
         fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         positive(self.name, params, ("load",))
         one_of(self.name, params, PLANES)
+        torn_by(self.name, params)
+        deformed(self.name, params)
 
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return the case with every cell halved; the arcs are other polygons."""
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        """Return the case with every cell halved; the arcs are other polygons.
+
+        At finite strain there is none: the QP of another mesh is linearised at another
+        state.
+        """
+        if params["kinematics"] == "finite":
+            return None
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
@@ -59,9 +72,8 @@ class HertzPlane(Family):
         """Emit the QP in one form."""
         from problems.models.hertz import cylinder_on_plane
 
-        del reference  # the gap to a plane is linear in u
         self.check(params)
-        return cylinder_on_plane(form, params)
+        return cylinder_on_plane(form, params, reference)
 
 
 @dataclass(frozen=True)
@@ -74,7 +86,7 @@ class HertzCylinder(Family):
             "n": 10, "m": 8, "load": 1.0, "radius": 1.0, "ratio": 1.0,
             "slave": "upper", "contact": "mortar", "basis": "dual", "plane": "strain",
             "halvings": 0, **FRICTION, "Q": 0.0, "peak": 0.0,
-            "programme": "normal-first", "steps": 20,
+            "programme": "normal-first", "steps": 20, **DECOMPOSITION,
         }),
         hash=False,
     )  # fmt: skip
@@ -96,6 +108,7 @@ class HertzCylinder(Family):
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
+        torn_by(self.name, params)
 
     def _check_tangential(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless the keys of the tangential force fit together."""

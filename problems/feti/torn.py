@@ -12,24 +12,160 @@ displacement u (n,) of the whole is v = T u, one d×d block per torn node.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csc_array, csc_matrix, csr_array
+from sksparse.cholmod import Factor, cholesky
 
 from harness import Vector
 from problems.fem.mesh import Nodes
 
+Dense = NDArray[np.float64]
+_STRIP = 256  #: right-hand sides that are solved for at once
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Kind:
-    """A subdomain, up to its place: what all subdomains of one kind share."""
+    """A subdomain, up to its place: what all subdomains of one kind share.
+
+    K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
+    components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). All
+    subdomains of a kind are solved for at once, as columns of one right-hand side.
+    """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
     fixing: Nodes  #: components of few nodes that no motion of R leaves at rest
+    #: components of all nodes on the boundary of the subdomain, ascending: those that
+    #: Dirichlet preconditioners condense onto, glued or free
+    boundary: Nodes
+    stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
+
+    def inverse(self, b: Dense) -> Dense:
+        """Apply K⁺ to columns (n_k, k)."""
+        return np.asarray(self._factor(b))
+
+    def block(self, b: Nodes) -> csr_array:
+        """Return K_bb."""
+        return csr_array(self.K[b][:, b])
+
+    def condensed(self, b: Nodes) -> Condensed:
+        """Condense onto components b: what is inside is eliminated once for both.
+
+        ::
+
+            (K⁺)_bb = ((S_h + ρR*R*ᵀ)⁻¹)_bb,    S_h = K_hh − K_hi K_ii⁻¹K_ih
+
+        where h are the boundary, b and the fixing components, and i all others.
+        """
+        g = np.union1d(self.boundary, b)
+        h = np.union1d(g, self.fixing)
+        S, at = self.elimination(h) @ np.eye(h.size), np.searchsorted(h, b)
+        K_rho, fixed = S.copy(), np.searchsorted(h, self.fixing)
+        K_rho[np.ix_(fixed, fixed)] += self._held
+        C = cho_solve(cho_factor(K_rho, lower=True), np.eye(h.size)[:, at])[at]
+        S_bb, inner = S[np.ix_(at, at)], ~np.isin(h, g)
+        if inner.any():
+            S_ib = S[inner][:, at]
+            S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
+        return Condensed(_symmetric(C), _symmetric(S_bb))
+
+    def elimination(self, h: Nodes) -> Elimination:
+        """Eliminate all components but h; S on these multiplies columns."""
+        i = np.setdiff1d(np.arange(self.K.shape[0]), h)
+        order = np.concatenate([h, i])
+        K = csc_array(csc_array(self.K[:, order])[order])
+        K_hh, K_ih = csr_array(K[: h.size, : h.size]), csr_array(K[h.size :, : h.size])
+        factor = cholesky(csc_matrix(K[h.size :, h.size :])) if i.size else None
+        return Elimination(K_hh, K_ih, factor)
+
+    @cached_property
+    def _held(self) -> Dense:
+        """ρR*R*ᵀ at the fixing components, (p, p)."""
+        star = np.linalg.qr(self.R[self.fixing])[0]
+        return np.asarray(self.K.diagonal().max() * (star @ star.T))
+
+    @cached_property
+    def _factor(self) -> Factor:
+        """Factorise K_ρ, where it is first needed."""
+        p = self.fixing.size
+        where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
+        held = csc_array((self._held.ravel(), where), shape=self.K.shape)
+        return cholesky(csc_matrix(self.K + held))
+
+
+class Condensed(NamedTuple):
+    """Blocks of one kind on components b."""
+
+    compliance: Dense  #: (K⁺)_bb
+    schur: Dense  #: S_bb of S condensed onto the boundary and b
+
+
+class Elimination(NamedTuple):
+    """S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
+
+    K_hh: csr_array
+    K_ih: csr_array
+    factor: Factor | None  #: of K_ii, where there is any i
+
+    def __matmul__(self, X: Dense) -> Dense:
+        SX = np.asarray(self.K_hh @ X)
+        if self.factor is not None:
+            for begin in range(0, X.shape[1], _STRIP):
+                strip = slice(begin, begin + _STRIP)
+                SX[:, strip] -= self.K_ih.T @ self.factor(self.K_ih @ X[:, strip])
+        return SX
+
+
+@dataclass(frozen=True, eq=False)
+class Subdomains:
+    """S subdomains, each of one of few kinds, that nothing holds together yet."""
+
+    kinds: tuple[Kind, ...]
+    kind: NDArray[np.int64]  #: (S,) of each subdomain
+
+    @cached_property
+    def start(self) -> NDArray[np.int64]:
+        """First torn unknown of each subdomain, and N: (S + 1,)."""
+        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
+        return np.concatenate([[0], np.cumsum(sizes)])
+
+    @cached_property
+    def members(self) -> tuple[NDArray[np.int64], ...]:
+        """Subdomains of each kind."""
+        order = np.argsort(self.kind, kind="stable")
+        ends = np.cumsum(np.bincount(self.kind, minlength=len(self.kinds)))
+        return tuple(np.split(order, ends[:-1]))
+
+    @cached_property
+    def kernel(self) -> csr_array:
+        """R = diag(R_1 … R_S), (N, Σr)."""
+        modes = np.array([kind.R.shape[1] for kind in self.kinds])[self.kind]
+        sizes = np.diff(self.start)
+        entries = np.concatenate([self.kinds[k].R.ravel() for k in self.kind])
+        per_row = np.repeat(modes, sizes)
+        ends = np.concatenate([[0], np.cumsum(per_row)])
+        along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
+        columns = np.repeat(np.cumsum(modes) - modes, sizes * modes) + along
+        return csr_array((entries, columns, ends), shape=(sizes.sum(), modes.sum()))
+
+    def places(self) -> Iterator[NDArray[np.int64]]:
+        """Give the torn unknowns of each kind, (n_k, S_k): a column per subdomain."""
+        for kind, members in zip(self.kinds, self.members, strict=True):
+            yield self.start[members] + np.arange(kind.R.shape[0])[:, None]
+
+    def inverse(self, b: Vector) -> Vector:
+        """Apply K⁺ to a torn vector (N,)."""
+        v = np.empty_like(b)
+        for kind, place in zip(self.kinds, self.places(), strict=True):
+            v[place] = kind.inverse(b[place])
+        return v
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,8 +190,16 @@ class Torn:
     f: Vector  #: (N,) Tᵀf is the load of the whole
     equalities: int  #: rows of B that are equations, the first ones
 
-    @cached_property
+    @property
     def start(self) -> NDArray[np.int64]:
         """First torn unknown of each subdomain, and N: (S + 1,)."""
-        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
-        return np.concatenate([[0], np.cumsum(sizes)])
+        return self.domains.start
+
+    @cached_property
+    def domains(self) -> Subdomains:
+        """The subdomains on their own, with what is factorised once."""
+        return Subdomains(self.kinds, self.kind)
+
+
+def _symmetric(M: Dense) -> Dense:
+    return np.asarray((M + M.T) / 2)

@@ -13,21 +13,25 @@ per unit thickness are not stated but implied.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
-from harness import Case, Reference, Value
+from harness import Case, Reference, Solution, Value
 from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
 from problems.contact.friction import FrictionLaw, law_of
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
+from problems.duality.newton import NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -41,21 +45,32 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     bodies = model(*geometry)
     method = (p["contact"], p["basis"])
+    sides = bodies.mesh.boundaries
+    tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+
+    def tip_of(s: Solution) -> dict[str, Any]:
+        return {"tip": (s.x[tip] * LENGTH).tolist()}
+
+    if p["kinematics"] == "finite":
+        finite = _newton_path(
+            geometry, method, p["steps"], p["material"], p["contact_stiffness"],
+            reference,
+        )  # fmt: skip
+        return newton_case(finite, form, p["step"], p["newton"], lambda _, s: tip_of(s))
     path = _path(
         geometry, method, p["steps"], p["relin"], law_of(params),
         p["loading"] == "quasi-static", reference,
     )  # fmt: skip
     problem = path.problem(p["step"], p["iterate"])
     primal, friction = problem.primal, problem.friction
-    sides = bodies.mesh.boundaries
-    tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+    subdivided = partial(_subdivided, p["feti"], *geometry)
     return contact_case(
         bodies, primal, form,
+        torn=posed_on(params, subdivided, primal, friction),
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
-        quantities=lambda s: quantities(bodies, primal, s, friction)
-        | {"tip": (s.x[tip] * LENGTH).tolist()},
+        quantities=lambda s: quantities(bodies, primal, s, friction) | tip_of(s),
         friction=friction,
     )  # fmt: skip
 
@@ -75,6 +90,14 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
         units=(LENGTH, LOAD), fixed=np.concatenate(clamps), load=load,
         pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4)
+def _subdivided(
+    most: int, Nr: int, Nh: int, radial: int, plane: Plane
+) -> SubdividedBodies:
+    label = structured_bodies([(8 * Nr, Nr), (12 * Nh, radial)], most)
+    return subdivide(model(Nr, Nh, radial, plane), label)
 
 
 @lru_cache(maxsize=4)
@@ -99,6 +122,20 @@ def _path(
 ) -> LoadPath:
     linearise = linearisation(model(*geometry), *method, [law])
     return LoadPath(
-        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin,
-        laws=(law,), quasi_static=quasi_static,
+        model(*geometry), linearise, lambda: _clamped(*geometry), reference,
+        steps, relin, laws=(law,), quasi_static=quasi_static,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    geometry: tuple[Any, ...],
+    method: tuple[Any, Any],
+    steps: int,
+    material: str,
+    contact_stiffness: str,
+    reference: Reference,
+) -> NewtonPath:
+    bodies = model(*geometry)
+    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)

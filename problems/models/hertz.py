@@ -58,9 +58,13 @@ from problems.contact.results import contact_forces, quantities
 from problems.contact.rigid_plane import above_plane
 from problems.duality.case_forms import contact_case
 from problems.duality.dualisation import dualise
+from problems.duality.newton import NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
@@ -72,8 +76,33 @@ UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
 CURVE = 601  #: points of exact tractions in pictures, over that part
 
 
-def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP in one form."""
+def cylinder_on_plane(
+    form: str, params: Mapping[str, Value], reference: Reference
+) -> Case:
+    """Emit the QP in one form; at finite strain the gap to the plane is linear, too."""
+    bodies, rows, exact = _on_plane(params)
+    if params["kinematics"] == "linear":
+        return _case(bodies, rows, form, exact, params)
+    path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
+    case = newton_case(
+        path, form, 1, int(params["newton"]),
+        lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
+    )  # fmt: skip
+    return _beside(case, exact)
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    items: tuple[tuple[str, Any], ...], reference: Reference
+) -> NewtonPath:
+    bodies, rows, _ = _on_plane(dict(items))
+    return newton_path(bodies, lambda u: rows, dict(items), reference)
+
+
+def _on_plane(
+    params: Mapping[str, Value],
+) -> tuple[Bodies, ContactRows, LineContact]:
+    """Mesh and assemble the cylinder, n cells per a; with Hertz's solution."""
     p: Any = params
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
@@ -86,7 +115,7 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    return _case(bodies, above_plane(mesh, mesh.boundaries["arc"]), form, exact)
+    return bodies, above_plane(mesh, mesh.boundaries["arc"]), exact
 
 
 def cylinder_on_cylinder(
@@ -100,7 +129,8 @@ def cylinder_on_cylinder(
     if p["friction"] == "none":
         bodies, exact = two_cylinders(params)
         linearise = linearisation(bodies, p["contact"], p["basis"])
-        return _case(bodies, linearise(np.zeros(bodies.mesh.dofs)), form, exact)
+        rows = linearise(np.zeros(bodies.mesh.dofs))
+        return _case(bodies, rows, form, exact, params)
     same_path = {**params, "iterate": 0}
     path, exact = _friction_path(tuple(same_path.items()), reference)
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
@@ -121,6 +151,7 @@ def cylinder_on_cylinder(
         bodies, primal, form,
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal, friction),
     )  # fmt: skip
     return _beside(case, exact, shear) if shear is not None else case
 
@@ -166,6 +197,20 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     return bodies, exact
 
 
+def subdivided(bodies: Bodies, most: int) -> SubdividedBodies:
+    """Cut the half discs into blocks of rings and sectors.
+
+    most : cells a side; the triangles at a centre are the last ring
+    """
+    sides, cells = bodies.mesh.boundaries, np.bincount(bodies.body)
+    arcs = [sides[name] for name in ("arc", "upper_arc", "lower_arc") if name in sides]
+    divisions = [
+        (arc.size - 1, int(count) // (arc.size - 1))
+        for arc, count in zip(arcs, cells, strict=True)
+    ]
+    return subdivide(bodies, structured_bodies(divisions, most))
+
+
 def kept_on_axis(bodies: Bodies) -> Bodies:
     """Add supports u_x = 0 on the axis of the upper one, which P does not load.
 
@@ -201,7 +246,7 @@ def _friction_path(
     rows = linearise(np.zeros(mesh.dofs))
     guided = kept_on_axis(bodies)
     path = LoadPath(
-        bodies, lambda u: rows, floating(guided), reference, steps=1,
+        bodies, lambda u: rows, lambda: floating(guided), reference, steps=1,
         transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
     )  # fmt: skip
     if not p["peak"]:
@@ -381,7 +426,11 @@ def _beside(
     return replace(case, fields=fields)
 
 
-def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> Case:
+def _case(
+    bodies: Bodies, rows: ContactRows, form: str, exact: LineContact,
+    params: Mapping[str, Value],
+) -> Case:  # fmt: skip
+    p: Any = params
     primal = primal_qp(bodies, rows)
     case = contact_case(
         bodies, primal, form,
@@ -389,6 +438,7 @@ def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> C
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal),
     )  # fmt: skip
     return _beside(case, exact)
 

@@ -27,10 +27,10 @@ import numpy as np
 from harness import QP, About, Solution, Status, Vector, kkt_residuals
 from solvers.common.conversion import dense, needs_dense, positive
 from solvers.smalbe.compiled import residual_bound
-from solvers.smalbe.driver import CLAIM, FREE_RANK, PATIENCE
+from solvers.smalbe.driver import CLAIM, PATIENCE
 from solvers.smalbe.faces import Faces
 from solvers.smalbe.outer_loop import infeasible
-from solvers.smalbe.projected import Rows, prepared_rows
+from solvers.smalbe.rows import FREE_RANK, DenseRows, prepared_rows
 
 LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
 RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
@@ -73,7 +73,7 @@ class Direct:
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         P = qp.P if isinstance(qp.P, np.ndarray) else dense(qp.P)
         P = P if P.flags.c_contiguous else P.T  # it is symmetric
-        rows = prepared_rows(qp)
+        rows = prepared_rows(qp.A, qp.b)
         if not rows.consistent:
             message = "the equality rows contradict each other"
             return partial(Solution.without_point, qp, Status.INFEASIBLE, message)
@@ -95,7 +95,7 @@ class _Point(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class _Task:
     qp: QP
-    rows: Rows
+    rows: DenseRows
     faces: Faces
 
     def point(self, *, fitted: bool) -> _Point:

@@ -26,23 +26,22 @@ from solvers.smalbe.outer_loop import (
     infeasible,
     smalbe,
 )
-from solvers.smalbe.preconditioner import face_preconditioner
+from solvers.smalbe.preconditioner import chosen, face_preconditioner, offered
 from solvers.smalbe.projected import (
     Projected,
-    Rows,
     Spectrum,
     by_lanczos,
     by_power,
     prepared_problem,
     projected_problem,
 )
+from solvers.smalbe.rows import DenseRows, Rows, is_sparse
 from solvers.smalbe.spectrum import random_start
 
 STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
-FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -79,7 +78,7 @@ def prepared(
     """Eliminate the free variables where asked and possible; project; look at F."""
     history = History() if options.history else None
     eliminated = None
-    if eliminate and options.preconditioner in WITHOUT_P:
+    if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
         eliminated = eliminate_free(qp, carry and carry.block)
     inner = qp if eliminated is None else eliminated.qp
     if carry is not None and carry.x.size != inner.q.size:
@@ -103,13 +102,15 @@ def prepared(
 
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
-    if carry is None and options.norm == "lanczos":
-        return prepared_problem(qp, _lanczos_steps(options, qp.q.size))
-    return projected_problem(qp, partial(_find, options, carry))
+    if carry is None and options.norm == "lanczos" and not is_sparse(qp.A):
+        return prepared_problem(qp, _lanczos_steps(options, qp))
+    steps = _lanczos_steps(options, qp)
+    return projected_problem(qp, partial(_find, options, steps, carry))
 
 
 def _find(
     options: Options,
+    steps: int,
     carry: Carry | None,
     PFP: Callable[[Vector], Vector],
     rows: Rows,
@@ -128,12 +129,17 @@ def _find(
         now = float(v @ PFP(v)) / float(v @ v or 1.0)
         if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
             return carry.spectrum.orthogonal_to(rows)
-    return by_lanczos(PFP, rows, steps=_lanczos_steps(options, rows.x_tilde.size))
+    return by_lanczos(PFP, rows, steps=steps)
 
 
-def _lanczos_steps(options: Options, n: int) -> int:
-    """Take few of them for few unknowns, where they would outweigh the CG steps."""
-    return min(options.lanczos_steps, max(LEAST_LANCZOS, n // 6))
+def _lanczos_steps(options: Options, qp: QP) -> int:
+    """Take few of them for few unknowns, where they would outweigh the CG steps.
+
+    And where P offers a preconditioner: the spectrum of torn bodies is flat, so that
+    only its norm is found.
+    """
+    few = LEAST_LANCZOS if offered(qp) else qp.q.size // 6
+    return min(options.lanczos_steps, max(LEAST_LANCZOS, few))
 
 
 def _start(
@@ -176,7 +182,7 @@ def outer_loop(
 ) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
     """Choose what runs the outer loop: compiled where it can be, or as it is written.
 
-    Where preconditioners need more than products, it is not.
+    Where preconditioners need more than products, or rows are sparse, it is not.
     """
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced,
@@ -187,15 +193,17 @@ def outer_loop(
         options.energy,
     )  # fmt: skip
     watch = None if history is None else partial(history.watch, problem)
-    if is_compiled and options.preconditioner in WITHOUT_P:
-        with_model = options.preconditioner == "model"
+    kind = chosen(qp, options.preconditioner)
+    is_compiled = is_compiled and isinstance(problem.rows, DenseRows)
+    if is_compiled and kind in WITHOUT_P:
+        with_model = kind == "model"
         solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
         return partial(_compiled_loop, solver, problem, constants, watch), solver
     plain = partial(problem.plain_model, alpha=options.alpha)
     inner = InnerSolver(
         rules=rules,
         model=problem.model if options.expansion == "model" else plain,
-        precondition=face_preconditioner(problem, qp, options.preconditioner),
+        precondition=face_preconditioner(problem, qp, kind),
         watch=watch,
     )
     return partial(smalbe, problem, constants, inner), None
@@ -317,7 +325,7 @@ def recovered(
     r = Fx + qp.q
     free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
-    a -= np.linalg.lstsq(C.T[free], (r + C.T @ a)[free], rcond=FREE_RANK)[0]
+    a += problem.rows.fitted(free, r + C.T @ a)
     r = r + C.T @ a
     z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)

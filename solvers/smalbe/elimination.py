@@ -22,7 +22,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csr_array
 
 from harness import QP, Matrix, Solution, Vector, no_rows
-from solvers.smalbe.projected import orthonormal_rows
+from solvers.smalbe.rows import orthonormal_rows
 
 #: singular values of orthonormal rows, cut to E, are zero below and good above these;
 #: rows that hardly meet E would make the reduced matrix as large as they are small

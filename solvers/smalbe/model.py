@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,20 @@ NEWTON_STEPS = 100
 SEARCH_STEPS = 60
 
 
-class _Tilted(NamedTuple):
+class BoxModel(Protocol):
+    """A model of H with tail τ, which can be minimised over a box and on a face."""
+
+    @property
+    def tau(self) -> float: ...
+    @property
+    def has_directions(self) -> bool: ...
+    def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector: ...
+    def raised(self, s: Vector, sHs: float) -> BoxModel: ...
+    def relaxed(self, factor: float) -> BoxModel: ...
+    def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]: ...
+
+
+class Tilted(NamedTuple):
     """What s(y) is at some y."""
 
     s: Vector
@@ -48,6 +61,11 @@ class Model:
         """B = norm·I: what is known of an H (n, n) of which only the norm is known."""
         return cls(norm, np.zeros((0, n)), np.zeros(0))
 
+    @property
+    def has_directions(self) -> bool:
+        """Whether it knows more of H than a norm."""
+        return bool(len(self.U))
+
     def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
         """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
 
@@ -58,23 +76,19 @@ class Model:
         U, tau, w = self.U, self.tau, self.w
         root = np.sqrt(w)
 
-        def at(y: Vector) -> _Tilted:
-            s, piece = kernels.tilted_step(x, g + y @ U, tau, *bounds)
-            return _Tilted(s, piece, U @ s - y / w)
+        def at(y: Vector) -> Tilted:
+            return tilted(x, g + y @ U, tau, bounds, lambda s: U @ s - y / w)
 
-        y: Vector = np.zeros(w.size)
-        here = at(y)
-        for _ in range(NEWTON_STEPS if w.size else 0):
-            U_f = U[:, here.piece == 0]
-            dy = root * np.linalg.solve(_core(U_f, root, tau), root * here.slope) * tau
-            there = at(y + dy)
-            if (there.piece == here.piece).all():  # where Newton's method is exact
-                return there.s
-            t, here = _searched(at, y, dy, (here, there))
-            y = y + t * dy
+        def newton(slope: Vector, free: Mask) -> Vector:
+            core = _core(U[:, free], root, tau)
+            return np.asarray(root * np.linalg.solve(core, root * slope) * tau)
+
         if not w.size:
-            return here.s
-        return Model.of_norm(tau + float(w.max()), x.size).step(x, g, bounds)
+            return kernels.tilted_step(x, g, tau, *bounds)[0]
+        s = minimised(at, newton, w.size)
+        if s is None:
+            return Model.of_norm(tau + float(w.max()), x.size).step(x, g, bounds)
+        return s
 
     def raised(self, s: Vector, sHs: float) -> Model:
         """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
@@ -88,6 +102,10 @@ class Model:
         """Change τ and leave w + τ as it is, where that is above τ."""
         w = self.w + self.tau - tau
         return Model(tau, self.U[w > 0], w[w > 0])
+
+    def relaxed(self, factor: float) -> Model:
+        """Divide τ."""
+        return Model(self.tau / factor, self.U, self.w)
 
     def core_in(self, free: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return U_F, zero off the face F, and N with B_FF⁻¹ = (I − U_FᵀNU_F)/τ.
@@ -114,12 +132,45 @@ def _core(U_f: NDArray[np.float64], root: Vector, tau: float) -> NDArray[np.floa
     return np.asarray(S @ S.T + tau * np.eye(root.size))
 
 
+def tilted(
+    x: Vector,
+    g: Vector,
+    tau: float,
+    bounds: tuple[Vector, Vector],
+    slope: Callable[[Vector], Vector],
+) -> Tilted:
+    """Minimise gᵀs + τ/2‖s‖² over the box."""
+    s, piece = kernels.tilted_step(x, g, tau, *bounds)
+    return Tilted(s, piece, slope(s))
+
+
+def minimised(
+    at: Callable[[Vector], Tilted],
+    newton: Callable[[Vector, Mask], Vector],
+    k: int,
+) -> Vector | None:
+    """Maximise the dual function of k multipliers y; return s(y), None where not found.
+
+    newton : the step dy for a slope, where the free components are those
+    """
+    y: Vector = np.zeros(k)
+    here = at(y)
+    for _ in range(NEWTON_STEPS):
+        dy = newton(here.slope, here.piece == 0)
+        there = at(y + dy)
+        if (there.piece == here.piece).all():  # where Newton's method is exact
+            return there.s
+        t, here = _searched(at, y, dy, (here, there))
+        y = y + t * dy
+    return None
+
+
 def _searched(
-    at: Callable[[Vector], _Tilted],
+    at: Callable[[Vector], Tilted],
     y: Vector,
     dy: Vector,
-    ends: tuple[_Tilted, _Tilted],
-) -> tuple[float, _Tilted]:
+    ends: tuple[Tilted, Tilted],
+) -> tuple[float, Tilted]:
     """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0."""
     there = ends[1]
     first, slope = float(ends[0].slope @ dy), float(there.slope @ dy)

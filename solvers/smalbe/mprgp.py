@@ -30,7 +30,7 @@ import numpy as np
 from harness import Vector
 from solvers.smalbe import kernels
 from solvers.smalbe.kernels import Mask
-from solvers.smalbe.model import Model
+from solvers.smalbe.model import BoxModel
 
 Operator = Callable[[Vector], Vector]
 Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner
@@ -94,7 +94,7 @@ class Minimum(NamedTuple):
 
 Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, where
 #: letter, where, model; None where the cost falls without end
-Step = tuple[str, Point, Model] | None
+Step = tuple[str, Point, BoxModel] | None
 
 
 class _Line(NamedTuple):
@@ -119,7 +119,7 @@ def mprgp(
     bounds: tuple[Vector, Vector],
     start: tuple[Vector, Vector],
     *,
-    B: Model,
+    B: BoxModel,
     stop: Callable[[Point, Face], bool],
     rules: Rules,
     precondition: Precondition | None = None,
@@ -151,7 +151,7 @@ def mprgp(
             idle = idle + 1 if face.beta_square > chopped / 2 else 0
             chopped = face.beta_square
             step = _proportion(
-                task, at, face, B, by_model=idle < MOST_IDLE or not len(B.U)
+                task, at, face, B, by_model=idle < MOST_IDLE or not B.has_directions
             )
         else:
             Hp = H(p)
@@ -176,7 +176,7 @@ def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
     return Face(*kernels.split(*at, *bounds))
 
 
-def _disproportional(task: _Task, at: Point, face: Face, B: Model) -> bool:
+def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
     """Whether more is to be gained on the bounds than in the face."""
     if face.beta_square == 0:
         return False
@@ -188,7 +188,7 @@ def _disproportional(task: _Task, at: Point, face: Face, B: Model) -> bool:
 
 
 def _proportion(
-    task: _Task, at: Point, face: Face, B: Model, *, by_model: bool
+    task: _Task, at: Point, face: Face, B: BoxModel, *, by_model: bool
 ) -> Step:
     """Take a step that frees components; never beyond an opposite bound."""
     if by_model and task.rules.proportioning == "model":
@@ -200,7 +200,7 @@ def _proportion(
 
 
 def _minimise_or_expand(
-    task: _Task, at: Point, p: Vector, Hp: Vector, B: Model, *, first: bool
+    task: _Task, at: Point, p: Vector, Hp: Vector, B: BoxModel, *, first: bool
 ) -> Step:
     """Take the CG step where it is feasible, else expand the active set."""
     H, b, bounds, rules = task
@@ -222,7 +222,7 @@ def _minimise_or_expand(
     return letter, Point(x, H(x) - b), B
 
 
-def _model_step(task: _Task, at: Point, B: Model) -> Step:
+def _model_step(task: _Task, at: Point, B: BoxModel) -> Step:
     """Minimise the model over the box, then the cost along that step.
 
     Above H, the model makes the minimising length at least 1. Where the product shows
@@ -241,7 +241,7 @@ def _model_step(task: _Task, at: Point, B: Model) -> Step:
 
 
 def _model_expansion(
-    task: _Task, at: Point, half: Point, line: _Line, B: Model, first: bool
+    task: _Task, at: Point, half: Point, line: _Line, B: BoxModel, first: bool
 ) -> Step:
     """Project z = x − α_cg p on the box in the metric of the model.
 
@@ -257,12 +257,12 @@ def _model_expansion(
     lessens the cost.
     """
     (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
-    release = first and len(B.U) > 0
+    release = first and B.has_directions
     held = ((half.x <= lower) | (half.x >= upper)) & (not release)
     box = np.where(held, half.x, lower), np.where(held, half.x, upper)
     beyond = cg - feasible if math.isfinite(cg) else 0.0
     z = Point(half.x - beyond * p, half.g - beyond * Hp)
-    relaxed = Model(B.tau / task.rules.relaxation, B.U, B.w)
+    relaxed = B.relaxed(task.rules.relaxation)
     s = np.where(held, 0.0, z.x + relaxed.step(*z, box) - half.x)
     if half.g @ s >= 0:
         beyond, s = 0.0, B.step(*half, box)

@@ -21,7 +21,7 @@ class Options:
 
     expansion: Expansion = "model"  #: see `solvers.smalbe.mprgp`
     proportioning: Proportioning = "model"
-    preconditioner: Preconditioner = "model"  #: see `solvers.smalbe.preconditioner`
+    preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
     rho: float = 1e4  #: penalty ρ, relative to ‖𝒫F𝒫‖
     rho_growth: float = 1.0  #: factor of ρ where the Lagrangian grew too little
     M: float = 1.0  #: precision of the inner runs at the start, relative to ‖𝒫F𝒫‖
@@ -61,7 +61,8 @@ class Options:
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")
-        if self.norm == "power" and "model" in (self.expansion, self.preconditioner):
+        model = self.expansion == "model" or self.preconditioner in ("auto", "model")
+        if self.norm == "power" and model:
             raise ValueError(
                 "norm = 'power' finds no Ritz vectors; expected 'lanczos', or "
                 "expansion and preconditioner other than 'model'"

@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness import Status, Vector
-from solvers.smalbe.model import Model
+from solvers.smalbe.model import BoxModel
 from solvers.smalbe.mprgp import (
     Face,
     Minimum,
@@ -40,7 +40,8 @@ from solvers.smalbe.mprgp import (
     Watch,
     mprgp,
 )
-from solvers.smalbe.projected import Projected, Rows
+from solvers.smalbe.projected import Projected
+from solvers.smalbe.rows import Rows
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products
@@ -66,7 +67,7 @@ class InnerSolver:
     """How the inner problems are solved, for each ρ."""
 
     rules: Rules
-    model: Callable[[float], Model]
+    model: Callable[[float], BoxModel]
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
     """Makes the observer of outer iteration k with that right-hand side."""

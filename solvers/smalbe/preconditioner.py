@@ -8,8 +8,18 @@ inverted in the face. The structural ones, for a dual with F = BK⁺Bᵀ, are
 
 where b are the components that B touches, i the others, and B_D = (BWBᵀ)⁻¹BW with the
 compliances W = diag(K_bb)⁻¹ as weights, so that where bodies meet the softer one takes
-more of a jump (Rixen and Farhat 1999). Inside SMALBE they work between the projectors:
-‖𝒫F𝒫‖ 𝒫M𝒫 + Q/ρ.
+more of a jump (Rixen and Farhat 1999). An operator P may offer its own
+(`harness.operators.Preconditioned`).
+
+Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated in a face by the model of the penalty
+B = I + (ρ − 1)Q, whose inverse there, P = B_FF⁻¹, is nearly the projector on C_Fν = 0;
+M takes the place of the unit matrix on what that leaves:
+
+    P (‖𝒫F𝒫‖ M_FF − I) P + P
+
+It is positive definite (0 < P ≤ I), and right where C_F C_Fᵀ has small eigenvalues, as
+those of motions that gluing hardly feels and contact does. The projector 𝒫 of the whole
+instead, which mixes free components with held ones, would undo what a large ρ achieves.
 """
 
 from __future__ import annotations
@@ -22,20 +32,37 @@ import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 
 from harness import QP, Structure, Vector
+from harness.operators import Preconditioned, SerialisableOperator
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.mprgp import Operator, Precondition
 from solvers.smalbe.projected import Projected
 
-Preconditioner = Literal["model", "diagonal", "lumped", "dirichlet", "none"]
+Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
 PRECONDITIONERS = get_args(Preconditioner)
+LEAST_RHO = 10.0  #: of the model of the penalty: with less, nothing is projected
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
+
+
+def offered(qp: QP) -> Preconditioned | None:
+    """Give what P offers preconditioners by, if it does."""
+    if not isinstance(qp.P, SerialisableOperator):
+        return None
+    product = qp.P.build()
+    return product if isinstance(product, Preconditioned) else None
+
+
+def chosen(qp: QP, kind: Preconditioner) -> Preconditioner:
+    """Choose, where asked to: Dirichlet's where P offers it, else the model."""
+    if kind != "auto":
+        return kind
+    return "dirichlet" if offered(qp) else "model"
 
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:
     """Say what `qp` lacks for this preconditioner, or None."""
     if kind == "diagonal" and not qp.is_explicit:
         return "preconditioner 'diagonal' needs an explicit P"
-    if kind in ("lumped", "dirichlet") and qp.structure is None:
+    if kind in ("lumped", "dirichlet") and qp.structure is None and not offered(qp):
         return f"preconditioner {kind!r} needs a QP with structure; 'diagonal' does not"
     return None
 
@@ -50,15 +77,15 @@ def face_preconditioner(
         return lambda rho: problem.model(rho).inverse_in
     M = _whole(qp, kind)
 
-    def between_projectors(v: Vector, rho: float) -> Vector:
-        problem.counts["preconditioner_applies"] += 1
-        Pv = problem.rows.project(v)
-        return problem.spectrum.norm * problem.rows.project(M(Pv)) + (v - Pv) / rho
-
     def in_face(free: Mask, rho: float) -> Operator:
-        return lambda v: np.where(
-            free, between_projectors(np.where(free, v, 0), rho), 0
-        )
+        of_penalty = problem.penalty(max(rho, LEAST_RHO)).inverse_in(free)
+
+        def apply(v: Vector) -> Vector:
+            problem.counts["preconditioner_applies"] += 1
+            Pv = of_penalty(v)
+            return of_penalty(problem.spectrum.norm * M(Pv) - Pv) + Pv
+
+        return apply
 
     return lambda rho: partial(in_face, rho=rho)
 
@@ -69,6 +96,8 @@ def _whole(qp: QP, kind: Preconditioner) -> Operator:
         diagonal = qp.P.diagonal()
         inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
         return lambda v: inverse * v
+    if (operator := offered(qp)) is not None:
+        return operator.preconditioner(kind, "stiffness")
     if qp.structure is None:
         raise ValueError(lacking(qp, kind))
     return _structural(qp.structure, _lumped if kind == "lumped" else _schur)

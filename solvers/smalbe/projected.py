@@ -5,55 +5,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr, solve_triangular
 
-from harness import QP, Matrix, Vector
+from harness import QP, Vector
+from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
-from solvers.smalbe.model import Model
+from solvers.smalbe.model import BoxModel, Model
+from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
 from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start
 
-RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
 FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
 TAIL = 1e-4  #: least τ of a model, relative to the norm
-
-
-class Rows(NamedTuple):
-    """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
-
-    G: NDArray[np.float64]  #: (m, n) as given
-    C: NDArray[np.float64]  #: (r, n)
-    GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
-    e_size: float  #: ‖e‖
-    least_pivot: float  #: of the QR factorisation, 1 for orthogonal rows
-    x_tilde: Vector  #: (n,) the shortest x with Gx = e
-    consistent: bool  #: whether there is one
-    multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
-
-    def met(self, nu: Vector, tol: float, least: float) -> bool:
-        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
-
-        For e = 0, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
-        """
-        Cnu = self.C @ nu
-        if self.e_size == 0:
-            size = max(float(np.linalg.norm(nu)), least)
-            return bool(np.linalg.norm(Cnu) <= tol * size)
-        size = float(np.linalg.norm(self.x_tilde))
-        return bool(
-            np.linalg.norm(Cnu) <= tol * size
-            and np.linalg.norm(self.GC @ Cnu) <= tol * self.e_size
-        )
-
-    def project(self, v: Vector) -> Vector:
-        """Apply 𝒫 = I − CᵀC."""
-        return np.asarray(v - self.C.T @ (self.C @ v))
 
 
 class Spectrum(NamedTuple):
@@ -109,7 +76,7 @@ class Projected:
         shift = rho * Cv - (C @ Fv) / self.spectrum.norm
         return np.asarray(Fv / self.spectrum.norm + C.T @ shift)
 
-    def model(self, rho: float) -> Model:
+    def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.
 
         The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
@@ -119,9 +86,8 @@ class Projected:
         a short process finds not even the first eigenvector, and Ritz vectors that are
         none would slow CG down: then only the norm is used.
         """
-        C, (above, U, tail) = self.rows.C, self.upper_end()
-        w = np.append(above, np.full(len(C), rho))
-        return Model(0.0, np.vstack([U, C]), w).with_tail(tail)
+        above, U, tail = self.upper_end()
+        return self.rows.model(tail, above, U, rho)
 
     def upper_end(self) -> tuple[Vector, NDArray[np.float64], float]:
         """Return the Ritz pairs (k,), (k, n) that a model holds, and its τ."""
@@ -137,36 +103,14 @@ class Projected:
             kept = 0
         return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
+    def penalty(self, rho: float) -> BoxModel:
+        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        return self.rows.model(1.0, np.zeros(0), np.zeros((0, self.b.size)), rho)
+
     def plain_model(self, rho: float, *, alpha: float) -> Model:
         """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
         norm = max(1.0, rho if len(self.rows.C) else 0.0)
         return Model.of_norm(norm / alpha, self.b.size)
-
-
-def orthonormal_rows(G: Matrix, e: Vector) -> Rows:
-    """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
-    dense = _dense(G)
-    size = np.linalg.norm(dense, axis=1)
-    size[size == 0] = 1.0
-    Q, R, pivot = qr((dense / size[:, None]).T, mode="economic", pivoting=True)
-    rank = int((np.abs(np.diag(R)) > RANK).sum())
-    C, R, kept = Q[:, :rank].T, R[:rank, :rank], pivot[:rank]
-    x_tilde = C.T @ solve_triangular(R, (e / size)[kept], trans="T")
-    mismatch = np.abs(dense @ x_tilde - e) / size
-    scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
-
-    triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
-    multipliers = partial(compiled.multipliers, e.size, *triangle)
-    consistent = bool((mismatch <= 1e-8 * scale).all())
-    C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
-    pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
-    GC = dense @ C.T
-    return Rows(dense, C, GC, e_size, pivot_size, x_tilde, consistent, multipliers)
-
-
-def _dense(G: Matrix) -> NDArray[np.float64]:
-    dense = G.toarray() if hasattr(G, "toarray") else G
-    return np.ascontiguousarray(dense, dtype=float)
 
 
 def projected_problem(
@@ -177,14 +121,14 @@ def projected_problem(
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
     """
     F = Product(qp.P, qp.q.size)
-    rows = orthonormal_rows(qp.A, qp.b)
+    rows = equality_rows(qp.A, qp.b, boxed(qp))
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     return _normalised(qp, F, rows, spectrum)
 
 
 def prepared_problem(qp: QP, steps: int) -> Projected:
     """Do what `projected_problem` does with `by_lanczos`, compiled."""
-    F, rows = Product(qp.P, qp.q.size), prepared_rows(qp)
+    F, rows = Product(qp.P, qp.q.size), prepared_rows(qp.A, qp.b)
     ritz = Ritz(*compiled.lanczos(F, rows.C, random_start(qp.q.size), steps))
     diagonal = _diagonal(qp)
     spectrum = _not_vanishing(Spectrum(ritz.norm or 1.0, ritz), diagonal)
@@ -192,12 +136,6 @@ def prepared_problem(qp: QP, steps: int) -> Projected:
         F, rows.C, rows.x_tilde, qp.q, qp.lb, qp.ub, spectrum.norm
     )
     return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
-
-
-def prepared_rows(qp: QP) -> Rows:
-    """Do what `orthonormal_rows` does, compiled."""
-    rows, triangle = compiled.orthonormal(_dense(qp.A), np.ascontiguousarray(qp.b))
-    return Rows(*rows, partial(compiled.multipliers, qp.b.size, *triangle))
 
 
 def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:

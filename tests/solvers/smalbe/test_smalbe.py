@@ -13,7 +13,8 @@ from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.mprgp import Rules
 from solvers.smalbe.outer_loop import Constants, InnerSolver, first_iterate, smalbe
-from solvers.smalbe.projected import by_lanczos, orthonormal_rows, projected_problem
+from solvers.smalbe.projected import by_lanczos, projected_problem
+from solvers.smalbe.rows import orthonormal_rows
 from solvers.smalbe.solver import SMALBE
 from solvers.smalbe.spectrum import lanczos, power_method
 

@@ -1,0 +1,118 @@
+"""The certificate of bodies torn into subdomains: without a factor of the whole K.
+
+With K = TᵀK_T T,  K_T = diag(K_1 … K_S), an admissible û and multipliers λ̂ of contact
+and friction leave the residual
+
+    ρ = Kû − f + Bᵀλ̂   on the components that no support holds.
+
+Share it among the copies of each component, Tᵀb = ρ, such that the forces b balance in
+every subdomain, R_Tᵀb = 0, and solve  K_T d = b,  one small Neumann problem for each
+subdomain. Then v = Tû − d is in equilibrium with f, λ̂ and forces between subdomains
+that are opposite on both sides: it is a u_λ of the torn problem, whose solution is the
+same, and identity (1) of `harness.verify.certificate` reads
+
+    ½‖û − u*‖² + ½‖v − Tu*‖² + …  =  ½‖d‖²_{K_T} + Σ(g|v̂| − λ̂v̂)
+
+So the bound is the energy of d, which is small itself: nothing cancels but in ρ, and
+that is formed in extended precision. Multipliers of gluing and supports that a solver
+may have found are not looked at.
+
+Forces are shared as balancing domain decomposition does (Mandel 1993), in proportion to
+the stiffness W of the copies,
+
+    b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
+      Z = W − WT(TᵀWT)⁻¹TᵀW
+
+where (TᵀWT)⁻¹ is put to zero where a support holds, so that TᵀZ = 0 elsewhere: Z spans
+the forces of gluing and supports. The sparse coarse matrix R_TᵀZR_T has three rows for
+each subdomain of the plane. It is singular along motions of the whole that only contact
+can hold; along these λ̂ balances the load, see `harness.verify.admissible.balanced`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import qr
+from scipy.sparse import csc_matrix, csr_array, diags_array
+from scipy.sparse.linalg import splu
+
+from harness.mechanics import Extended, Mechanics
+from harness.qp import Vector
+
+
+class Neighbour(NamedTuple):
+    """The u_λ near a displacement û, as torn displacements (N,)."""
+
+    u: Extended  #: Tû
+    Ku: Extended  #: K_T Tû
+    d: Vector  #: Tû − u_λ, as far as it was solved for
+    Kd: Vector  #: K_T d
+    left: float  #: energy norm of the rest of d
+
+
+def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neighbour:
+    """Find u_λ from an admissible û (n,) and λ̂ (m,)."""
+    exact, parts = mechanics.exact, mechanics.substructures
+    torn = parts.spread @ u
+    pull = parts.product(torn)
+    residual = parts.spread.T @ pull - exact.f + exact.B.T @ multipliers
+    residual[exact.held] = 0
+    b = _shared(mechanics, residual.astype(np.float64))
+    d = parts.solve(b)
+    Kd = parts.product(d)
+    step = parts.solve(b - Kd)
+    return Neighbour(torn, pull, d, Kd, float(np.sqrt(abs(float((b - Kd) @ step)))))
+
+
+def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
+    """Share ρ (n,) among the subdomains, balanced in each: b (N,).
+
+    Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
+    """
+    parts, held = mechanics.substructures, mechanics.exact.held
+    squares = parts.spread.copy()
+    squares.data **= 2
+    total = squares.T @ parts.weight
+    part = parts.weight / (squares @ total)
+    single = np.ones(total.size, dtype=bool)
+    single[held] = False
+    inner = (part > 1 - 1e-9) & (squares @ single > 1 - 1e-9)
+    at = np.flatnonzero(~inner)
+    T, R, w = parts.spread[at], parts.kernel[at], parts.weight[at]
+    inverse = 1 / total
+    inverse[held] = 0
+    WR = csr_array(diags_array(w) @ R)
+    TWR = csr_array(T.T @ WR)
+    coarse = R.T @ WR - TWR.T @ (diags_array(inverse) @ TWR)
+    solve = _coarse_solve(csr_array(coarse), _moved_together(mechanics))
+    b = part * (parts.spread @ residual)
+    for _ in range(2):  # the second time for the digits that the first one lost
+        mu = solve(parts.kernel.T @ b)
+        b[at] -= WR @ mu - w * (T @ (inverse * (TWR @ mu)))
+    return np.asarray(b)
+
+
+def _moved_together(mechanics: Mechanics) -> Any:
+    """Return the coefficients (r, q) of R of the motions that no support holds."""
+    parts, kernel = mechanics.substructures, mechanics.kernel
+    return np.asarray((parts.kernel.T @ (parts.spread @ kernel)).toarray(), dtype=float)
+
+
+def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
+    """Return x ↦ A⁺x, with as many components held as `kernel` (r, q) has columns."""
+    pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
+    free = np.setdiff1d(np.arange(A.shape[0]), pins)
+    factor = splu(
+        csc_matrix(A[free][:, free]), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )  # fmt: skip
+
+    def solve(b: Vector) -> Vector:
+        x = np.zeros_like(b)
+        x[free] = factor.solve(b[free])
+        return x
+
+    return solve

@@ -1,0 +1,50 @@
+"""Two membranes torn into subdomains; see `problems.models.membranes`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING
+
+from harness import Family
+from problems.ranges import GLUES, at_least, doubled, fits, one_of
+
+if TYPE_CHECKING:
+    from harness import Case, Reference, Value
+
+
+@dataclass(frozen=True)
+class Membranes(Family):
+    """Two membranes in contact along an edge, the right one floating."""
+
+    name: str = "membranes"
+    defaults: Mapping[str, Value] = field(
+        default_factory=lambda: MappingProxyType(
+            {"S": 2, "n": 8, "glue": "orthonormal"}
+        ),
+        hash=False,
+    )
+    forms: tuple[str, ...] = ("primal", "dual")
+
+    def check(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless every key is in its range."""
+        at_least(1, self.name, params, ("S", "n"))
+        one_of(self.name, params, GLUES)
+        side = int(params["S"]) * int(params["n"])
+        fits(self.name, 2 * (side + 1) ** 2)
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+        """Return the case with every cell halved."""
+        return {**params, **doubled(params, "n")}
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Emit the QP in one form."""
+        from problems.models.membranes import membranes
+
+        del reference
+        params = self.complete(params)
+        self.check(params)
+        return membranes(form, params)

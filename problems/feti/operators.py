@@ -1,0 +1,315 @@
+"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners; plain arrays.
+
+Only components that rows touch matter: with B_b the columns of B there and all of them
+packed group by group, a product is sparse, dense, sparse:
+
+    F λ = B_b diag((K⁺)_bb) B_bᵀ λ
+
+A group is subdomains that share a dense block; what they gather are the columns of one
+matrix, so that a group is one product of two dense matrices. Of the block of a single
+subdomain one triangle is kept, since reading it takes the time. Blocks (K⁺)_bb and S_bb
+are formed where they fit (*explicit*; it pays after about ten products); beyond, a
+product solves with the factors of its kind.
+
+Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999):
+
+    B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
+
+with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
+condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
+or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular: which
+generalised inverse is taken changes λ by what Bᵀ does not feel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
+from sksparse.cholmod import cholesky
+
+from harness import Vector
+from harness.operators import Arrays, Product, SerialisableOperator
+from problems.fem.mesh import Nodes
+from problems.feti.torn import Dense, Kind, Subdomains
+
+NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
+EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
+#: of the diagonal of B W Bᵀ, added where rows are redundant
+SHIFT = 1e-8
+ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
+_PARTS = ("data", "indices", "indptr")
+_OF_KINDS = ("stiffness", "fixing", "boundary")  #: whose lengths differ by kind
+
+
+class Group(NamedTuple):
+    """The subdomains of one kind, with what rows touch of any of them."""
+
+    kind: Kind
+    explicit: bool  #: whether (K⁺)_bb is formed
+    members: NDArray[np.int64]  #: (S_g,) subdomains
+    touched: Nodes  #: b (n_g,) components within each, ascending
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """The touched components of all subdomains, numbered group by group.
+
+    Within a group by component, then by subdomain: what a group gathers is (n_g, S_g).
+    """
+
+    groups: tuple[Group, ...]
+    B: csr_array  #: (m, M) columns of B, packed
+    BT: csr_array  #: (M, m) its transpose by rows
+
+    def congruence(self, blocks: Sequence[Any], x: Dense) -> Dense:
+        """Multiply  B_b diag(blocks) B_bᵀ  with x (m,) or (m, k)."""
+        return np.asarray(self.B @ self.multiplied(blocks, self.BT @ x))
+
+    def multiplied(self, blocks: Sequence[Any], X: Dense) -> Dense:
+        """Multiply each subdomain's part of X (M,) or (M, k) with its group's block."""
+        Y, end = np.empty_like(X), 0
+        for block, group in zip(blocks, self.groups, strict=True):
+            n = group.touched.size
+            begin, end = end, end + n * group.members.size
+            part = X[begin:end]
+            Y[begin:end] = (block @ part.reshape(n, -1)).reshape(part.shape)
+        return Y
+
+
+def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
+    """Pack the columns of B (m, N)."""
+    groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
+    parts = touched(B, domains)
+    for k, (kind, members) in enumerate(
+        zip(domains.kinds, domains.members, strict=True)
+    ):
+        groups.append(Group(kind, bool(explicit[k]), members, parts[k]))
+        places = domains.start[members] + parts[k][:, None]
+        number[places.ravel()] = np.arange(end, end + places.size)
+        end += places.size
+    indices = number[B.indices].astype(B.indices.dtype)
+    B_b = csr_array((B.data, indices, B.indptr), shape=(B.shape[0], end))
+    return Packed(tuple(groups), B_b, csr_array(B_b.T))
+
+
+def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
+    """List the components that rows touch of any subdomain of each kind, ascending."""
+    columns = np.zeros(B.shape[1], dtype=bool)
+    columns[B.indices] = True
+    found = np.flatnonzero(columns)
+    sub = np.searchsorted(domains.start, found, side="right") - 1
+    largest = int(np.diff(domains.start).max())
+    kind, at = np.divmod(
+        np.unique(domains.kind[sub] * largest + found - domains.start[sub]), largest
+    )
+    ends = np.cumsum(np.bincount(kind, minlength=len(domains.kinds)))
+    return np.split(at, ends[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class DualOperator:
+    """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
+
+    B: csr_array  #: (m, N)
+    domains: Subdomains
+    explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
+
+    def __call__(self, x: Dense) -> Dense:
+        """Multiply with F."""
+        return self.packed.congruence([inverse for inverse, _ in self._blocks], x)
+
+    def preconditioner(self, kind: str, scaling: str) -> Product:
+        """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
+
+        kind : lumped or dirichlet
+        scaling : multiplicity or stiffness
+
+        Raises
+        ------
+        ValueError
+            For other names.
+
+        """
+        return _scaled(self.packed, *self.weighted_blocks(kind, scaling))
+
+    def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
+        """Return D of each group, and the weights W of all that rows touch.
+
+        Raises
+        ------
+        ValueError
+            As of `preconditioner`.
+
+        """
+        for name, value, known in (
+            ("preconditioner", kind, ("lumped", "dirichlet")),
+            ("scaling", scaling, ("multiplicity", "stiffness")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
+        groups = self.packed.groups
+        blocks = (
+            [g.kind.block(g.touched) for g in groups] if kind == "lumped"
+            else [schur for _, schur in self._blocks]
+        )  # fmt: skip
+        softness = [
+            np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
+        ]
+        weights = np.concatenate(softness)
+        if scaling == "multiplicity":
+            weights = np.ones_like(weights)
+        return blocks, weights
+
+    @cached_property
+    def packed(self) -> Packed:
+        """Its rows on what they touch."""
+        return packed(self.B, self.domains, self.explicit)
+
+    @cached_property
+    def _blocks(self) -> list[tuple[Any, Any]]:
+        """(K⁺)_bb and S_bb of each group: matrices, or what multiplies with them."""
+        return [
+            _explicit(g) if g.explicit else _implicit(g) for g in self.packed.groups
+        ]
+
+
+def _explicit(group: Group) -> tuple[Any, Any]:
+    blocks = group.kind.condensed(group.touched)
+    if group.members.size == 1:
+        return _Triangle.of(blocks.compliance), _Triangle.of(blocks.schur)
+    return blocks
+
+
+def _implicit(group: Group) -> tuple[Any, Any]:
+    kind, b = group.kind, group.touched
+    g = np.union1d(kind.boundary, b)
+    at = np.searchsorted(g, b)
+    return _Part(kind.K.shape[0], b, kind.inverse), _Part(
+        g.size, at, kind.elimination(g).__matmul__
+    )
+
+
+class _Triangle(NamedTuple):
+    """A symmetric matrix by its upper triangle, column by column."""
+
+    n: int
+    entries: Vector
+
+    @classmethod
+    def of(cls, M: Dense) -> _Triangle:
+        return cls(len(M), lapack.dtrttp(M)[0])
+
+    def __matmul__(self, X: Dense) -> Dense:
+        return np.stack([blas.dspmv(self.n, 1.0, self.entries, x) for x in X.T], axis=1)
+
+
+class _Part(NamedTuple):
+    """M_bb of a matrix M (n, n) that columns can be multiplied with."""
+
+    n: int
+    b: Nodes
+    product: Product
+
+    def __matmul__(self, X: Dense) -> Dense:
+        whole = np.zeros((self.n, X.shape[1]))
+        whole[self.b] = X
+        return self.product(whole)[self.b]
+
+
+def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
+    """Make x ↦ B_D diag(blocks) B_Dᵀx,  B_D = (B W Bᵀ)⁻¹B W."""
+    BW = csr_array(of.B @ diags_array(weights))
+    WB, solve = csr_array(BW.T), _gram_inverse(csr_array(BW @ of.BT))
+
+    def product(x: Dense) -> Dense:
+        return solve(np.asarray(BW @ of.multiplied(blocks, WB @ solve(x))))
+
+    return product
+
+
+def _gram_inverse(gram: csr_array) -> Product:
+    """Make x ↦ (B W Bᵀ)⁻¹x; most rows of orthonormal gluing stand alone."""
+    diagonal = gram.diagonal()
+    rows = np.repeat(np.arange(diagonal.size), np.diff(gram.indptr))
+    size = np.sqrt(diagonal[rows] * diagonal[gram.indices])
+    couples = (rows != gram.indices) & (np.abs(gram.data) > ROUNDING * size)
+    coupled = np.unique(rows[couples])
+    if not coupled.size:
+        return lambda x: np.asarray((x.T / diagonal).T)
+    shift = diags_array(SHIFT * diagonal[coupled])
+    factor = cholesky(csc_matrix(gram[coupled][:, coupled] + shift))
+
+    def solve(x: Dense) -> Dense:
+        y = np.asarray((x.T / diagonal).T)
+        y[coupled] = factor(x[coupled])
+        return y
+
+    return solve
+
+
+def dual_operator(B: csr_array, domains: Subdomains) -> SerialisableOperator:
+    """Make F as an operator that can be written: every kind once, and B."""
+    kinds = domains.kinds
+    K = csc_array(block_diag([kind.K for kind in kinds], format="csc"))
+    modes = np.array([kind.R.shape[1] for kind in kinds])
+    R = [np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in kinds]
+    arrays = {
+        **{f"K_{part}": getattr(K, part) for part in _PARTS},
+        **{f"B_{part}": getattr(B, part) for part in _PARTS},
+        "R": np.concatenate(R),
+        "modes": modes,
+        "stiffness": np.concatenate([kind.stiffness for kind in kinds]),
+        "fixing": np.concatenate([kind.fixing for kind in kinds]),
+        "boundary": np.concatenate([kind.boundary for kind in kinds]),
+        "kind": domains.kind,
+        "explicit": explicit_kinds(B, domains),
+    }
+    for name in _OF_KINDS:
+        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
+    return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
+
+
+def made(arrays: Arrays) -> DualOperator:
+    """Put F together from the arrays of `dual_operator`."""
+    ends = [np.append(0, arrays[f"{name}_ends"]) for name in _OF_KINDS]
+    data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
+
+    def kind(k: int) -> Kind:
+        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
+        columns, n = indptr[own.start : own.stop + 1], own.stop - own.start
+        within = slice(columns[0], columns[-1])
+        K = (data[within], indices[within] - own.start, columns - columns[0])
+        return Kind(
+            K=csc_array(K, shape=(n, n)),
+            R=arrays["R"][own, : arrays["modes"][k]],
+            fixing=arrays["fixing"][fixing],
+            boundary=arrays["boundary"][boundary],
+            stiffness=arrays["stiffness"][own],
+        )
+
+    domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
+    shape = arrays["B_indptr"].size - 1, domains.start[-1]
+    B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
+    return DualOperator(B, domains, arrays["explicit"])
+
+
+def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
+    """Choose the kinds whose blocks are formed: the smallest, as many as fit."""
+    sizes = np.array([part.size for part in touched(B, domains)])
+    order = np.argsort(sizes, kind="stable")
+    found = np.zeros(sizes.size, dtype=bool)
+    found[order] = np.cumsum(block_bytes(sizes, domains)[order]) <= EXPLICIT_MIB * 2**20
+    return found
+
+
+def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
+    """Return what both blocks of each kind take, formed on so many components."""
+    alone = np.array([members.size == 1 for members in domains.members])
+    return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

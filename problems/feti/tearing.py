@@ -1,0 +1,168 @@
+"""A mesh cut into subdomains that share no node.
+
+Which cells form a subdomain is a label of each cell: blocks of a structured mesh, or
+whatever a library of graph partitioning says. Cells of one subdomain keep their nodes;
+a node on the boundary of several subdomains gets a copy in each.
+
+Subdomains that are images of one another by a rigid motion are of one kind. They are
+found by their cells (numbered alike), their materials and their points; the rotation of
+each is the best one in the sense of least squares (Kabsch 1976).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from problems.fem.mesh import Nodes
+
+ALIKE = 1e-11  #: distance of the points of equal subdomains, of their diameter
+
+
+class Part(NamedTuple):
+    """One subdomain on its own, with nodes 0 … n_k − 1."""
+
+    points: NDArray[np.float64]  #: (n_k, dim)
+    cells: Nodes  #: (E_k, corners)
+    material: NDArray[np.int64]  #: (E_k,)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Decomposition:
+    """A mesh whose S subdomains have nodes of their own, M in all.
+
+    Torn nodes are numbered subdomain after subdomain, and within one in the order of
+    the nodes that they are copies of.
+    """
+
+    node: Nodes  #: (M,) node of the whole mesh that each torn node is a copy of
+    nodes: int  #: of the whole mesh
+    start: NDArray[np.int64]  #: (S + 1,) first torn node of each subdomain, and M
+    parts: tuple[Part, ...]  #: the first subdomain of each kind
+    kind: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
+    #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
+    rotation: NDArray[np.float64]
+
+    @property
+    def subdomain(self) -> NDArray[np.int64]:
+        """Subdomain of each torn node, (M,)."""
+        return np.repeat(np.arange(self.kind.size), np.diff(self.start))
+
+
+def blocks(
+    divisions: tuple[int, ...], most: int | tuple[int, ...]
+) -> NDArray[np.int64]:
+    """Label the cells of a structured mesh by blocks of at most `most` cells a side.
+
+    The blocks along a direction are as equal as whole numbers allow.
+
+    Parameters
+    ----------
+    divisions : cells along each direction, the one that is numbered fastest first
+    most : H/h; of each direction, where these differ
+
+    Returns
+    -------
+    (Π divisions,) block of each cell, numbered as cells are
+
+    """
+    label = np.zeros(1, dtype=np.int64)
+    sides = np.broadcast_to(most, len(divisions))
+    for cells, side in zip(divisions[::-1], sides[::-1], strict=True):
+        count = -(-cells // int(side))
+        along = np.arange(cells) * count // cells
+        label = (label[:, None] * count + along).ravel()
+    return label
+
+
+def structured_bodies(
+    divisions: Sequence[tuple[int, ...]], most: int
+) -> NDArray[np.int64]:
+    """Label the cells of structured meshes, one after another, each by its `blocks`.
+
+    Parameters
+    ----------
+    divisions : of each body, as of `blocks`
+    most : H/h
+
+    """
+    labels = [np.zeros(0, dtype=np.int64)]
+    for body in divisions:
+        labels.append(blocks(body, most) + labels[-1].max(initial=-1) + 1)
+    return np.concatenate(labels)
+
+
+def decompose(
+    points: NDArray[np.float64],
+    cells: Nodes,
+    label: NDArray[np.int64],
+    material: NDArray[np.int64],
+) -> Decomposition:
+    """Cut a mesh into the subdomains that its cells are labelled with.
+
+    Parameters
+    ----------
+    points : (n, dim)
+    cells : (E, corners)
+    label : (E,) subdomain of each cell, 0 … S − 1, none of them empty
+    material : (E,) of each cell; subdomains of one kind have the same
+
+    """
+    n, S = len(points), int(label.max()) + 1
+    by_label = np.argsort(label, kind="stable")
+    copies, corner = np.unique(
+        (label[by_label, None] * n + cells[by_label]).ravel(), return_inverse=True
+    )
+    start = np.searchsorted(copies, n * np.arange(S + 1))
+    first_cell = np.searchsorted(label[by_label], np.arange(S + 1))
+    node = copies % n
+    corner = corner.reshape(cells.shape) - start[label[by_label], None]
+
+    def part(s: int) -> Part:
+        mine = slice(first_cell[s], first_cell[s + 1])
+        own = node[start[s] : start[s + 1]]
+        return Part(points[own], corner[mine], material[by_label[mine]])
+
+    alike: dict[tuple[bytes, bytes], list[int]] = {}
+    for s in range(S):
+        mine = part(s)
+        alike.setdefault((mine.cells.tobytes(), mine.material.tobytes()), []).append(s)
+    first, kind = list[int](), np.empty(S, dtype=np.int64)
+    rotation = np.empty((S, points.shape[1], points.shape[1]))
+    for group in alike.values():
+        left = np.array(group)
+        while left.size:
+            own = start[left][:, None] + np.arange(start[left[0] + 1] - start[left[0]])
+            same, turn = _images(points[node[own]])
+            kind[left[same]], rotation[left[same]] = len(first), turn[same]
+            first.append(int(left[0]))
+            left = left[~same]
+    return Decomposition(
+        node=node, nodes=n, start=start, parts=tuple(part(s) for s in first),
+        kind=kind, rotation=rotation,
+    )  # fmt: skip
+
+
+def _images(
+    points: NDArray[np.float64],
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Say which of equally many points (g, n, dim) are images of the first, and how.
+
+    Returns
+    -------
+    (g,) whether, and (g, dim, dim) the rotations: x − x̄ = Q (x₁ − x̄₁)
+
+    """
+    x = points - points.mean(axis=1, keepdims=True)
+    near = ALIKE * np.linalg.norm(x[0], axis=1).max()
+    U, _, Vt = np.linalg.svd(np.einsum("gni,nj->gij", x, x[0]))
+    U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
+    Q = U @ Vt
+    moved = np.abs(x - x[0]).max(axis=(1, 2)) <= near  # without turning
+    Q[moved] = np.eye(x.shape[2])
+    turned = np.abs(x - np.einsum("gij,nj->gni", Q, x[0])).max(axis=(1, 2)) <= near
+    return turned, Q

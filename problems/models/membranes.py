@@ -1,0 +1,174 @@
+"""Two membranes that press on each other along an edge: a model problem of Total FETI.
+
+Dostál and Horák 2004, "Scalable FETI with optimal dual penalty for a variational
+inequality"; PERMON's developers measure with it. Under unit tension,
+
+    min Σ_b ∫ ½|∇u_b|² − f_b u_b,    u_1 = 0 on x = 0,   u_1 ≤ u_2 on x = 1
+
+on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 where y > ¾,
+f_2 = −1 where y < ¼, zero elsewhere. Nothing but the first membrane holds the second,
+which can move as a whole; so the forces between them add up to its load, ¼.
+
+Bilinear elements. Each membrane is cut into S × S squares of n × n cells, which are all
+of one kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from scipy.sparse import block_diag, csc_array, csr_array, eye_array
+
+from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
+from problems.contact.sides import active
+from problems.duality.dualisation import posed
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
+from problems.fem.inverse import GeneralisedInverse, supported_inverse
+from problems.fem.laplacian import grid_stiffness
+from problems.fem.mesh import Mesh, Nodes, join, prefixed, rectangle
+from problems.feti.gluing import glue
+from problems.feti.membrane import membrane_kind
+from problems.feti.substructures import local_problems
+from problems.feti.tearing import blocks, decompose
+from problems.feti.torn import Torn
+
+NAMES = ("left", "right")
+LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
+
+
+def membranes(form: str, params: Mapping[str, Value]) -> Case:
+    """Emit the QP in one form."""
+    p: Any = params
+    pair = Membranes(p["S"], p["n"])
+    matrices: Mapping[str, Any] = {}
+    decomposition: Mapping[str, Any] = {}
+    seconds, tear = None, None
+    if form == "primal":
+        new = posed(pair.qp)
+    else:
+        start = perf_counter()
+        torn = pair.torn(p["glue"])
+        new, tear = torn_dual(torn, pair.qp), partial(local_problems, torn, 1)
+        seconds = perf_counter() - start
+        matrices = torn_matrices(torn, new.qp)
+        decomposition = torn_quantities(torn, new.qp)
+    dofs = pair.qp.q.size
+    return Case(
+        qp=new.qp,
+        recover=lambda s: new.recover(s).x,
+        quantities=lambda s: {**pair.quantities(new.recover(s)), **decomposition},
+        scale=new.sign,
+        constant=new.constant,
+        matrices=matrices,
+        dualise_seconds=seconds,
+        mechanics=Mechanics(
+            primal=pair.qp, back=new.recover, factorise=pair.factorise,
+            mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
+            grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
+            tear=tear,
+        ),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Membranes:
+    """Both membranes on uniform grids, node by node, the left one first."""
+
+    S: int  #: subdomains along a side of a membrane, 1/H
+    n: int  #: cells along a side of a subdomain, H/h
+
+    @property
+    def side(self) -> int:
+        """Cells along a side of a membrane."""
+        return self.S * self.n
+
+    @cached_property
+    def _joined(self) -> tuple[Mesh, Nodes]:
+        squares = (
+            prefixed(
+                rectangle((x, 0.0), (1.0, 1.0), (self.side, self.side)), f"{name} "
+            )
+            for x, name in zip((0.0, 1.0), NAMES, strict=True)
+        )
+        return join(tuple(squares))
+
+    @property
+    def mesh(self) -> Mesh:
+        """Both squares; the sides that touch are not joined."""
+        return self._joined[0]
+
+    @property
+    def body(self) -> Nodes:
+        """Membrane of each cell, (E,)."""
+        return self._joined[1]
+
+    @cached_property
+    def qp(self) -> QP:
+        """The primal problem: unknowns are the heights of the nodes."""
+        nodes, sides = len(self.mesh.points), self.mesh.boundaries
+        K = grid_stiffness((self.side, self.side))
+        loads = [
+            f * np.outer(shares(self.side, *y), shares(self.side, 0.0, 1.0)).ravel()
+            for f, y in LOADED
+        ]
+        one = csr_array(eye_array(nodes, format="csr"))
+        held = one[np.sort(sides["left left"])]
+        lower, upper = (np.sort(sides[s]) for s in ("left right", "right left"))
+        return QP(
+            P=csc_array(block_diag([K, K], format="csc")), q=-np.concatenate(loads),
+            A=held, b=np.zeros(held.shape[0]),
+            G=csr_array(one[lower] - one[upper]), h=np.zeros(lower.size),
+            lb=np.full(nodes, -np.inf), ub=np.full(nodes, np.inf),
+        )  # fmt: skip
+
+    @property
+    def rigid(self) -> Any:
+        """Motions of each membrane as a whole, (nodes, 2), orthonormal."""
+        half = self.qp.q.size // 2
+        return np.kron(np.eye(2), np.full((half, 1), half**-0.5))
+
+    def factorise(self) -> GeneralisedInverse:
+        """Factorise K without the prescribed components; the right one is free."""
+        free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
+        return supported_inverse(self.qp.P, free, self.rigid)
+
+    def torn(self, rows: str) -> Torn:
+        """Tear both into squares, glued by `rows` of `problems.feti.gluing`."""
+        mesh, qp, nodes = self.mesh, self.qp, self.qp.q.size
+        squares = blocks((self.side, self.side), self.n)
+        label = np.concatenate([squares, squares + self.S**2])
+        parts = decompose(mesh.points, mesh.cells, label, np.zeros_like(self.body))
+        return glue(
+            parts, tuple(map(membrane_kind, parts.parts)), load=-qp.q,
+            supports=csr_array(qp.A), supported=qp.b, contact=csr_array(qp.G), c=qp.h,
+            E=np.ones(nodes), rows=rows,
+        )  # fmt: skip
+
+    def quantities(self, s: Solution) -> dict[str, Any]:
+        """Report counts, energy, force on the right membrane and its lowest height.
+
+        Of a solution of the primal problem; energy and force are per tension.
+        """
+        return {
+            "nodes": len(self.mesh.points),
+            "elements": len(self.mesh.cells),
+            "dofs": self.qp.q.size,
+            "equality_rows": self.qp.b.size,
+            "contact_rows": self.qp.h.size,
+            "active": int(active(s.z).sum()),
+            "energy": self.qp.objective(s.x),
+            "contact_force": float(s.z.sum()),
+            "lowest": float(s.x.min()),
+        }
+
+
+def shares(n: int, lower: float, upper: float) -> Vector:
+    """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
+    begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
+    rising = (end**2 - begin**2) / 2
+    return np.asarray((np.append(end - begin - rising, 0) + np.append(0, rising)) / n)

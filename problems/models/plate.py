@@ -1,0 +1,210 @@
+"""An elastic plate in square subdomains: a linear problem to measure FETI on.
+
+A plate of `width` × `height` is held at its left edge and pulled down by 1 N per m of
+thickness. It consists of Sx × Sy subdomains of n × ny cells, with E = 1 Pa, and
+E = `jump` in some of them: every other one (``checkerboard``) or those at the held edge
+(``column``). Nothing touches it, so that the dual has equations only, and its condition
+numbers say how well the method scales, without load, stopping test or units.
+
+The load acts at the upper right corner (``point``), as a constant traction on the right
+edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
+
+Supports are rows of B as everywhere (Total FETI), or ``eliminated``: then subdomains at
+the held edge do not float, as in FETI-1 (Farhat and Roux 1991).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+
+from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
+from harness.mechanics import Substructures
+from problems.duality.dualisation import Transformed, posed
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
+from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
+from problems.fem.inverse import GeneralisedInverse, regular_inverse
+from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
+from problems.feti.elastic import elastic_kind
+from problems.feti.gluing import glue, without_supports
+from problems.feti.spectrum import Spectrum, spectra_of_equations
+from problems.feti.substructures import local_problems
+from problems.feti.tearing import blocks, decompose
+from problems.feti.torn import Torn
+
+NU = 0.3
+#: preconditioner and scaling, by the names under which their spectra are reported
+PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
+    "none": None,
+    "lumped": ("lumped", "multiplicity"),
+    "dirichlet": ("dirichlet", "multiplicity"),
+    "dirichlet_stiffness": ("dirichlet", "stiffness"),
+}
+
+
+def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
+    """Emit the QP in one form."""
+    plate = model(tuple(params.items()))
+    mesh = plate.mesh
+    new = plate.dual if form == "dual" else posed(plate.primal)
+
+    def results(s: Solution) -> Mapping[str, Any]:
+        counts = quantities(plate, new.recover(s))
+        return counts | (dual_quantities(plate) if form == "dual" else {})
+
+    def torn() -> Substructures:
+        return local_problems(plate.torn)
+
+    return Case(
+        qp=new.qp,
+        recover=lambda s: new.recover(s).x,
+        quantities=results,
+        fields=lambda s: Fields(
+            points=mesh.points, cells=mesh.cells, bodies=plate.material,
+            displacement=as_vectors(new.recover(s).x),
+        ),
+        scale=new.sign,
+        constant=new.constant,
+        matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
+        mechanics=Mechanics(
+            primal=plate.primal, back=new.recover, factorise=plate.factorise,
+            mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells))),
+            rigid=rigid_modes(mesh.points), names=("plate",), grid=Grid(
+                mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
+                np.zeros(mesh.dofs),
+            ),
+            tear=torn if form == "dual" and not plate.eliminated else None,
+        ),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plate:
+    """The plate of one set of keys: E = 1 Pa, lengths in m, forces in N/m."""
+
+    size: tuple[float, float]  #: width and height, m
+    mesh: Mesh
+    subdomain: NDArray[np.int64]  #: (E,) of each cell
+    material: NDArray[np.int64]  #: (E,) of each cell, a place in `moduli`
+    moduli: Vector  #: Pa
+    D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials, Pa
+    primal: QP
+    glue: str
+    eliminated: bool  #: whether the supports are no rows of the dual
+
+    @cached_property
+    def torn(self) -> Torn:
+        """The plate in its subdomains; it is one body, so that no row is scaled."""
+        points, primal = self.mesh.points, self.primal
+        parts = decompose(points, self.mesh.cells, self.subdomain, self.material)
+        torn = glue(
+            parts, tuple(elastic_kind(p, self.D, self.moduli) for p in parts.parts),
+            load=-primal.q, supports=csr_array(primal.A), supported=primal.b,
+            contact=csr_array(primal.G), c=primal.h, E=np.ones(len(points)),
+            rows=self.glue,
+        )  # fmt: skip
+        return without_supports(torn, self.held) if self.eliminated else torn
+
+    @cached_property
+    def dual(self) -> Transformed:
+        """The dual of the torn plate."""
+        return torn_dual(self.torn, self.primal)
+
+    @cached_property
+    def spectra(self) -> Mapping[str, Spectrum]:
+        """Spectra of F on its equations, alone and with preconditioners."""
+        found = spectra_of_equations(self.torn, list(PRECONDITIONERS.values()))
+        return dict(zip(PRECONDITIONERS, found, strict=True))
+
+    @property
+    def held(self) -> NDArray[np.int64]:
+        """Components at the held edge."""
+        return dofs_of(self.mesh.boundaries["left"])
+
+    def factorise(self) -> GeneralisedInverse:
+        """Factorise K without the prescribed components."""
+        free = np.setdiff1d(np.arange(self.mesh.dofs), self.held)
+        return regular_inverse(self.primal.P, free)
+
+
+@lru_cache(maxsize=4)
+def model(params: tuple[tuple[str, Value], ...]) -> Plate:
+    """Mesh and assemble the plate of complete keys."""
+    p: Any = dict(params)
+    side = (p["n"], p["ny"] or p["n"])
+    pieces = (p["Sx"], p["Sy"])
+    cells = (side[0] * pieces[0], side[1] * pieces[1])
+    size = (p["width"] or float(p["Sx"]), p["height"] or float(p["Sy"]))
+    mesh = rectangle((0.0, 0.0), size, cells)
+    subdomain = blocks(cells, side)
+    column, row = subdomain % p["Sx"], subdomain // p["Sx"]
+    material = {
+        "uniform": np.zeros_like(subdomain),
+        "checkerboard": (column + row) % 2,
+        "column": (column == 0).astype(np.int64),
+    }[p["pattern"]]
+    moduli = np.array([1.0, p["jump"]])
+    D = np.stack([elasticity_matrix(Material(E, NU), p["plane"]) for E in moduli])
+    n = mesh.dofs
+    one = csr_array(eye_array(n, format="csr"))
+    held = dofs_of(mesh.boundaries["left"])
+    primal = QP(
+        P=stiffness(mesh, D, material), q=-load(mesh, p["load"]),
+        A=one[held], b=np.zeros(held.size), G=no_rows(n), h=np.zeros(0),
+        lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
+    )  # fmt: skip
+    return Plate(
+        size=size, mesh=mesh, subdomain=subdomain, material=material, moduli=moduli,
+        D=D, primal=primal, glue=p["glue"], eliminated=p["supports"] == "eliminated",
+    )  # fmt: skip
+
+
+def load(mesh: Mesh, kind: str) -> Vector:
+    """Return nodal forces (2N,) that pull down with 1 N/m in all."""
+    right = mesh.boundaries["right"]
+    share = {
+        "point": (right == np.intersect1d(right, mesh.boundaries["top"])).astype(float),
+        "edge": nodal_lengths(mesh.points[right]),
+        "nodal": np.ones(right.size),
+    }[kind]
+    f = np.zeros(mesh.dofs)
+    f[2 * right + 1] = -share / share.sum()
+    return f
+
+
+def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
+    """Report counts, energy, J/m, and the tip [u_x, u_y], m: the upper right corner."""
+    mesh = plate.mesh
+    tip = dofs_of(np.intersect1d(mesh.boundaries["top"], mesh.boundaries["right"]))
+    return {
+        "nodes": len(mesh.points),
+        "elements": len(mesh.cells),
+        "dofs": mesh.dofs,
+        "equality_rows": plate.primal.b.size,
+        "energy": plate.primal.objective(s.x),
+        "tip": s.x[tip].tolist(),
+    }
+
+
+def dual_quantities(plate: Plate) -> dict[str, Any]:
+    """Report how the plate is torn, ‖PFP‖, and condition numbers with error bounds.
+
+    kappa: κ(PFP). kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
+    preconditioners, by multiplicity but for the last. Each has an `…_error`.
+    """
+    spectra = plate.spectra
+    found: dict[str, Any] = {
+        **torn_quantities(plate.torn, plate.dual.qp),
+        "norm_PFP": spectra["none"].largest,
+        "norm_PFP_error": spectra["none"].largest_error,
+    }
+    for name, of in spectra.items():
+        key = "kappa" if name == "none" else f"kappa_{name}"
+        found |= {key: of.condition, f"{key}_error": of.condition_error}
+    return found

@@ -1,0 +1,395 @@
+"""Equality rows Gx = e as orthonormal rows C: dense, or by a sparse Cholesky factor.
+
+Few rows are orthonormalised by a pivoted QR factorisation, which also finds their rank
+(`DenseRows`). Thousands of sparse ones, as the rigid modes of subdomains give, are only
+divided by their norms, and
+
+    GGᵀ = LLᵀ,   C = L⁻¹G,   𝒫 = I − CᵀC = I − Gᵀ(GGᵀ)⁻¹G
+
+are applied by products with G and solves with L (`SparseRows`); they must be
+independent. A model of the penalty ρCᵀC for steps over the box comes with each:
+`solvers.smalbe.model.Model` holds C as it is, `PenaltyModel` needs solves with
+G_F G_Fᵀ + κGGᵀ on a face F. These differ from (1 + κ)GGᵀ in rows that bounded
+components touch, and in contact few subdomains have any: with those rows c last, only
+the Schur complement of GGᵀ on them is factorised anew (`_Bordered`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.sparse import csc_matrix, csr_array, diags_array, issparse
+from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
+
+from harness import Matrix, Vector, too_large
+from solvers.smalbe import compiled
+from solvers.smalbe.kernels import Mask
+from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
+
+RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
+MOST_BORDER = 2000  #: rows that bounded components touch, whose block is dense
+MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
+
+
+class Transposed(Protocol):
+    """Cᵀ (n, r)."""
+
+    def __matmul__(self, a: Vector, /) -> Vector: ...
+
+
+class Orthonormal(Protocol):
+    """C (r, n) with CCᵀ = I."""
+
+    @property
+    def T(self) -> Transposed: ...
+    def __len__(self) -> int: ...
+    def __matmul__(self, v: Vector, /) -> Vector: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Rows(ABC):
+    """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
+
+    G: Matrix  #: (m, n) as given
+    C: Orthonormal  #: (r, n)
+    e_size: float  #: ‖e‖
+    least_pivot: float  #: of the factorisation, 1 for orthogonal rows
+    x_tilde: Vector  #: (n,) the shortest x with Gx = e
+    consistent: bool  #: whether there is one
+    multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
+
+    def met(self, nu: Vector, tol: float, least: float) -> bool:
+        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
+
+        For e = 0, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
+        """
+        Cnu = self.C @ nu
+        if self.e_size == 0:
+            size = max(float(np.linalg.norm(nu)), least)
+            return bool(np.linalg.norm(Cnu) <= tol * size)
+        size = float(np.linalg.norm(self.x_tilde))
+        return bool(
+            np.linalg.norm(Cnu) <= tol * size
+            and np.linalg.norm(self.error(nu, Cnu)) <= tol * self.e_size
+        )
+
+    def project(self, v: Vector) -> Vector:
+        """Apply 𝒫 = I − CᵀC."""
+        return np.asarray(v - self.C.T @ (self.C @ v))
+
+    @abstractmethod
+    def error(self, nu: Vector, Cnu: Vector) -> Vector:
+        """Return Gν (m,), from Cν where that is less work."""
+
+    @abstractmethod
+    def model(
+        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
+    ) -> BoxModel:
+        """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC, without what is not above τ."""
+
+    @abstractmethod
+    def fitted(self, free: Mask, r: Vector) -> Vector:
+        """Find the a (r,) with the least ‖(r + Cᵀa)_F‖."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseRows(Rows):
+    """Equality rows whose C (r, n) is an array."""
+
+    C: NDArray[np.float64]
+    GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
+
+    def error(self, nu: Vector, Cnu: Vector) -> Vector:
+        return np.asarray(self.GC @ Cnu)
+
+    def model(
+        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
+    ) -> Model:
+        w = np.append(above, np.full(len(self.C), rho))
+        return Model(0.0, np.vstack([U, self.C]), w).with_tail(tau)
+
+    def fitted(self, free: Mask, r: Vector) -> Vector:
+        a, *_ = np.linalg.lstsq(self.C.T[free], -r[free], rcond=FREE_RANK)
+        return np.asarray(a)
+
+
+@dataclass(frozen=True, eq=False)
+class SparseRows(Rows):
+    """Sparse, independent equality rows, of which GGᵀ is factorised."""
+
+    unit: csr_array  #: (r, n) the rows of G divided by their norms
+    gram: csc_matrix  #: (r, r) of these
+    factor: Factor  #: of their Gram matrix
+    bordered: _Bordered | None  #: None where most rows touch bounded components
+
+    def error(self, nu: Vector, Cnu: Vector) -> Vector:
+        return np.asarray(self.G @ nu)
+
+    def model(
+        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
+    ) -> BoxModel:
+        # many rows come of many subdomains, and there no eigenvalue stands apart
+        if rho <= tau:
+            return Model.of_norm(tau, self.x_tilde.size)
+        return PenaltyModel(tau, self, rho - tau)
+
+    def fitted(self, free: Mask, r: Vector) -> Vector:
+        solve = self.factor_in(free, FREE_RANK)
+        y = -solve(self.unit @ np.where(free, r, 0.0))
+        return _forward(self.factor, self.gram @ y)
+
+    def factor_in(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return solves with G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
+        if self.bordered is not None:
+            return self.bordered.solver(~free, shift)
+        held = self.unit[:, np.flatnonzero(~free)]
+        factor = self.factor.cholesky(_csc((1 + shift) * self.gram - held @ held.T))
+        return lambda t: np.asarray(factor(t))
+
+
+@dataclass(frozen=True, eq=False)
+class _Bordered:
+    """S = GGᵀ = LLᵀ with the rows c that bounded components touch last.
+
+    L_cc L_ccᵀ is the Schur complement of S on c, and that of (1 + κ)S − G_H G_Hᵀ with
+    held components H is (1 + κ)L_cc L_ccᵀ − (G_H G_Hᵀ)_cc.
+    """
+
+    order: NDArray[np.int64]  #: (r,) rows, those of c last
+    factor: Factor  #: of S in that order
+    L_cc: NDArray[np.float64]
+    touching: csc_matrix  #: G_c (c, n)
+
+    def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return solves with (1 + shift)S − G_H G_Hᵀ."""
+        G_H, L_cc, n = (
+            self.touching[:, np.flatnonzero(held)],
+            self.L_cc,
+            self.order.size,
+        )
+        inner, scale = slice(0, n - len(L_cc)), 1 + shift
+        schur = cho_factor(
+            scale * (L_cc @ L_cc.T) - (G_H @ G_H.T).toarray(), lower=True
+        )
+
+        def solve(t: Vector) -> Vector:
+            u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
+            u[inner] /= scale
+            u[inner.stop :] = L_cc.T @ cho_solve(schur, L_cc @ u[inner.stop :])
+            s = np.empty(n)
+            s[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
+            return s
+
+        return solve
+
+
+def _bordered(unit: csr_array, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
+    last = np.zeros(gram.shape[0], dtype=bool)
+    last[csc_matrix(unit[:, np.flatnonzero(bounded)]).indices] = True
+    c, rest = np.flatnonzero(last), np.flatnonzero(~last)
+    if c.size > MOST_BORDER:
+        return None
+    if rest.size:
+        rest = rest[analyze(_csc(gram[rest][:, rest]), use_long=False).P()]
+    order = np.concatenate([rest, c])
+    S = _csc(gram[order][:, order])
+    factor = analyze(S, ordering_method="natural", use_long=False)
+    factor.cholesky_inplace(S)
+    L_cc = factor.L()[rest.size :, rest.size :].toarray()
+    return _Bordered(order, factor, L_cc, csc_matrix(unit[c]))
+
+
+@dataclass(frozen=True, eq=False)
+class PenaltyModel:
+    """B = τI + w Gᵀ(GGᵀ)⁻¹G, which is τI + wCᵀC."""
+
+    tau: float
+    rows: SparseRows
+    w: float  #: positive
+
+    has_directions = True
+
+    def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
+        """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
+
+        As `Model.step`, with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs: the gradient of
+        the dual function is Gs(y) − GGᵀy/w.
+        """
+        G, gram, tau, w = self.rows.unit, self.rows.gram, self.tau, self.w
+
+        def at(y: Vector) -> Tilted:
+            return tilted(x, g + G.T @ y, tau, bounds, lambda s: G @ s - gram @ y / w)
+
+        def newton(slope: Vector, free: Mask) -> Vector:
+            return np.asarray(tau * self.rows.factor_in(free, tau / w)(slope))
+
+        s = minimised(at, newton, len(self.rows.C))
+        return Model.of_norm(tau + w, x.size).step(x, g, bounds) if s is None else s
+
+    def raised(self, s: Vector, sHs: float) -> BoxModel:
+        """As `Model.raised`."""
+        Cs = self.rows.C @ s
+        part = float(Cs @ Cs)
+        rest = float(s @ s) - part
+        missing = sHs - self.tau * float(s @ s) - self.w * part
+        tau = self.tau + missing / rest if rest > 0 else np.inf
+        tau = min(max(tau, self.tau), 10 * self.tau)
+        w = self.w + self.tau - tau
+        if w <= 0:
+            return Model.of_norm(tau, s.size)
+        return PenaltyModel(tau, self.rows, w)
+
+    def relaxed(self, factor: float) -> PenaltyModel:
+        """As `Model.relaxed`."""
+        return replace(self, tau=self.tau / factor)
+
+    def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
+        """Return v → B_FF⁻¹v_F, zero off the face F."""
+        G, solve = self.rows.unit, self.rows.factor_in(free, self.tau / self.w)
+
+        def apply(v: Vector) -> Vector:
+            v = np.where(free, v, 0.0)
+            return np.where(free, v - G.T @ solve(G @ v), 0.0) / self.tau
+
+        return apply
+
+
+@dataclass(frozen=True, eq=False)
+class _Factored:
+    """C = L⁻¹G of normalised rows G (r, n) with the Cholesky factor L of GGᵀ."""
+
+    unit: csr_array
+    factor: Factor
+
+    def __len__(self) -> int:
+        return int(self.unit.shape[0])
+
+    def __matmul__(self, v: Vector) -> Vector:
+        return _forward(self.factor, self.unit @ v)
+
+    @property
+    def T(self) -> _FactoredTransposed:
+        return _FactoredTransposed(self)
+
+
+@dataclass(frozen=True, eq=False)
+class _FactoredTransposed:
+    C: _Factored
+
+    def __matmul__(self, a: Vector) -> Vector:
+        return np.asarray(self.C.unit.T @ _backward(self.C.factor, a))
+
+
+def _forward(factor: Factor, t: Vector) -> Vector:
+    """Return L⁻¹t."""
+    return np.asarray(factor.solve_L(factor.apply_P(t), use_LDLt_decomposition=False))
+
+
+def _backward(factor: Factor, a: Vector) -> Vector:
+    """Return L⁻ᵀa."""
+    return np.asarray(factor.apply_Pt(factor.solve_Lt(a, use_LDLt_decomposition=False)))
+
+
+def is_sparse(G: Matrix) -> bool:
+    """Whether rows G (m, n) are too many to be held as an array."""
+    return bool(issparse(G) and G.shape[0] * G.shape[1] > MOST_DENSE)
+
+
+def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
+    """Orthonormalise the rows of G (m, n), as sparse ones where they are many.
+
+    Rows that depend on each other are taken as dense ones.
+
+    bounded : (n,) components that have a bound
+
+    Raises
+    ------
+    ValueError
+        Where dependent rows are too many for that.
+
+    """
+    if not is_sparse(G):
+        return orthonormal_rows(G, e)
+    rows = sparse_rows(csr_array(G), e, bounded)
+    if rows is not None:
+        return rows
+    m, n = G.shape
+    if reason := too_large(max(m, n), 3 * min(m, n) / max(m, n)):
+        raise ValueError(f"the equality rows depend on each other, and {reason}")
+    return orthonormal_rows(G, e)
+
+
+def sparse_rows(G: csr_array, e: Vector, bounded: Mask) -> SparseRows | None:
+    """Factorise GGᵀ of sparse G (m, n); None where rows depend on each other."""
+    size = np.sqrt(G.multiply(G).sum(axis=1))
+    if not (size > 0).all():
+        return None
+    unit = csr_array(diags_array(1 / size) @ G)
+    gram = _csc(unit @ unit.T)
+    factor = analyze(gram, use_long=False)
+    try:
+        factor.cholesky_inplace(gram)
+    except CholmodNotPositiveDefiniteError:
+        return None
+    least = float(factor.D().min())  # pivots may be negative, too
+    if least <= RANK:
+        return None
+    return SparseRows(
+        G=G, C=_Factored(unit, factor), e_size=float(np.linalg.norm(e)),
+        least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
+        multipliers=lambda a: _backward(factor, a) / size,
+        unit=unit, gram=gram, factor=factor, bordered=_bordered(unit, gram, bounded),
+    )  # fmt: skip
+
+
+def _csc(M: Matrix) -> csc_matrix:
+    """Have entries numbered by 32-bit integers, as the factor does."""
+    M = csc_matrix(M)
+    M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
+    return M
+
+
+def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
+    """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
+    dense = as_dense(G)
+    size = np.linalg.norm(dense, axis=1)
+    size[size == 0] = 1.0
+    Q, R, pivot = qr((dense / size[:, None]).T, mode="economic", pivoting=True)
+    rank = int((np.abs(np.diag(R)) > RANK).sum())
+    C, R, kept = Q[:, :rank].T, R[:rank, :rank], pivot[:rank]
+    x_tilde = C.T @ solve_triangular(R, (e / size)[kept], trans="T")
+    mismatch = np.abs(dense @ x_tilde - e) / size
+    scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
+
+    triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
+    multipliers = partial(compiled.multipliers, e.size, *triangle)
+    consistent = bool((mismatch <= 1e-8 * scale).all())
+    C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
+    pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
+    return DenseRows(
+        dense, C, e_size, pivot_size, x_tilde, consistent, multipliers, dense @ C.T
+    )
+
+
+def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
+    """Do what `orthonormal_rows` does, compiled."""
+    found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e))
+    dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
+    multipliers = partial(compiled.multipliers, e.size, *triangle)
+    return DenseRows(
+        dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
+    )
+
+
+def as_dense(G: Matrix) -> NDArray[np.float64]:
+    """Return a matrix as an array, row by row."""
+    dense = G.toarray() if hasattr(G, "toarray") else G
+    return np.ascontiguousarray(dense, dtype=float)

@@ -1,0 +1,269 @@
+"""The certificate from subdomains: no error above its bound, no factor of the whole.
+
+Bodies are cut into boxes. The truth is the reference solution of the whole, known to
+rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import block_diag
+
+from harness import Mechanics, Solution, Status, UncertifiableError, certify
+from harness.mechanics import Extended, Real
+from harness.names import parse
+from harness.verify.certificate import Certificate
+from harness.verify.references import ReferencePoint, reference_point
+from harness.verify.substructured import neighbour
+from problems import PROBLEMS
+from problems.contact.bodies import Bodies
+from problems.feti.elastic import subdivide, torn
+from problems.feti.substructures import LocalProblems, local_problems
+from problems.models import beam_ring, hertz, patch
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+
+CASES = (
+    "beam-ring/Nr=3/Nh=2/step=10",
+    "beam-ring/Nr=2/Nh=3/step=6/contact=mortar/basis=standard",
+    "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7",
+    "contact-patch/ratio=0.1",  # contact alone holds the upper block
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2",
+    "hertz-cylinder/n=3/m=2",
+)
+PERTURBATIONS = 6000
+ROUNDED = 1 + 1e-9  #: local solves are those of doubles
+NOISE = 1e-7  #: relative error from which on effectivities are measured
+
+
+def bodies_of(name: str) -> Bodies:
+    params: Mapping[str, Any] = parse(f"{name}/primal", PROBLEMS).params
+    if name.startswith("beam-ring"):
+        keys = ("Nr", "Nh", "radial", "plane")
+        return beam_ring.model(*(params[key] for key in keys))
+    if name.startswith("contact-patch"):
+        return patch.model(params)
+    return hertz.two_cylinders(params)[0]
+
+
+def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
+    """Label cells by boxes around their centres, body by body."""
+    centres = bodies.mesh.points[bodies.mesh.cells].mean(axis=1)
+    label = np.zeros(len(centres), dtype=np.int64)
+    for b in range(len(bodies.names)):
+        own = bodies.body == b
+        low, high = centres[own].min(axis=0), centres[own].max(axis=0)
+        cell = ((centres[own] - low) / (high - low + 1e-9) * parts).astype(np.int64)
+        label[own] = b * np.prod(parts) + cell @ [1, parts[0]]
+    return np.unique(label, return_inverse=True)[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A small torn problem with its solution to rounding."""
+
+    mechanics: Mechanics
+    exact: ReferencePoint
+
+    def solution(self) -> Solution:
+        """The solution as `Mechanics.back` would give it."""
+        m, primal = self.mechanics, self.mechanics.primal
+        u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
+        y = -primal.A @ (primal.P @ u + primal.q + m.rows.T @ lam)
+        contact, z = primal.h.size, np.zeros(primal.h.size + m.friction.bound.size)
+        z[:contact] = lam[:contact]
+        z[contact:][m.friction.bound > 0] = lam[contact:]
+        return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
+
+    def pair_error(self, c: Certificate) -> float:
+        """√(‖û − u*‖² + ‖u_λ − Tu*‖²), the second one of torn displacements."""
+        parts = self.mechanics.substructures
+        jump = c.equilibrium - parts.spread.astype(Real) @ self.exact.u
+        torn = float(np.sqrt(jump @ parts.product(jump)))
+        return float(np.hypot(self.error(c.u), torn))
+
+    def error(self, u: Extended) -> float:
+        """‖u − u*‖_K."""
+        return self.mechanics.whole.norm(u - self.exact.u)
+
+
+@cache
+def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
+    case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
+    whole, bodies = case.mechanics, bodies_of(name)
+    assert whole is not None
+    domains = subdivide(bodies, boxes(bodies, parts))
+
+    def never() -> Any:
+        raise AssertionError("certificates of subdomains need no factor of the whole")
+
+    mechanics = replace(
+        whole, factorise=never,
+        tear=lambda: local_problems(torn(domains, whole.primal, whole.friction)),
+    )  # fmt: skip
+    vars(mechanics)["whole"] = whole
+    return Known(mechanics, reference_point(whole, reference_solution))
+
+
+def noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
+    z = s.z + size * np.abs(s.z).max() * rng.standard_normal(s.z.size)
+    return replace(s, x=x, z=z)
+
+
+def scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    a, b = 1 + size * rng.standard_normal(2)
+    return replace(s, x=a * s.x, z=b * s.z)
+
+
+def wrong_rows(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Move forces from rows in contact to others."""
+    z, swapped = s.z.copy(), rng.random(s.z.size) < max(size, 1.5 / s.z.size)
+    z[swapped] = rng.permutation(z)[swapped]
+    return replace(s, z=z)
+
+
+def infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Push bodies into each other, move what is held, and let contact pull."""
+    x = s.x * (1 + 10 * size) + size * np.abs(s.x).max() * rng.random(s.x.size)
+    return replace(s, x=x, z=s.z - size * np.abs(s.z).max() * rng.random(s.z.size))
+
+
+def shifted(s: Solution, size: float, rng: np.random.Generator) -> Solution:
+    """Move and bend all bodies together."""
+    u = s.x.reshape(-1, 2)
+    bend = np.cumsum(rng.standard_normal(u.shape), axis=0) / len(u) ** 0.5
+    moved = u + size * np.abs(u).max() * (rng.standard_normal(2) + bend)
+    return replace(s, x=moved.ravel())
+
+
+KINDS = (noise, scaled, wrong_rows, infeasible, shifted)
+
+
+def holds(problem: Known, s: Solution, found: Certificate) -> bool:
+    """Whether no error that the certificate speaks of exceeds what it says."""
+    exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
+    worst = max(problem.error(found.u), problem.error(s.x.astype(Real)))
+    within = min(found.error, found.bound * problem.exact.norm)
+    motion, lam = exact.motion(found.u), found.multipliers
+    return bool(
+        problem.pair_error(found) <= ROUNDED * found.pair + 2 * slack
+        and worst <= ROUNDED * within + slack
+        and (lam >= exact.lower).all() and (lam <= exact.upper).all()
+        and (motion[exact.contact] <= 0).all()
+        and (found.u[exact.held] == 0).all()
+    )  # fmt: skip
+
+
+def violations(name: str, count: int) -> tuple[list[str], list[float]]:
+    """Disturb the solution at random; tell when a bound did not hold, and how sharp."""
+    problem, told, sharp = known(name), list[str](), list[float]()
+    rng = np.random.default_rng(sum(map(ord, name)))
+    for i in range(count):
+        kind, size = KINDS[i % len(KINDS)], 10 ** rng.uniform(-9, 0.3)
+        s = kind(problem.solution(), size, rng)
+        try:
+            found = certify(problem.mechanics, s)
+        except UncertifiableError as e:
+            told.append(f"{kind.__name__} {size:.1e}: {e}")
+            continue
+        if not holds(problem, s, found):
+            told.append(f"{kind.__name__} {size:.1e}: bound {found.bound:.3e}")
+        error = max(problem.error(s.x.astype(Real)), problem.pair_error(found))
+        if NOISE * problem.exact.norm < error < 0.1 * problem.exact.norm:
+            sharp.append(found.error / error)
+    return told, sharp
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_error_exceeds_its_bound_and_bounds_are_sharp(name: str) -> None:
+    told, sharp = violations(name, 50)
+    assert told == []
+    assert len(sharp) > 10
+    assert np.median(sharp) <= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_none_of_a_thousand_does(name: str) -> None:
+    told, sharp = violations(name, PERTURBATIONS // len(CASES))
+    assert told == []
+    assert np.median(sharp) <= 2
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_bound_of_the_solution_is_that_of_rounding(name: str) -> None:
+    assert certify(known(name).mechanics, known(name).solution()).bound < 1e-7
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_bounds_are_about_those_of_the_whole(name: str) -> None:
+    problem, found = known(name), []
+    for tol in (1e-3, 1e-4, 1e-5, 1e-6):
+        for label in ("clarabel", "piqp"):
+            case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
+            assert case.mechanics is not None
+            s = case.mechanics.back(SOLVERS[label].prepare(case.qp, tol)())
+            one, other = (certify(m, s) for m in (case.mechanics, problem.mechanics))
+            assert holds(problem, s, other)
+            if one.bound > NOISE:
+                found.append(other.bound / one.bound)
+    assert np.median(found) <= 2.5
+
+
+def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
+    problem = known(CASES[0])
+    mechanics, parts = problem.mechanics, problem.mechanics.substructures
+    rng, exact = np.random.default_rng(5), problem.exact
+    u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
+    u[mechanics.exact.held] = 0
+    near = neighbour(mechanics, u, exact.multipliers)
+    b = parts.product(near.d)
+    residual = mechanics.stiffness @ u - mechanics.exact.f
+    residual = residual + mechanics.exact.B.T @ exact.multipliers
+    free = np.setdiff1d(np.arange(u.size), mechanics.exact.held)
+    size = float(np.abs(residual).max())
+    assert_allclose(
+        (parts.spread.T @ b - residual)[free].astype(float), 0, atol=1e-11 * size
+    )
+    assert np.abs(parts.kernel.T @ b).max() < 1e-11 * size
+    assert near.left < 1e-9 * np.sqrt(near.d @ b)
+
+
+def test_local_problems_are_those_of_the_torn_bodies() -> None:
+    parts = known(CASES[0]).mechanics.substructures
+    assert isinstance(parts, LocalProblems)
+    K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
+    rng = np.random.default_rng(6)
+    v = rng.standard_normal(K.shape[0])
+    b = v - parts.kernel @ (parts.kernel.T @ v)
+    assert_allclose(parts.product(v.astype(Real)).astype(float), K @ v, rtol=1e-9)
+    assert_allclose(K @ parts.solve(b), b, atol=1e-9 * np.abs(b).max())
+    assert abs(K @ parts.kernel).max() < 1e-12 * abs(K).max()
+
+
+def test_a_load_that_nothing_balances_has_no_certificate() -> None:
+    problem = known("contact-patch/ratio=0.1")
+    primal = problem.mechanics.primal
+    away = replace(problem.mechanics, primal=replace(primal, q=-primal.q))
+    with pytest.raises(UncertifiableError, match="pull"):
+        certify(away, problem.solution())
+
+
+@pytest.mark.parametrize("size", [1e160, 1e300])
+def test_answers_beyond_all_numbers_are_not_called_good(size: float) -> None:
+    problem = known(CASES[0])
+    s = problem.solution()
+    for far in (replace(s, x=size * (1 + s.x)), replace(s, z=size * (1 + s.z))):
+        try:
+            found = certify(problem.mechanics, far)
+        except UncertifiableError:
+            continue
+        assert found.bound >= 1

@@ -1,0 +1,159 @@
+"""Two membranes: PERMON's model problem, with the sizes of its table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.sparse import issparse
+
+from harness import InputError, Solution, Status, kkt_residuals
+from harness.files.matfile import read_mat, save_mat
+from problems import PROBLEMS
+from problems.fem.laplacian import grid_stiffness
+from problems.models.membranes import shares
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+FAMILY = PROBLEMS["membranes"]
+#: (1/H, H/h) and torn unknowns, multipliers, contact rows, subdomains
+TABLE = {
+    (1, 8): (162, 18, 9, 2), (2, 4): (200, 56, 9, 8), (2, 8): (648, 104, 17, 8),
+    (2, 16): (2312, 200, 33, 8), (4, 4): (800, 256, 17, 32),
+    (4, 8): (2592, 480, 33, 32), (8, 4): (3200, 1088, 33, 128),
+}  # fmt: skip
+#: products with F of the best of PERMON 3.25's settings, at its tolerance 1e-6
+PERMON = {
+    (1, 8): 59, (2, 4): 56, (2, 8): 57, (2, 16): 66, (4, 4): 89,
+    (4, 8): 97, (4, 16): 106, (8, 4): 90, (8, 8): 103, (12, 4): 100,
+}  # fmt: skip
+
+
+def built(form, **params):
+    return FAMILY.build(form, params, reference_solution)
+
+
+def solution(case):
+    qp = case.qp
+    if not qp.is_explicit:
+        qp = replace(qp, P=qp.P @ np.eye(qp.q.size), A=qp.A.toarray())
+    return reference_solution(qp)
+
+
+@pytest.mark.parametrize("size", TABLE, ids=str)
+def test_sizes_are_those_of_the_table(size):
+    S, n = size
+    case = built("dual", S=S, n=n)
+    told = case.quantities(Solution.without_point(case.qp, Status.FAILED))
+    names = ("torn_dofs", "multipliers", "contact_rows", "subdomains")
+
+    assert tuple(told[name] for name in names) == TABLE[size]
+    assert (case.qp.lb == 0).sum() == told["contact_rows"]
+    assert told["kinds"] == 1
+    assert told["explicit_subdomains"] == told["subdomains"]
+
+
+def test_the_stiffness_is_exact_for_what_the_elements_hold():
+    """∫|∇u|² of u = 1, x, y and xy on the unit square: 0, 1, 1 and 2/3."""
+    n = 5
+    x = np.tile(np.linspace(0, 1, n + 1), n + 1)
+    y = np.repeat(np.linspace(0, 1, n + 1), n + 1)
+    U = np.stack([x**0, x, y, x * y], axis=1)
+
+    assert np.diag(U.T @ (grid_stiffness((n, n)) @ U)) == pytest.approx(
+        [0, 1, 1, 2 / 3]
+    )
+
+
+@pytest.mark.parametrize("n", [3, 4, 8])
+def test_the_load_integrates_polynomials_of_the_first_degree(n):
+    """Also where the edge of the strip is inside of a cell."""
+    y = np.linspace(0, 1, n + 1)
+    share = shares(n, 0.75, 1.0)
+
+    assert share.sum() == pytest.approx(0.25)
+    assert share @ y == pytest.approx((1 - 0.75**2) / 2)
+
+
+@pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
+def test_the_forms_have_one_solution_in_every_gluing(glue):
+    dual, primal = built("dual", S=2, n=4, glue=glue), built("primal", S=2, n=4)
+    s, s_primal = solution(dual), solution(primal)
+    torn, whole = dual.quantities(s), primal.quantities(s_primal)
+
+    assert dual.recover(s) == pytest.approx(primal.recover(s_primal), abs=1e-12)
+    assert {name: torn[name] for name in whole} == pytest.approx(whole, rel=1e-9)
+    energy = dual.scale * dual.qp.objective(s.x) + dual.constant
+    assert energy == pytest.approx(whole["energy"], rel=1e-10)
+
+
+def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
+    """Its load is ¼; contact is partial, and a bottom of both is free of the other."""
+    case = built("dual", S=2, n=8)
+    s = solution(case)
+    found = case.quantities(s)
+
+    assert found["contact_force"] == pytest.approx(0.25, rel=1e-10)
+    assert 0 < found["active"] < found["contact_rows"]
+    assert kkt_residuals(built("primal", S=2, n=8).qp, case.mechanics.back(s)).worst < (
+        1e-9
+    )
+
+
+@pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
+def test_smalbe_solves_it_as_an_operator(glue):
+    case = built("dual", S=2, n=4, glue=glue)
+    s = SMALBE().prepare(case.qp, 1e-6)()
+
+    assert kkt_residuals(case.qp, s).worst <= 1e-5
+    assert case.quantities(s)["contact_force"] == pytest.approx(0.25, rel=1e-5)
+
+
+@pytest.mark.parametrize(("size", "best"), PERMON.items(), ids=str)
+def test_products_stay_below_those_of_the_best_settings_of_permon(size, best):
+    S, n = size
+    case = built("dual", S=S, n=n)
+    s = SMALBE().prepare(case.qp, 1e-6)()
+
+    assert kkt_residuals(case.qp, s).worst <= 1e-5
+    assert s.counts["P_products"] < best
+    assert s.counts["preconditioner_applies"] < best
+
+
+def test_energies_fall_to_a_limit_as_the_mesh_is_refined():
+    energies = [solution(built("primal", S=1, n=n)) for n in (4, 8, 16, 32)]
+    found = [built("primal", S=1, n=n).qp.objective(s.x)
+             for n, s in zip((4, 8, 16, 32), energies, strict=True)]  # fmt: skip
+
+    steps = -np.diff(found)
+    assert (steps > 0).all()
+    assert (steps[1:] < 0.5 * steps[:-1]).all()
+
+
+def test_the_mat_file_holds_the_dual_in_the_notation_of_the_paper(tmp_path):
+    case = built("dual", S=2, n=2)
+    save_mat(tmp_path / "m.mat", case.qp, {}, case.matrices)
+    M = {
+        name: M.toarray() if issparse(M) else M
+        for name, M in read_mat(tmp_path / "m.mat").items()
+        if name != "meta"
+    }
+    K = block_diag(*[grid_stiffness((2, 2)).toarray()] * 8)
+    expected = M["B"] @ np.linalg.pinv(K) @ M["B"].T
+    G = M["R"].T @ M["B"].T
+    P = np.eye(len(expected)) - np.linalg.pinv(G) @ G
+
+    assert G == pytest.approx(M["A"], abs=1e-14)
+    assert M["F"] == pytest.approx(M["P"])
+    assert P @ M["F"] @ P == pytest.approx(P @ expected @ P, abs=1e-12)
+    assert M["d"] == pytest.approx(-M["q"])
+
+
+def test_values_out_of_range_are_refused():
+    for params, message in (
+        ({"S": 0}, "membranes: S=0 must be at least 1"),
+        ({"n": 0}, "membranes: n=0 must be at least 1"),
+        ({"glue": "tape"}, "membranes: glue='tape' is unknown"),
+    ):
+        with pytest.raises(InputError, match=message):
+            FAMILY.check(FAMILY.complete(params))

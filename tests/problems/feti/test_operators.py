@@ -1,0 +1,244 @@
+"""F = B K⁺Bᵀ by kinds and its preconditioners, against their dense definitions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
+from scipy.sparse import csc_array, eye_array
+
+from harness import QP, no_rows
+from harness.files.qpfile import load_qp, save_qp
+from harness.operators import Preconditioned
+from problems import OPERATORS
+from problems.contact.linearise import linearisation
+from problems.duality.stepping import primal_qp
+from problems.feti.elastic import subdivide, torn
+from problems.feti.operators import dual_operator, made
+from problems.feti.tearing import blocks
+from problems.models.beam_ring import model
+from problems.models.membranes import Membranes
+
+GLUING = ("orthonormal", "chain", "redundant")
+SCALINGS = ("multiplicity", "stiffness")
+KINDS = ("lumped", "dirichlet")
+
+
+def beam_and_ring(rows="orthonormal"):
+    bodies = model(2, 2, 4, "strain")
+    primal = primal_qp(
+        bodies, linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
+    )
+    beam = blocks((16, 2), 2)
+    label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
+    return torn(subdivide(bodies, label), primal, rows=rows)
+
+
+def membranes(rows="orthonormal"):
+    return Membranes(2, 4).torn(rows)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(tear, rows) for tear in (beam_and_ring, membranes) for rows in GLUING],
+    ids=lambda p: f"{p[0].__name__}-{p[1]}",
+)
+def pair(request):
+    tear, rows = request.param
+    return tear(rows)
+
+
+def operator_of(pair):
+    return dual_operator(pair.B, pair.domains)
+
+
+def dense(pair):
+    """K as a whole, with B and R."""
+    K = block_diag(*(pair.kinds[k].K.toarray() for k in pair.kind))
+    return K, pair.B.toarray(), pair.domains.kernel.toarray()
+
+
+def test_the_kernel_is_orthonormal_and_costs_no_energy(pair):
+    K, _, R = dense(pair)
+
+    assert_allclose(R.T @ R, np.eye(R.shape[1]), atol=1e-13)
+    assert abs(K @ R).max() < 1e-13 * abs(K).max()
+
+
+def test_the_inverse_of_torn_bodies_is_a_generalised_one_and_symmetric(pair):
+    K, _, _ = dense(pair)
+    inverse = pair.domains.inverse
+    K_plus = np.stack([inverse(e) for e in np.eye(len(K))], axis=1)
+
+    assert abs(K @ K_plus @ K - K).max() < 1e-12 * abs(K).max()
+    assert_allclose(K_plus, K_plus.T, atol=1e-12 * abs(K_plus).max())
+
+
+def test_products_are_those_of_any_generalised_inverse_on_what_balances(pair):
+    K, B, R = dense(pair)
+    F = operator_of(pair) @ np.eye(len(B))
+    G = R.T @ B.T
+    P = np.eye(len(B)) - np.linalg.pinv(G) @ G
+    expected = P @ B @ np.linalg.pinv(K, rcond=1e-11) @ B.T @ P
+
+    assert_allclose(P @ F @ P, expected, atol=1e-12 * abs(expected).max())
+    assert_allclose(F, F.T, atol=1e-13 * abs(F).max())
+
+
+def test_a_product_with_a_matrix_is_that_with_each_column(pair):
+    F = operator_of(pair)
+    x = np.random.default_rng(3).standard_normal((F.shape[0], 3))
+    columns = np.stack([F @ column for column in x.T], axis=1)
+
+    assert_allclose(F @ x, columns, rtol=1e-12, atol=1e-14)
+
+
+def test_a_block_that_is_not_formed_gives_the_same_product(pair):
+    arrays = operator_of(pair).arrays
+    implicit = made({**arrays, "explicit": np.zeros_like(arrays["explicit"])})
+    x = np.random.default_rng(3).standard_normal((pair.scale.size, 2))
+    Fx = made(arrays)(x)
+
+    assert arrays["explicit"].all()
+    assert_allclose(implicit(x), Fx, atol=1e-11 * abs(Fx).max())
+    assert_allclose(implicit(x[:, 0]), Fx[:, 0], atol=1e-11 * abs(Fx).max())
+    for kind in KINDS:
+        Mx = made(arrays).preconditioner(kind, "stiffness")(x)
+        found = implicit.preconditioner(kind, "stiffness")(x)
+        assert_allclose(found, Mx, atol=1e-9 * abs(Mx).max())
+
+
+def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
+    pair = beam_and_ring()
+    arrays = operator_of(pair).arrays
+    sizes = [
+        np.unique(np.concatenate([
+            pair.B[:, pair.start[s] : pair.start[s + 1]].indices
+            for s in np.flatnonzero(pair.kind == k)
+        ])).size for k in range(len(pair.kinds))
+    ]  # fmt: skip
+    assert len(set(sizes)) > 1
+    room = 16 * (np.square(sizes).sum() - 1) / 2**20
+    monkeypatch.setattr("problems.feti.operators.EXPLICIT_MIB", room)
+
+    explicit = operator_of(pair).arrays["explicit"]
+
+    assert arrays["explicit"].all()
+    assert (np.array(sizes)[~explicit] == max(sizes)).all()
+    assert (~explicit).sum() == 1
+
+
+def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
+    """Each of two membranes in one square, of the same kind or of two."""
+    pair = Membranes(1, 4).torn("orthonormal")
+    (kind,) = pair.kinds
+    other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
+    F, apart = operator_of(pair), operator_of(other)
+    x = np.random.default_rng(3).standard_normal((pair.scale.size, 2))
+
+    assert_allclose(apart @ x, F @ x, rtol=1e-11, atol=1e-13)
+    for name in KINDS:
+        M, of_two = (f.build().preconditioner(name, "stiffness") for f in (F, apart))
+        assert_allclose(of_two(x), M(x), rtol=1e-11, atol=1e-12)
+        assert_allclose(of_two(x[:, 1]), M(x)[:, 1], rtol=1e-11, atol=1e-12)
+
+
+def definition(pair, kind, scaling):
+    """B_D diag(D) B_Dᵀ by pseudo-inverses; B_D is unique but for the kernel of Bᵀ."""
+    _, B, _ = dense(pair)
+    touched = np.abs(B).sum(axis=0) > 0
+    D, softness = [], []
+    for s, k in enumerate(pair.kind):
+        own, part = pair.kinds[k], touched[pair.start[s] : pair.start[s + 1]]
+        S = own.K.toarray().copy()
+        edge = np.zeros(len(S), dtype=bool)
+        edge[own.boundary] = True
+        assert edge[part].all()
+        if kind == "dirichlet":
+            inner = np.linalg.inv(S[~edge][:, ~edge]) if (~edge).any() else 0
+            S = S[edge][:, edge] - S[edge][:, ~edge] @ inner @ S[~edge][:, edge]
+            part = part[edge]
+        D.append(S[part][:, part])
+        stiffness = own.stiffness[touched[pair.start[s] : pair.start[s + 1]]]
+        softness.append(1 / stiffness if scaling == "stiffness" else 0 * stiffness + 1)
+    B, W = B[:, touched], np.diag(np.concatenate(softness))
+    B_D = np.linalg.pinv(B @ W @ B.T, rcond=1e-10, hermitian=True) @ B @ W
+    return B_D @ block_diag(*D) @ B_D.T
+
+
+@pytest.mark.parametrize("scaling", SCALINGS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_preconditioners_are_what_they_are_defined_to_be(pair, kind, scaling):
+    M = operator_of(pair).build().preconditioner(kind, scaling)
+    _, B, _ = dense(pair)
+    expected = B.T @ definition(pair, kind, scaling) @ B
+
+    MB = M(B)
+    assert_allclose(B.T @ MB, expected, atol=3e-7 * abs(expected).max())
+    assert_allclose(M(B[:, 0]), MB[:, 0], atol=1e-6 * abs(MB).max())
+
+
+def test_preconditioners_bring_the_spectrum_together():
+    """As the field has it: none, lumped, Dirichlet."""
+    pair = Membranes(2, 8).torn("orthonormal")
+    F = operator_of(pair)
+    _, B, R = dense(pair)
+    G = R.T @ B.T
+    P = np.eye(len(B)) - np.linalg.pinv(G) @ G
+    PFP = P @ (F @ np.eye(len(B))) @ P
+
+    def spread(M):
+        values = np.linalg.eigvals(P @ M @ P @ PFP).real
+        values = values[values > 1e-9 * values.max()]
+        return values.max() / values.min()
+
+    build = F.build().preconditioner
+    lumped, dirichlet = (
+        spread(build(k, "multiplicity")(np.eye(len(B)))) for k in KINDS
+    )
+    assert dirichlet < lumped < spread(np.eye(len(B)))
+
+
+def test_a_wrong_name_of_a_preconditioner_is_refused_with_the_right_ones():
+    built = operator_of(membranes()).build()
+
+    assert isinstance(built, Preconditioned)
+    with pytest.raises(ValueError, match="preconditioner 'ilu'; known: lumped, diri"):
+        built.preconditioner("ilu", "stiffness")
+    with pytest.raises(ValueError, match="scaling 'none'; known: multiplicity, stiff"):
+        built.preconditioner("lumped", "none")
+
+
+def test_a_written_operator_is_read_as_the_same(tmp_path):
+    pair = beam_and_ring()
+    F, m = operator_of(pair), pair.scale.size
+    qp = QP(
+        P=F, q=pair.c, A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
+        lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
+    )  # fmt: skip
+    digest = save_qp(tmp_path / "qp.npz", qp, serialised=True)
+    read, _ = load_qp(tmp_path / "qp.npz", operators=OPERATORS)
+    x = np.random.default_rng(5).standard_normal(m)
+
+    assert (read.P @ x == F @ x).all()
+    assert save_qp(tmp_path / "again.npz", read, serialised=True) == digest
+
+
+def test_equal_subdomains_share_one_stiffness_in_what_is_written():
+    few, many = (
+        operator_of(Membranes(S, 4).torn("orthonormal")).arrays for S in (1, 3)
+    )
+    assert few["K_data"].size == many["K_data"].size
+    assert many["kind"].size == 9 * few["kind"].size
+
+
+def test_a_kind_without_kernel_has_its_inverse():
+    """Where supports are eliminated, as in FETI-1."""
+    (kind,) = membranes().kinds
+    n = kind.K.shape[0]
+    K = csc_array(kind.K + eye_array(n))
+    nothing = np.zeros(0, dtype=np.int64)
+    regular = replace(kind, K=K, R=np.zeros((n, 0)), fixing=nothing)
+
+    assert_allclose(regular.inverse(K.toarray()), np.eye(n), atol=1e-13)

@@ -1,0 +1,118 @@
+"""Bodies torn into subdomains, and the rows that hold these together."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import block_diag
+
+from problems.fem.mesh import rectangle
+from problems.feti.tearing import blocks, decompose, structured_bodies
+from tests.support.torn_bodies import torn_pair
+
+GLUING = ("orthonormal", "chain", "redundant")
+
+
+def test_blocks_are_as_equal_as_whole_numbers_allow() -> None:
+    label = blocks((7, 3), 3).reshape(3, 7)
+    sizes = np.bincount(label.ravel()).reshape(1, 3)
+    assert sorted(sizes[0]) == [6, 6, 9]
+    assert (np.diff(label, axis=0) == 0).all()
+    assert blocks((4, 2, 2), 1).tolist() == list(range(16))
+
+
+def test_one_block_holds_what_is_not_larger_than_it() -> None:
+    assert not blocks((8, 5), 8).any()
+
+
+def test_blocks_of_several_bodies_are_numbered_one_body_after_another() -> None:
+    label = structured_bodies([(4, 2), (3, 3), (1, 1)], 2)
+    assert label[:8].tolist() == [0, 0, 1, 1] * 2
+    assert label[8:17].reshape(3, 3)[0].tolist() == [2, 2, 3]
+    assert label[8:17].reshape(3, 3)[2].tolist() == [4, 4, 5]
+    assert label[17:].tolist() == [6]
+
+
+def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
+    mesh = rectangle((0.3, 0.1), (2.1, 0.7), (6, 2))
+    cells, of_one = mesh.cells, np.zeros(12, dtype=np.int64)
+    label = blocks((6, 2), 2)
+    assert decompose(mesh.points, cells, label, of_one).kind.tolist() == [0, 0, 0]
+    moved = mesh.points.copy()
+    moved[6] += 1e-7  # the upper right corner of the last one, in the first row
+    assert decompose(moved, cells, label, of_one).kind.tolist() == [0, 0, 1]
+    of_two = np.where(label == 1, 1, 0)
+    assert decompose(mesh.points, cells, label, of_two).kind.tolist() == [0, 1, 0]
+
+
+def test_a_mirror_image_is_of_another_kind() -> None:
+    points = np.array([[0, 0], [3, 0], [2, 1], [0, 1]], dtype=float)
+    mirrored = points * [-1, 1] + [10, 0]
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
+    of_one = np.zeros(2, dtype=np.int64)
+    both = decompose(np.vstack([points, mirrored]), cells, np.arange(2), of_one)
+    assert both.kind.tolist() == [0, 1]
+
+
+def test_rectangles_are_of_one_kind_and_each_layer_of_the_ring_is_of_one() -> None:
+    _, _, pair = torn_pair()
+    assert len(pair.kinds) == 1 + 3
+    assert pair.kind.size == 16 * 2 + 18 * 3
+
+
+def test_the_torn_stiffness_of_all_subdomains_is_that_of_the_whole() -> None:
+    bodies, _, pair = torn_pair()
+    K = block_diag([pair.kinds[k].K for k in pair.kind])
+    assembled = pair.spread.T @ K @ pair.spread
+    assert abs(assembled - bodies.K).max() < 1e-12 * abs(bodies.K).max()
+
+
+def test_motions_of_the_kernel_are_orthonormal_and_cost_no_energy() -> None:
+    for kind in torn_pair()[2].kinds:
+        assert_allclose(kind.R.T @ kind.R, np.eye(3), atol=1e-14)
+        assert abs(kind.K @ kind.R).max() < 1e-13 * abs(kind.K).max()
+
+
+@pytest.mark.parametrize("rows", GLUING)
+def test_rows_hold_exactly_what_is_whole_and_supported(rows: str) -> None:
+    bodies, primal, pair = torn_pair(rows)
+    u = np.sin(np.arange(bodies.mesh.dofs) ** 2)
+    u[bodies.B_D.indices] = 0
+    held = pair.B @ (pair.spread @ u)
+    assert_allclose(held[: pair.equalities], 0, atol=1e-9)
+    assert_allclose(
+        held[pair.equalities :],
+        pair.scale[pair.equalities :] * (primal.G @ u),
+        rtol=1e-10,
+    )
+    assert_allclose(
+        pair.c[pair.equalities :], pair.scale[pair.equalities :] * primal.h, rtol=1e-12
+    )
+    # nothing else is held: the torn motions that all equations leave at rest
+    B_E = (pair.B[: pair.equalities]).toarray()
+    rank = int((np.linalg.svd(B_E, compute_uv=False) > 1e-9).sum())
+    left = pair.B.shape[1] - rank
+    assert left == bodies.mesh.dofs - primal.b.size
+
+
+@pytest.mark.parametrize("rows", GLUING)
+def test_the_load_is_that_of_the_whole(rows: str) -> None:
+    _, primal, pair = torn_pair(rows)
+    assert_allclose(pair.spread.T @ pair.f, -primal.q, atol=1e-15)
+
+
+def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
+    _, _, pair = torn_pair()
+    E = pair.equalities
+    B = np.diag(1 / pair.scale) @ pair.B.toarray()
+    assert_allclose(B[:E] @ B[:E].T, np.eye(E), atol=1e-14)
+    assert_allclose(B[E:] @ B[:E].T, 0, atol=1e-14)
+    root_E = np.linalg.norm(pair.B.toarray(), axis=1)
+    assert_allclose(np.unique(root_E.round(6)), np.sqrt([400.0, 4000.0]).round(6))
+
+
+def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
+    _, _, pair = torn_pair(most=4)
+    beam = pair.kinds[0]  # 4 × 4 cells
+    assert beam.boundary.size == 2 * 16
+    assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
+    assert np.unique(np.concatenate([k.stiffness for k in pair.kinds])).size == 2

@@ -1,0 +1,136 @@
+"""Equality rows by a sparse Cholesky factor: rows, models and steps of dense ones."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array, random_array
+
+from harness import QP, Status, kkt_residuals, no_rows
+from solvers.smalbe import rows as module
+from solvers.smalbe.rows import (
+    DenseRows,
+    SparseRows,
+    equality_rows,
+    orthonormal_rows,
+    sparse_rows,
+)
+from solvers.smalbe.solver import SMALBE
+
+SEED = 20210805
+
+
+@pytest.fixture
+def G():
+    """Nine rows of very different lengths on forty unknowns."""
+    rng = np.random.default_rng(SEED)
+    entries = random_array((9, 40), density=0.2, rng=rng, data_sampler=rng.normal)
+    return csr_array(np.logspace(-3, 3, 9)[:, None] * entries.tocsr())
+
+
+@pytest.fixture
+def e(G):
+    return G @ np.linspace(-1, 2, G.shape[1])
+
+
+ALL, THIRD = np.ones(40, dtype=bool), np.arange(40) % 3 == 0
+
+
+@pytest.fixture(params=["held", "all", "all, refactorised"])
+def pair(G, e, request, monkeypatch):
+    """The rows, sparse and dense; what may be held decides how faces are factorised."""
+    if "refactorised" in request.param:
+        monkeypatch.setattr(module, "MOST_BORDER", 0)
+    bounded = THIRD if request.param == "held" else ALL
+    return sparse_rows(G, e, bounded), orthonormal_rows(G, e)
+
+
+@pytest.fixture
+def face():
+    """Every third component held."""
+    return ~THIRD
+
+
+def columns(apply, n):
+    return np.column_stack([apply(v) for v in np.eye(n)])
+
+
+def test_the_rows_are_orthonormal_and_span_those_given(pair):
+    sparse, dense = pair
+    C = columns(lambda v: sparse.C @ v, 40)
+
+    assert C @ C.T == pytest.approx(np.eye(9), abs=1e-12)
+    assert columns(sparse.project, 40) == pytest.approx(
+        columns(dense.project, 40), abs=1e-12
+    )
+    assert columns(lambda a: sparse.C.T @ a, 9) == pytest.approx(C.T, abs=1e-14)
+    assert sparse.x_tilde == pytest.approx(dense.x_tilde, rel=1e-9, abs=1e-10)
+
+
+def test_multipliers_belong_to_the_rows_as_given(pair, G):
+    a = np.arange(1.0, 10.0)
+
+    for rows in pair:
+        assert G.T @ rows.multipliers(a) == pytest.approx(rows.C.T @ a, abs=1e-10)
+
+
+def test_the_least_squares_multipliers_on_a_face(pair, face):
+    r = np.linspace(-2, 1, 40)
+    sparse, dense = ((r + rows.C.T @ rows.fitted(face, r))[face] for rows in pair)
+
+    assert sparse == pytest.approx(dense, abs=1e-8)
+
+
+@pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
+def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
+    x = np.zeros(40)
+    g = np.random.default_rng(SEED).normal(size=40)
+    bounds = np.where(face, -np.inf, -0.5), np.where(face, np.inf, 0.1)
+    sparse, dense = (
+        rows.model(1.0, np.zeros(0), np.zeros((0, 40)), rho) for rows in pair
+    )
+    s = dense.step(x, g, bounds)
+
+    assert sparse.step(x, g, bounds) == pytest.approx(s, abs=1e-9)
+    assert sparse.raised(s, 7.0).tau == pytest.approx(dense.raised(s, 7.0).tau)
+    assert sparse.relaxed(1.9).tau == dense.relaxed(1.9).tau
+    assert columns(sparse.inverse_in(face), 40) == pytest.approx(
+        columns(dense.inverse_in(face), 40), abs=1e-9
+    )
+
+
+def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
+    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    twice = csr_array(np.vstack([G.toarray(), G.toarray()[3:4]]))
+
+    assert isinstance(equality_rows(G, e, ALL), SparseRows)
+    rows = equality_rows(twice, np.append(e, e[3]), ALL)
+    assert isinstance(rows, DenseRows)
+    assert len(rows.C) == 9
+
+
+def test_rows_that_depend_and_are_too_many_are_a_reason(G, e, monkeypatch):
+    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    monkeypatch.setattr(module, "too_large", lambda n, copies: "too large")
+    twice = csr_array(np.vstack([G.toarray(), G.toarray()[3:4]]))
+
+    with pytest.raises(ValueError, match="depend on each other"):
+        equality_rows(twice, np.append(e, e[3]), ALL)
+
+
+@pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
+def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner):
+    rng = np.random.default_rng(SEED)
+    W = rng.normal(size=(40, 40))
+    qp = QP(
+        P=W @ W.T + np.eye(40), q=rng.normal(size=40), A=G, b=e, G=no_rows(40),
+        h=np.zeros(0), lb=np.linspace(-1, 2, 40) - 0.3, ub=np.full(40, np.inf),
+    )  # fmt: skip
+    solver = SMALBE(
+        preconditioner=preconditioner, eliminate="never", lanczos_steps=1, energy=0
+    )
+    dense = solver.prepare(qp, 1e-8)()
+    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    sparse = solver.prepare(qp, 1e-8)()
+
+    assert dense.status is sparse.status is Status.SOLVED
+    assert kkt_residuals(qp, sparse).worst <= 1e-7
+    assert sparse.x == pytest.approx(dense.x, abs=1e-6)
