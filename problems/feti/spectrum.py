@@ -144,7 +144,7 @@ def spectrum(
         Wv = metric(v)
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)
-        if over or k % CHECKED == CHECKED - 1:
+        if over or k % CHECKED == CHECKED - 1 or k == n - 1:
             found = _extreme(np.array(alpha), np.array(beta), length)
             if over or found.within(tol):
                 break
