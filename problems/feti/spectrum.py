@@ -21,7 +21,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import coo_array, csc_matrix, csr_array, vstack
 from scipy.sparse.csgraph import connected_components
@@ -175,10 +174,14 @@ def spectra_of_equations(
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:
     """Bound the extreme Ritz values, the next vector being of this length."""
-    theta, s = eigh_tridiagonal(alpha, beta)
-    rounding = np.finfo(float).eps * alpha.size * np.abs(theta).max()
-    residual: NDArray[np.float64] = length * np.abs(s[-1]) + rounding
+    last = alpha.size - 1
+    (smallest, s), (largest, t) = (
+        eigh_tridiagonal(alpha, beta, select="i", select_range=(i, i))
+        for i in (0, last)
+    )
+    rounding = float(np.finfo(float).eps) * alpha.size * float(largest[0])
     return Spectrum(
-        float(theta[0]), float(theta[-1]), float(residual[0]), float(residual[-1]),
-        alpha.size,
+        float(smallest[0]), float(largest[0]),
+        length * abs(float(s[-1, 0])) + rounding,
+        length * abs(float(t[-1, 0])) + rounding, alpha.size,
     )  # fmt: skip
