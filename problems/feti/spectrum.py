@@ -166,7 +166,7 @@ def spectra_of_equations(
 
     """
     B_E = torn.B[: torn.equalities]
-    F = made(dual_operator(B_E, torn.domains).arrays)
+    F = made(dual_operator(B_E, torn.domains, torn.equalities).arrays)
     G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
     inverses = [p and F.preconditioner(*p) for p in preconditioners]
     return [spectrum(F, G, M, tol) for M in inverses]
