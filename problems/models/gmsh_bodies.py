@@ -159,5 +159,8 @@ def _newton_path(
     contact_stiffness: str, reference: Reference,
 ) -> NewtonPath:  # fmt: skip
     bodies = model(*source)
-    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    keys = {
+        "material": material, "contact": method[0],
+        "contact_stiffness": contact_stiffness,
+    }  # fmt: skip
     return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)
