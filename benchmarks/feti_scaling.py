@@ -99,11 +99,11 @@ def known_face(pieces, qp, s):
     """Measure κ without contact, and CG steps with the final active rows known."""
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    F = dual_operator(pieces.B[equality], pieces.domains)
+    F = dual_operator(pieces.B[equality], pieces.domains, pieces.equalities)
     kappa = spectrum(F.build(), qp.A[:, equality], tol=1e-3).condition
     m = int(active.sum())
     face = replace(
-        qp, P=dual_operator(pieces.B[active], pieces.domains), q=qp.q[active],
+        qp, P=dual_operator(pieces.B[active], pieces.domains, m), q=qp.q[active],
         A=qp.A[:, active], G=no_rows(m), lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
     )  # fmt: skip
     steps = {
