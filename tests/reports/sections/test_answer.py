@@ -141,6 +141,19 @@ def test_a_winner_over_cases_takes_both_the_interval_and_the_test_of_all_pairs(
     assert why in claim
 
 
+def test_where_few_of_many_cases_were_solved_no_ratio_over_cases_is_told(
+    record, opened
+):
+    """As where a sequence was asked for more steps than there were."""
+    records = [
+        record(s, k, 0.01, **({} if k < 4 else {"verdict": Verdict.DECLINED}))
+        for k in range(9) for s in "ab"
+    ]  # fmt: skip
+    (claim,) = opened(records)["dual"].claims
+    assert "over 9 cases" not in claim
+    assert "was the fastest" not in claim
+
+
 @pytest.mark.parametrize(
     "cases", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 7))]
 )
