@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
 from sksparse.cholmod import cholesky
 
-from harness import Vector
+from harness import QP, Vector
+from harness.distributed import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
 from problems.feti.local import Dense, Local, Subdomains
@@ -114,7 +115,9 @@ def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
 
-    packed: Packed
+    B: csr_array  #: (m, N)
+    domains: Subdomains
+    explicit: NDArray[np.bool_]  #: (kinds,) whether (K⁺)_bb is formed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
@@ -132,24 +135,18 @@ class DualOperator:
             For other names.
 
         """
-        for name, value, known in (
-            ("preconditioner", kind, ("lumped", "dirichlet")),
-            ("scaling", scaling, ("multiplicity", "stiffness")),
-        ):
-            if value not in known:
-                raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
-        groups = self.packed.groups
-        if kind == "lumped":
-            blocks: list[Any] = [g.local.lumped(g.touched) for g in groups]
-        else:
-            blocks = [g.local.schur(g.touched) for g in groups]
-        softness = [
-            np.repeat(1 / g.local.stiffness[g.touched], g.members.size) for g in groups
-        ]
-        weights = np.concatenate(softness)
-        if scaling == "multiplicity":
-            weights = np.ones_like(weights)
-        return _scaled(self.packed, blocks, weights)
+        return _scaled(self.packed, *weighted_blocks(self.packed.groups, kind, scaling))
+
+    def share(self, qp: QP, ranks: Ranks) -> Share:
+        """Take this rank's share of a dual with this F."""
+        from problems.feti.distributed import shared  # late: one process needs none
+
+        return shared(qp, self, ranks)
+
+    @cached_property
+    def packed(self) -> Packed:
+        """Its rows on what they touch."""
+        return packed(self.B, self.domains, self.explicit)
 
     @cached_property
     def _blocks(self) -> list[Any]:
@@ -157,6 +154,34 @@ class DualOperator:
             g.local.compliance(g.touched) if g.explicit else _Solved(g.local, g.touched)
             for g in self.packed.groups
         ]
+
+
+def weighted_blocks(
+    groups: Sequence[Group], kind: str, scaling: str
+) -> tuple[list[Any], Vector]:
+    """Return the blocks D of groups, and the weights W of all that they touch.
+
+    Raises
+    ------
+    ValueError
+        For other names than those of `DualOperator.preconditioner`.
+
+    """
+    for name, value, known in (
+        ("preconditioner", kind, ("lumped", "dirichlet")),
+        ("scaling", scaling, ("multiplicity", "stiffness")),
+    ):
+        if value not in known:
+            raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
+    if kind == "lumped":
+        blocks: list[Any] = [g.local.lumped(g.touched) for g in groups]
+    else:
+        blocks = [g.local.schur(g.touched) for g in groups]
+    softness = [
+        np.repeat(1 / g.local.stiffness[g.touched], g.members.size) for g in groups
+    ]
+    weights = np.concatenate(softness)
+    return blocks, np.ones_like(weights) if scaling == "multiplicity" else weights
 
 
 class _Solved(NamedTuple):
@@ -250,7 +275,7 @@ def made(arrays: Arrays) -> DualOperator:
     domains = Subdomains(kinds, arrays["kind"])
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    return DualOperator(packed(B, domains, arrays["explicit"]))
+    return DualOperator(B, domains, arrays["explicit"])
 
 
 def _explicit(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
