@@ -54,7 +54,9 @@ def analysis(form, Nr=30, Nh=15, steps=10):
         assert s.status == "solved"
         return s
 
-    path = LoadPath(bodies, linearise, inverse, solve, steps, transform=transform)
+    path = LoadPath(
+        bodies, linearise, lambda: inverse, solve, steps, transform=transform
+    )
     u = path.solution(steps) * bodies.length
     lap("recovery")
     return bodies, u, spent

@@ -95,3 +95,11 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
     def _adjoint(self) -> SerialisableOperator:
         return self
+
+
+def assembled(P: LinearOperator) -> NDArray[np.float64]:
+    """Multiply an operator out: the symmetric part of P·1, (n, n)."""
+    M = np.asarray(P @ np.eye(P.shape[0]))
+    M += M.T.copy()
+    M /= 2
+    return M

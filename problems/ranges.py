@@ -17,6 +17,8 @@ CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 #: values of the keys that choose the method; node-to-segment takes no notice of basis
 METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
 PLANES = {"plane": ("strain", "stress")}
+#: the keys of bodies in subdomains: H/h, 0 for one piece per body, and `GLUES`
+DECOMPOSITION: Mapping[str, Value] = {"feti": 0, "glue": "orthonormal"}
 #: how copies of a node are held together, `problems.feti.gluing`
 GLUES = {"glue": ("orthonormal", "chain", "redundant")}
 #: the keys of friction with their defaults; -1 is no bound and no mu
@@ -129,6 +131,17 @@ def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) 
         raise InputError(
             f"{family}: iterate={params['iterate']} is not used by friction={law}; "
             "expected friction=coulomb, whose fixed point has iterates"
+        )
+
+
+def torn_by(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError unless the keys of subdomains fit together."""
+    at_least(0, family, params, ("feti",))
+    one_of(family, params, GLUES)
+    if not params["feti"] and params["glue"] != DECOMPOSITION["glue"]:
+        raise InputError(
+            f"{family}: glue={params['glue']} is not used by feti=0, one piece per "
+            "body; expected no glue, or feti, the most cells along a subdomain's side"
         )
 
 

@@ -12,6 +12,7 @@ SOLVERS: Registry[Solver] = Registry(
         "smalbe-espreso": entry("solvers.smalbe.solver", "ESPRESO"),
         "smalbe-paper": entry("solvers.smalbe.solver", "PAPER"),
         "pdas": entry("solvers.baselines.pdas", "PDAS"),
+        "feti": entry("solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
             "solvers.baselines.projected_gradient", "ProjectedGradient"
         ),

@@ -54,13 +54,16 @@ def save_mat(
 ) -> None:
     """Write `qp` and the arrays `more` to `path`; `meta` is as in `save_qp`.
 
+    more : where P is an operator, it may be among them
+
     Raises
     ------
     InputError
-        When the file cannot be written.
+        When the file cannot be written, or P is an operator that is too large.
 
     """
     matrices, dense = explicit_matrices(qp)
+    more = {name: matrices["P"] if M is qp.P else M for name, M in more.items()}
     arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
     arrays |= {name: getattr(qp, name) for name in _VECTORS}
     arrays |= {name: csc_array(M) for name, M in matrices.items()}

@@ -32,7 +32,7 @@ from harness.errors import InputError, shortened, unknown
 from harness.files.datafile import check_size, json_object
 from harness.files.npz import write_mappable
 from harness.files.store import digest_of, mapped_arrays
-from harness.operators import Maker, SerialisableOperator
+from harness.operators import Maker, SerialisableOperator, assembled
 from harness.qp import QP, Matrix, Structure, Vector, no_rows
 
 SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
@@ -47,8 +47,19 @@ _PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
-    """Return P, G and A, an operator P multiplied out, and the names of dense ones."""
-    P = qp.P if qp.is_explicit else qp.P @ np.eye(qp.q.size)
+    """Return P, G and A, an operator P multiplied out, and the names of dense ones.
+
+    Raises
+    ------
+    InputError
+        When an operator P is too large for that, as `check_dense`.
+
+    """
+    P = qp.P
+    if not qp.is_explicit:
+        n = qp.q.size
+        check_size(f"P, an operator, as a dense matrix of {n} rows", 8 * n**2)
+        P = assembled(P)
     matrices = {"P": P, "G": qp.G, "A": qp.A}
     return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
 

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Case, Friction, Grid, Mechanics, Solution
+from harness import QP, Case, Friction, Grid, InputError, Mechanics, Solution
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.contact.results import fields
 from problems.duality.dualisation import dual_bounds, dualise, posed
+from problems.duality.torn_dual import torn_dual, torn_matrices
 from problems.fem.inverse import GeneralisedInverse
+from problems.feti.substructures import local_problems
+from problems.feti.torn import Torn
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -31,6 +35,7 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
+    torn: Callable[[], Torn] | None = None,
 ) -> Case:
     """Emit the primal QP of a contact problem in one of FORMS.
 
@@ -44,11 +49,27 @@ def contact_case(
         the multipliers of the contact rows, then those of the friction
     friction : with a given bound; its work is a part of the energy that the objective
         stands for
+    torn : poses the problem on subdomains; then its dual is emitted, and no other form
+
+    Raises
+    ------
+    InputError
+        When a problem on subdomains is asked for in another form.
 
     """
     matrices: Mapping[str, Any] = {}
-    seconds = None
-    if form == "primal":
+    seconds, tear = None, None
+    if torn is not None:
+        if form != "dual":
+            raise InputError(
+                f"feti with form {form} is not built; expected form dual, or no feti"
+            )
+        start = perf_counter()
+        pieces = torn()
+        new, tear = torn_dual(pieces, primal, friction), partial(local_problems, pieces)
+        seconds = perf_counter() - start
+        matrices = torn_matrices(pieces, new.qp)
+    elif form == "primal":
         new = posed(primal, friction)
     else:
         inverse = floating() if form == "dual" else clamped()
@@ -75,7 +96,7 @@ def contact_case(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction,
+            friction=friction, tear=tear,
         ),
     )  # fmt: skip
 

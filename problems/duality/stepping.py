@@ -105,7 +105,8 @@ class LoadPath:
 
     bodies: Bodies
     linearise: Linearise
-    inverse: GeneralisedInverse  #: K⁺ that `transform` needs
+    #: K⁺ that `transform` needs; called when the first problem is to be solved
+    factorise: Callable[[], GeneralisedInverse]
     reference: Reference
     steps: int
     relin: int = 1
@@ -117,6 +118,11 @@ class LoadPath:
     begin: State | None = None  #: where the first step begins; none: at rest
     #: 1, 2, …
     _steps: list[list[ContactProblem]] = field(default_factory=list, init=False)
+
+    @cached_property
+    def inverse(self) -> GeneralisedInverse:
+        """K⁺, factorised at the first use."""
+        return self.factorise()
 
     def primal(self, k: int) -> QP:
         """Emit the QP of step k (1 … steps), as last linearised, without friction."""
@@ -260,7 +266,7 @@ def single_load(
     """
     if any(law.mu for law in laws):
         path = LoadPath(
-            bodies, linearise, factorise(), reference, steps,
+            bodies, linearise, factorise, reference, steps,
             transform=dualise, laws=laws, pressed=float(np.abs(bodies.f).sum()),
         )  # fmt: skip
         problem = path.problem(1, iterate)

@@ -12,6 +12,7 @@ an operator of plain arrays (`problems.feti.operators`), and RᵀBᵀ is sparse.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -19,7 +20,6 @@ from scipy.sparse import csr_array
 from harness import QP, Friction, Solution, Vector, no_rows
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.duality.dualisation import Transformed
-from problems.feti.local import kernel, subdomains
 from problems.feti.operators import dual_operator
 from problems.feti.torn import Torn
 
@@ -38,7 +38,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
     friction : with a given bound
 
     """
-    domains, R, T = subdomains(torn), kernel(torn), torn.spread
+    domains, R, T = torn.domains, torn.domains.kernel, torn.spread
     B, f, m_E, scale = torn.B, torn.f, torn.equalities, torn.scale
     free = domains.inverse(f)
     m_I = primal.h.size
@@ -51,6 +51,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
+    copies[copies == 0] = 1  # eliminated components are zero
     B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:
@@ -63,3 +64,9 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
+
+
+def torn_matrices(torn: Torn, dual: QP) -> dict[str, Any]:
+    """Name the matrices of the dual as the paper does: F, d, B, c and R."""
+    R = torn.domains.kernel
+    return {"F": dual.P, "d": -dual.q, "B": torn.B, "c": torn.c, "R": R}

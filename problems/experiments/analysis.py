@@ -65,7 +65,7 @@ def analyse(
         return solution
 
     path = LoadPath(
-        bodies, linearise, inverse, solve_dual, steps, transform=dualise
+        bodies, linearise, lambda: inverse, solve_dual, steps, transform=dualise
     )  # fmt: skip
     path.solution(steps)
     watch.lap("recovery")

@@ -40,7 +40,7 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     inverse, linearise = clamped(bodies), linearisation(bodies, "nts", "dual")
     ways = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*ways, SETTLED):
-        path = LoadPath(bodies, linearise, inverse, solve, steps, relin)
+        path = LoadPath(bodies, linearise, lambda: inverse, solve, steps, relin)
         yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
 
 
@@ -73,7 +73,7 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     lengths = nodal_lengths(points)
     for contact in ("nts", "mortar"):
         linearise = linearisation(bodies, contact, "dual")
-        path = LoadPath(bodies, linearise, inverse, solve, plan.steps)
+        path = LoadPath(bodies, linearise, lambda: inverse, solve, plan.steps)
         for step in range(1, plan.steps + 1):
             s = path.answer(step)
             on_nodes = (path.primal(step).G.T @ s.z).reshape(-1, 2)[slave]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from harness import Family, InputError
 from problems.ranges import (
     CONTACT_FORMS,
+    DECOMPOSITION,
     FRICTION,
     METHODS,
     MOST_STEPS,
@@ -20,6 +21,7 @@ from problems.ranges import (
     fits,
     one_of,
     rough,
+    torn_by,
     without_friction,
 )
 
@@ -38,7 +40,7 @@ class BeamRing(Family):
         default_factory=lambda: MappingProxyType({
             "Nr": 10, "Nh": 5, "radial": 0, "steps": 10, "step": 0,
             "contact": "nts", "basis": "dual", "relin": 1, "plane": "strain",
-            **FRICTION,
+            **FRICTION, **DECOMPOSITION,
         }),
         hash=False,
     )  # fmt: skip
@@ -71,6 +73,7 @@ class BeamRing(Family):
             )
         one_of(self.name, p, METHODS | PLANES)
         rough(self.name, p)
+        torn_by(self.name, p)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved; its load steps are linearised anew.

@@ -32,7 +32,6 @@ from harness.distributed import (
 )
 from harness.operators import Product
 from problems.fem.mesh import Nodes
-from problems.feti.local import Dense, Subdomains
 from problems.feti.operators import (
     ROUNDING,
     SHIFT,
@@ -40,6 +39,7 @@ from problems.feti.operators import (
     touched,
     weighted_blocks,
 )
+from problems.feti.torn import Dense, Subdomains
 
 
 class Parts(NamedTuple):

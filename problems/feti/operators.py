@@ -36,7 +36,7 @@ from harness import QP, Vector
 from harness.distributed import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
-from problems.feti.local import Dense, Local, Subdomains
+from problems.feti.torn import Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
@@ -44,12 +44,13 @@ EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 SHIFT = 1e-8
 ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
 _PARTS = ("data", "indices", "indptr")
+_OF_KINDS = ("stiffness", "fixing", "boundary")  #: whose lengths differ by kind
 
 
 class Group(NamedTuple):
     """The subdomains of one kind, with what rows touch of any of them."""
 
-    local: Local
+    kind: Kind
     explicit: bool  #: whether (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within each, ascending
@@ -85,10 +86,10 @@ def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pa
     """Pack the columns of B (m, N)."""
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
     parts = touched(B, domains)
-    for k, (local, members) in enumerate(
+    for k, (kind, members) in enumerate(
         zip(domains.kinds, domains.members, strict=True)
     ):
-        groups.append(Group(local, bool(explicit[k]), members, parts[k]))
+        groups.append(Group(kind, bool(explicit[k]), members, parts[k]))
         places = domains.start[members] + parts[k][:, None]
         number[places.ravel()] = np.arange(end, end + places.size)
         end += places.size
@@ -151,7 +152,7 @@ class DualOperator:
     @cached_property
     def _blocks(self) -> list[Any]:
         return [
-            g.local.compliance(g.touched) if g.explicit else _Solved(g.local, g.touched)
+            g.kind.compliance(g.touched) if g.explicit else _Solved(g.kind, g.touched)
             for g in self.packed.groups
         ]
 
@@ -174,11 +175,11 @@ def weighted_blocks(
         if value not in known:
             raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
     if kind == "lumped":
-        blocks: list[Any] = [g.local.lumped(g.touched) for g in groups]
+        blocks: list[Any] = [g.kind.block(g.touched) for g in groups]
     else:
-        blocks = [g.local.schur(g.touched) for g in groups]
+        blocks = [g.kind.schur(g.touched) for g in groups]
     softness = [
-        np.repeat(1 / g.local.stiffness[g.touched], g.members.size) for g in groups
+        np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
     ]
     weights = np.concatenate(softness)
     return blocks, np.ones_like(weights) if scaling == "multiplicity" else weights
@@ -187,13 +188,13 @@ def weighted_blocks(
 class _Solved(NamedTuple):
     """(K⁺)_bb that is not formed: a product solves with the factor."""
 
-    local: Local
+    kind: Kind
     b: Nodes
 
     def __matmul__(self, X: Dense) -> Dense:
-        whole = np.zeros((self.local.K.shape[0], X.shape[1]))
+        whole = np.zeros((self.kind.K.shape[0], X.shape[1]))
         whole[self.b] = X
-        return self.local.inverse(whole)[self.b]
+        return self.kind.inverse(whole)[self.b]
 
 
 def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
@@ -230,49 +231,44 @@ def _gram_inverse(gram: csr_array) -> Product:
 def dual_operator(B: csr_array, domains: Subdomains) -> SerialisableOperator:
     """Make F as an operator that can be written: every kind once, and B."""
     kinds = domains.kinds
-    K = csc_array(block_diag([local.K for local in kinds], format="csc"))
-    most = max(local.star.shape[1] for local in kinds)
-    star = [np.pad(k.star, ((0, 0), (0, most - k.star.shape[1]))) for k in kinds]
+    K = csc_array(block_diag([kind.K for kind in kinds], format="csc"))
+    modes = np.array([kind.R.shape[1] for kind in kinds])
+    R = [np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in kinds]
     arrays = {
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
         **{f"B_{part}": getattr(B, part) for part in _PARTS},
-        "sizes": np.array([local.K.shape[0] for local in kinds]),
-        "fixings": np.array([local.fixing.size for local in kinds]),
-        "fixing": np.concatenate([local.fixing for local in kinds]),
-        "star": np.concatenate(star),
-        "boundaries": np.array([local.boundary.size for local in kinds]),
-        "boundary": np.concatenate([local.boundary for local in kinds]),
-        "stiffness": np.concatenate([local.stiffness for local in kinds]),
+        "R": np.concatenate(R),
+        "modes": modes,
+        "stiffness": np.concatenate([kind.stiffness for kind in kinds]),
+        "fixing": np.concatenate([kind.fixing for kind in kinds]),
+        "boundary": np.concatenate([kind.boundary for kind in kinds]),
         "kind": domains.kind,
         "explicit": _explicit(B, domains),
     }
+    for name in _OF_KINDS:
+        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
     return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
 
 
 def made(arrays: Arrays) -> DualOperator:
     """Put F together from the arrays of `dual_operator`."""
-    ends = {
-        name: np.append(0, np.cumsum(arrays[name]))
-        for name in ("sizes", "fixings", "boundaries")
-    }
+    ends = [np.append(0, arrays[f"{name}_ends"]) for name in _OF_KINDS]
     data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
 
-    def kind(k: int) -> Local:
-        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends.values())
-        columns = indptr[own.start : own.stop + 1]
+    def kind(k: int) -> Kind:
+        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
+        columns, n = indptr[own.start : own.stop + 1], own.stop - own.start
         within = slice(columns[0], columns[-1])
-        n = own.stop - own.start
         K = (data[within], indices[within] - own.start, columns - columns[0])
-        return Local(
+        return Kind(
             K=csc_array(K, shape=(n, n)),
+            R=arrays["R"][own, : arrays["modes"][k]],
             fixing=arrays["fixing"][fixing],
-            star=arrays["star"][fixing],
             boundary=arrays["boundary"][boundary],
             stiffness=arrays["stiffness"][own],
         )
 
-    kinds = tuple(map(kind, range(arrays["sizes"].size)))
-    domains = Subdomains(kinds, arrays["kind"])
+    domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
     return DualOperator(B, domains, arrays["explicit"])

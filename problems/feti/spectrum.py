@@ -124,13 +124,15 @@ def spectrum(
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
     v = P(np.sin(1.0 + np.arange(n) ** 2))
-    V, WV = np.empty((2, _CHUNK, n))
+    V = np.empty((_CHUNK, n))
+    WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
     length = float(np.sqrt(v @ Wv))
     for k in range(n):
         if k == len(V):
-            V, WV = (np.concatenate([X, np.empty((_CHUNK, n))]) for X in (V, WV))
+            V = np.concatenate([V, np.empty((_CHUNK, n))])
+            WV = V if M is None else np.concatenate([WV, np.empty((_CHUNK, n))])
         V[k], WV[k] = v / length, Wv / length
         v = image(WV[k])
         alpha.append(float(v @ WV[k]))
@@ -150,7 +152,8 @@ def spectrum(
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:
     """Bound the extreme Ritz values, the next vector being of this length."""
     theta, s = eigh_tridiagonal(alpha, beta)
-    residual: NDArray[np.float64] = length * np.abs(s[-1])
+    rounding = np.finfo(float).eps * alpha.size * np.abs(theta).max()
+    residual: NDArray[np.float64] = length * np.abs(s[-1]) + rounding
     return Spectrum(
         float(theta[0]), float(theta[-1]), float(residual[0]), float(residual[-1]),
         alpha.size,

@@ -10,8 +10,7 @@ from scipy.sparse import csr_array
 
 from harness import Vector
 from harness.mechanics import Extended, Real
-from problems.feti.local import Subdomains, kernel, subdomains
-from problems.feti.torn import Torn
+from problems.feti.torn import Subdomains, Torn
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,4 +48,4 @@ def local_problems(torn: Torn, components: int = 2) -> LocalProblems:
 
     components : of a node; torn unknowns are numbered node by node
     """
-    return LocalProblems(torn.spread, kernel(torn), subdomains(torn), components)
+    return LocalProblems(torn.spread, torn.domains.kernel, torn.domains, components)

@@ -12,20 +12,29 @@ displacement u (n,) of the whole is v = T u, one d×d block per torn node.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csc_array, csc_matrix, csr_array
+from sksparse.cholmod import Factor, cholesky
 
 from harness import Vector
 from problems.fem.mesh import Nodes
 
+Dense = NDArray[np.float64]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Kind:
-    """A subdomain, up to its place: what all subdomains of one kind share."""
+    """A subdomain, up to its place: what all subdomains of one kind share.
+
+    K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
+    components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). All
+    subdomains of a kind are solved for at once, as columns of one right-hand side.
+    """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
@@ -34,6 +43,85 @@ class Kind:
     #: Dirichlet preconditioners condense onto, glued or free
     boundary: Nodes
     stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
+
+    def inverse(self, b: Dense) -> Dense:
+        """Apply K⁺ to columns (n_k, k)."""
+        return np.asarray(self._factor(b))
+
+    def compliance(self, b: Nodes) -> Dense:
+        """Return (K⁺)_bb."""
+        unit = np.zeros((self.K.shape[0], b.size))
+        unit[b, np.arange(b.size)] = 1
+        return _symmetric(self.inverse(unit)[b])
+
+    def block(self, b: Nodes) -> csr_array:
+        """Return K_bb."""
+        return csr_array(self.K[b][:, b])
+
+    def schur(self, b: Nodes) -> Dense:
+        """Return S_bb of  S = K_gg − K_gi K_ii⁻¹K_ig  on g: boundary and b."""
+        g = np.union1d(self.boundary, b)
+        S, i = self.block(g).toarray(), np.setdiff1d(np.arange(self.K.shape[0]), g)
+        if i.size:
+            K_ig = self.K[i][:, g]
+            S -= K_ig.T @ cholesky(csc_matrix(self.K[i][:, i]))(K_ig.toarray())
+        kept = np.isin(g, b)
+        return _symmetric(S[kept][:, kept])
+
+    @cached_property
+    def _factor(self) -> Factor:
+        """Factorise K_ρ, made when it is first needed."""
+        p, n = self.fixing.size, self.K.shape[0]
+        star = np.linalg.qr(self.R[self.fixing])[0]
+        block = self.K.diagonal().max() * (star @ star.T)
+        where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
+        K_rho = self.K + csc_array((block.ravel(), where), shape=(n, n))
+        return cholesky(csc_matrix(K_rho))
+
+
+@dataclass(frozen=True, eq=False)
+class Subdomains:
+    """S subdomains, each of one of few kinds, that nothing holds together yet."""
+
+    kinds: tuple[Kind, ...]
+    kind: NDArray[np.int64]  #: (S,) of each subdomain
+
+    @cached_property
+    def start(self) -> NDArray[np.int64]:
+        """First torn unknown of each subdomain, and N: (S + 1,)."""
+        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
+        return np.concatenate([[0], np.cumsum(sizes)])
+
+    @cached_property
+    def members(self) -> tuple[NDArray[np.int64], ...]:
+        """Subdomains of each kind."""
+        order = np.argsort(self.kind, kind="stable")
+        ends = np.cumsum(np.bincount(self.kind, minlength=len(self.kinds)))
+        return tuple(np.split(order, ends[:-1]))
+
+    @cached_property
+    def kernel(self) -> csr_array:
+        """R = diag(R_1 … R_S), (N, Σr)."""
+        modes = np.array([kind.R.shape[1] for kind in self.kinds])[self.kind]
+        sizes = np.diff(self.start)
+        entries = np.concatenate([self.kinds[k].R.ravel() for k in self.kind])
+        per_row = np.repeat(modes, sizes)
+        ends = np.concatenate([[0], np.cumsum(per_row)])
+        along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
+        columns = np.repeat(np.cumsum(modes) - modes, sizes * modes) + along
+        return csr_array((entries, columns, ends), shape=(sizes.sum(), modes.sum()))
+
+    def places(self) -> Iterator[NDArray[np.int64]]:
+        """Give the torn unknowns of each kind, (n_k, S_k): a column per subdomain."""
+        for kind, members in zip(self.kinds, self.members, strict=True):
+            yield self.start[members] + np.arange(kind.R.shape[0])[:, None]
+
+    def inverse(self, b: Vector) -> Vector:
+        """Apply K⁺ to a torn vector (N,)."""
+        v = np.empty_like(b)
+        for kind, place in zip(self.kinds, self.places(), strict=True):
+            v[place] = kind.inverse(b[place])
+        return v
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,8 +146,16 @@ class Torn:
     f: Vector  #: (N,) Tᵀf is the load of the whole
     equalities: int  #: rows of B that are equations, the first ones
 
-    @cached_property
+    @property
     def start(self) -> NDArray[np.int64]:
         """First torn unknown of each subdomain, and N: (S + 1,)."""
-        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
-        return np.concatenate([[0], np.cumsum(sizes)])
+        return self.domains.start
+
+    @cached_property
+    def domains(self) -> Subdomains:
+        """The subdomains on their own, with what is factorised once."""
+        return Subdomains(self.kinds, self.kind)
+
+
+def _symmetric(M: Dense) -> Dense:
+    return np.asarray((M + M.T) / 2)

@@ -13,7 +13,7 @@ per unit thickness are not stated but implied.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,8 @@ from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
+from problems.feti.elastic import SubdividedBodies, subdivide, torn
+from problems.feti.tearing import blocks
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -49,8 +51,13 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     primal, friction = problem.primal, problem.friction
     sides = bodies.mesh.boundaries
     tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+    pieces = None
+    if p["feti"]:
+        pieces = partial(
+            torn, _subdivided(*geometry, p["feti"]), primal, friction, p["glue"]
+        )
     return contact_case(
-        bodies, primal, form,
+        bodies, primal, form, torn=pieces,
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
@@ -78,6 +85,15 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
 
 
 @lru_cache(maxsize=4)
+def _subdivided(
+    Nr: int, Nh: int, radial: int, plane: Plane, most: int
+) -> SubdividedBodies:
+    beam, ring = blocks((8 * Nr, Nr), most), blocks((12 * Nh, radial), most)
+    label = np.append(beam, ring + beam.max() + 1)
+    return subdivide(model(Nr, Nh, radial, plane), label)
+
+
+@lru_cache(maxsize=4)
 def _floating(*geometry: Any) -> GeneralisedInverse:
     return floating(model(*geometry))
 
@@ -99,6 +115,6 @@ def _path(
 ) -> LoadPath:
     linearise = linearisation(model(*geometry), *method, [law])
     return LoadPath(
-        model(*geometry), linearise, _clamped(*geometry), reference, steps, relin,
-        laws=(law,), quasi_static=quasi_static,
+        model(*geometry), linearise, lambda: _clamped(*geometry), reference,
+        steps, relin, laws=(law,), quasi_static=quasi_static,
     )  # fmt: skip

@@ -107,6 +107,6 @@ def _path(
             "steps and re-linearisations do not allow; expected steps=1 and relin=1"
         ) from None
     return LoadPath(
-        bodies, linearisation(bodies, *method, laws), inverse, reference, steps, relin,
-        laws=laws, quasi_static=quasi_static,
+        bodies, linearisation(bodies, *method, laws), lambda: inverse, reference, steps,
+        relin, laws=laws, quasi_static=quasi_static,
     )  # fmt: skip

@@ -102,6 +102,6 @@ def _path(n: int, mu: float, reference: Reference) -> LoadPath:
     bodies = plate(n)
     rows = above_plane(bodies.mesh, bodies.pairs[0].slave, tangential=True)
     return LoadPath(
-        bodies, lambda u: rows, clamped(bodies), reference, steps=1,
+        bodies, lambda u: rows, lambda: clamped(bodies), reference, steps=1,
         laws=(FrictionLaw("coulomb", mu=mu),),
     )  # fmt: skip

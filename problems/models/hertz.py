@@ -201,7 +201,7 @@ def _friction_path(
     rows = linearise(np.zeros(mesh.dofs))
     guided = kept_on_axis(bodies)
     path = LoadPath(
-        bodies, lambda u: rows, floating(guided), reference, steps=1,
+        bodies, lambda u: rows, lambda: floating(guided), reference, steps=1,
         transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
     )  # fmt: skip
     if not p["peak"]:

@@ -27,7 +27,7 @@ from scipy.sparse import block_diag, csc_array, csr_array, diags_array, eye_arra
 from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from problems.contact.sides import active
 from problems.duality.dualisation import posed
-from problems.duality.torn_dual import torn_dual
+from problems.duality.torn_dual import torn_dual, torn_matrices
 from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
 from problems.fem.mesh import Mesh, Nodes, boundary_edges, join, prefixed, rectangle
@@ -44,14 +44,16 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
-    start = perf_counter()
-    tear = None
+    matrices: Mapping[str, Any] = {}
+    seconds, tear = None, None
     if form == "primal":
         new = posed(pair.qp)
     else:
+        start = perf_counter()
         torn = pair.torn(p["glue"])
         new, tear = torn_dual(torn, pair.qp), partial(local_problems, torn, 1)
-    seconds = None if form == "primal" else perf_counter() - start
+        seconds = perf_counter() - start
+        matrices = torn_matrices(torn, new.qp)
     dofs = pair.qp.q.size
     return Case(
         qp=new.qp,
@@ -59,6 +61,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         quantities=lambda s: pair.quantities(new.recover(s)),
         scale=new.sign,
         constant=new.constant,
+        matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
             primal=pair.qp, back=new.recover, factorise=pair.factorise,

@@ -25,14 +25,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array, vstack
 
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
+from harness.mechanics import Substructures
 from problems.duality.dualisation import Transformed, posed
+from problems.duality.torn_dual import torn_dual
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
-from problems.feti.dual import torn_dual
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
 from problems.feti.spectrum import Spectrum, dependencies, spectrum
+from problems.feti.substructures import local_problems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
@@ -55,6 +57,9 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         counts = quantities(plate, new.recover(s))
         return counts | (dual_quantities(plate) if form == "dual" else {})
 
+    def torn() -> Substructures:
+        return local_problems(plate.torn)
+
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x,
@@ -72,6 +77,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
+            tear=torn if form == "dual" and not plate.eliminated else None,
         ),
     )  # fmt: skip
 

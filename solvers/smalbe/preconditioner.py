@@ -9,9 +9,17 @@ inverted in the face. The structural ones, for a dual with F = BK⁺Bᵀ, are
 where b are the components that B touches, i the others, and B_D = (BWBᵀ)⁻¹BW with the
 compliances W = diag(K_bb)⁻¹ as weights, so that where bodies meet the softer one takes
 more of a jump (Rixen and Farhat 1999). An operator P may offer its own
-(`harness.operators.Preconditioned`). Inside SMALBE they work between the projectors of
-the face, 𝒫_F = I − C_Fᵀ(C_F C_Fᵀ)⁻¹C_F:  ‖𝒫F𝒫‖ 𝒫_F M 𝒫_F + (I − 𝒫_F)/ρ. With 𝒫 instead,
-which mixes free components with held ones, M would undo what a large ρ achieves.
+(`harness.operators.Preconditioned`).
+
+Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated in a face by the model of the penalty
+B = I + (ρ − 1)Q, whose inverse there, P = B_FF⁻¹, is nearly the projector on C_Fν = 0;
+M takes the place of the unit matrix on what that leaves:
+
+    P (‖𝒫F𝒫‖ M_FF − I) P + P
+
+It is positive definite (0 < P ≤ I), and right where C_F C_Fᵀ has small eigenvalues, as
+those of motions that gluing hardly feels and contact does. The projector 𝒫 of the whole
+instead, which mixes free components with held ones, would undo what a large ρ achieves.
 """
 
 from __future__ import annotations
@@ -31,6 +39,7 @@ from solvers.smalbe.projected import Projected
 
 Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
 PRECONDITIONERS = get_args(Preconditioner)
+LEAST_RHO = 10.0  #: of the model of the penalty: with less, nothing is projected
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 
@@ -69,15 +78,12 @@ def face_preconditioner(
     M = _whole(qp, kind)
 
     def in_face(free: Mask, rho: float) -> Operator:
-        project = problem.rows.in_face(free)
+        of_penalty = problem.penalty(max(rho, LEAST_RHO)).inverse_in(free)
 
         def apply(v: Vector) -> Vector:
             problem.counts["preconditioner_applies"] += 1
-            Pv = project(v)
-            return (
-                problem.spectrum.norm * project(M(Pv))
-                + (np.where(free, v, 0.0) - Pv) / rho
-            )
+            Pv = of_penalty(v)
+            return of_penalty(problem.spectrum.norm * M(Pv) - Pv) + Pv
 
         return apply
 

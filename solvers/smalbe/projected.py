@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Vector
+from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
@@ -102,6 +103,10 @@ class Projected:
             kept = 0
         return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
+    def penalty(self, rho: float) -> BoxModel:
+        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        return self.rows.model(1.0, np.zeros(0), np.zeros((0, self.b.size)), rho)
+
     def plain_model(self, rho: float, *, alpha: float) -> Model:
         """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
         norm = max(1.0, rho if len(self.rows.C) else 0.0)
@@ -116,7 +121,7 @@ def projected_problem(
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
     """
     F = Product(qp.P, qp.q.size)
-    rows = equality_rows(qp.A, qp.b)
+    rows = equality_rows(qp.A, qp.b, boxed(qp))
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     return _normalised(qp, F, rows, spectrum)
 

@@ -9,7 +9,9 @@ divided by their norms, and
 are applied by products with G and solves with L (`SparseRows`); they must be
 independent. A model of the penalty ρCᵀC for steps over the box comes with each:
 `solvers.smalbe.model.Model` holds C as it is, `PenaltyModel` needs solves with
-G_F G_Fᵀ + κGGᵀ on a face F, which have the sparsity of GGᵀ.
+G_F G_Fᵀ + κGGᵀ on a face F. These differ from (1 + κ)GGᵀ in rows that bounded
+components touch, and in contact few subdomains have any: with those rows c last, only
+the Schur complement of GGᵀ on them is factorised anew (`_Bordered`).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.sparse import csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -33,8 +35,8 @@ from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
+MOST_BORDER = 2000  #: rows that bounded components touch, whose block is dense
 MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
-IN_FACE = 1e-6  #: κ of the projector on a face: C_F may have dependent rows
 
 
 class Transposed(Protocol):
@@ -94,10 +96,6 @@ class Rows(ABC):
         """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC, without what is not above τ."""
 
     @abstractmethod
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        """Return v → v_F less its part in the span of the rows C_F."""
-
-    @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
         """Find the a (r,) with the least ‖(r + Cᵀa)_F‖."""
 
@@ -118,12 +116,6 @@ class DenseRows(Rows):
         w = np.append(above, np.full(len(self.C), rho))
         return Model(0.0, np.vstack([U, self.C]), w).with_tail(tau)
 
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        if not len(self.C):
-            return lambda v: np.where(free, v, 0.0)
-        inverse = Model(IN_FACE, self.C, np.ones(len(self.C))).inverse_in(free)
-        return lambda v: IN_FACE * inverse(v)
-
     def fitted(self, free: Mask, r: Vector) -> Vector:
         a, *_ = np.linalg.lstsq(self.C.T[free], -r[free], rcond=FREE_RANK)
         return np.asarray(a)
@@ -136,6 +128,7 @@ class SparseRows(Rows):
     unit: csr_array  #: (r, n) the rows of G divided by their norms
     gram: csc_matrix  #: (r, r) of these
     factor: Factor  #: of their Gram matrix
+    bordered: _Bordered | None  #: None where most rows touch bounded components
 
     def error(self, nu: Vector, Cnu: Vector) -> Vector:
         return np.asarray(self.G @ nu)
@@ -148,19 +141,70 @@ class SparseRows(Rows):
             return Model.of_norm(tau, self.x_tilde.size)
         return PenaltyModel(tau, self, rho - tau)
 
-    def in_face(self, free: Mask) -> Callable[[Vector], Vector]:
-        inverse = PenaltyModel(IN_FACE, self, 1.0).inverse_in(free)
-        return lambda v: IN_FACE * inverse(v)
-
     def fitted(self, free: Mask, r: Vector) -> Vector:
         solve = self.factor_in(free, FREE_RANK)
         y = -solve(self.unit @ np.where(free, r, 0.0))
         return _forward(self.factor, self.gram @ y)
 
-    def factor_in(self, free: Mask, shift: float) -> Factor:
-        """Factorise G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
+    def factor_in(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return solves with G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
+        if self.bordered is not None:
+            return self.bordered.solver(~free, shift)
         held = self.unit[:, np.flatnonzero(~free)]
-        return self.factor.cholesky(csc_matrix((1 + shift) * self.gram - held @ held.T))
+        factor = self.factor.cholesky(_csc((1 + shift) * self.gram - held @ held.T))
+        return lambda t: np.asarray(factor(t))
+
+
+@dataclass(frozen=True, eq=False)
+class _Bordered:
+    """S = GGᵀ = LLᵀ with the rows c that bounded components touch last.
+
+    L_cc L_ccᵀ is the Schur complement of S on c, and that of (1 + κ)S − G_H G_Hᵀ with
+    held components H is (1 + κ)L_cc L_ccᵀ − (G_H G_Hᵀ)_cc.
+    """
+
+    order: NDArray[np.int64]  #: (r,) rows, those of c last
+    factor: Factor  #: of S in that order
+    L_cc: NDArray[np.float64]
+    touching: csc_matrix  #: G_c (c, n)
+
+    def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return solves with (1 + shift)S − G_H G_Hᵀ."""
+        G_H, L_cc, n = (
+            self.touching[:, np.flatnonzero(held)],
+            self.L_cc,
+            self.order.size,
+        )
+        inner, scale = slice(0, n - len(L_cc)), 1 + shift
+        schur = cho_factor(
+            scale * (L_cc @ L_cc.T) - (G_H @ G_H.T).toarray(), lower=True
+        )
+
+        def solve(t: Vector) -> Vector:
+            u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
+            u[inner] /= scale
+            u[inner.stop :] = L_cc.T @ cho_solve(schur, L_cc @ u[inner.stop :])
+            s = np.empty(n)
+            s[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
+            return s
+
+        return solve
+
+
+def _bordered(unit: csr_array, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
+    last = np.zeros(gram.shape[0], dtype=bool)
+    last[csc_matrix(unit[:, np.flatnonzero(bounded)]).indices] = True
+    c, rest = np.flatnonzero(last), np.flatnonzero(~last)
+    if c.size > MOST_BORDER:
+        return None
+    if rest.size:
+        rest = rest[analyze(_csc(gram[rest][:, rest]), use_long=False).P()]
+    order = np.concatenate([rest, c])
+    S = _csc(gram[order][:, order])
+    factor = analyze(S, ordering_method="natural", use_long=False)
+    factor.cholesky_inplace(S)
+    L_cc = factor.L()[rest.size :, rest.size :].toarray()
+    return _Bordered(order, factor, L_cc, csc_matrix(unit[c]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,10 +303,12 @@ def is_sparse(G: Matrix) -> bool:
     return bool(issparse(G) and G.shape[0] * G.shape[1] > MOST_DENSE)
 
 
-def equality_rows(G: Matrix, e: Vector) -> Rows:
+def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """Orthonormalise the rows of G (m, n), as sparse ones where they are many.
 
     Rows that depend on each other are taken as dense ones.
+
+    bounded : (n,) components that have a bound
 
     Raises
     ------
@@ -272,7 +318,7 @@ def equality_rows(G: Matrix, e: Vector) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    rows = sparse_rows(csr_array(G), e)
+    rows = sparse_rows(csr_array(G), e, bounded)
     if rows is not None:
         return rows
     m, n = G.shape
@@ -281,14 +327,14 @@ def equality_rows(G: Matrix, e: Vector) -> Rows:
     return orthonormal_rows(G, e)
 
 
-def sparse_rows(G: csr_array, e: Vector) -> SparseRows | None:
+def sparse_rows(G: csr_array, e: Vector, bounded: Mask) -> SparseRows | None:
     """Factorise GGᵀ of sparse G (m, n); None where rows depend on each other."""
     size = np.sqrt(G.multiply(G).sum(axis=1))
     if not (size > 0).all():
         return None
     unit = csr_array(diags_array(1 / size) @ G)
-    gram = csc_matrix(unit @ unit.T)
-    factor = analyze(gram)
+    gram = _csc(unit @ unit.T)
+    factor = analyze(gram, use_long=False)
     try:
         factor.cholesky_inplace(gram)
     except CholmodNotPositiveDefiniteError:
@@ -300,8 +346,15 @@ def sparse_rows(G: csr_array, e: Vector) -> SparseRows | None:
         G=G, C=_Factored(unit, factor), e_size=float(np.linalg.norm(e)),
         least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
         multipliers=lambda a: _backward(factor, a) / size,
-        unit=unit, gram=gram, factor=factor,
+        unit=unit, gram=gram, factor=factor, bordered=_bordered(unit, gram, bounded),
     )  # fmt: skip
+
+
+def _csc(M: Matrix) -> csc_matrix:
+    """Have entries numbered by 32-bit integers, as the factor does."""
+    M = csc_matrix(M)
+    M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
+    return M
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:

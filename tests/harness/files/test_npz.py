@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Status, no_rows
+from harness import QP, InputError, Status, no_rows
 from harness.files.npz import ALIGNMENT, mapped, write_mappable
 from harness.files.qpfile import load_qp, save_qp
 from harness.operators import SerialisableOperator
@@ -67,15 +67,21 @@ def diagonal(arrays):
 MAKERS = {"diagonal": diagonal}
 
 
+def operator_of(d):
+    """Make a QP whose P is the operator diag(d)."""
+    n = d.size
+    P = SerialisableOperator(n, "diagonal", {"d": d}, MAKERS)
+    return QP(
+        P=P, q=-d, A=no_rows(n), b=np.zeros(0), G=no_rows(n),
+        h=np.zeros(0), lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
+    )  # fmt: skip
+
+
 @pytest.fixture
 def operator_qp():
     """A QP whose P is the operator diag(1, 2); BUILT counts how often it was made."""
     BUILT.clear()
-    P = SerialisableOperator(2, "diagonal", {"d": np.array([1.0, 2.0])}, MAKERS)
-    return QP(
-        P=P, q=np.array([-1.0, -2.0]), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
-        h=np.zeros(0), lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
-    )  # fmt: skip
+    return operator_of(np.array([1.0, 2.0]))
 
 
 def test_an_operator_travels_as_arrays_and_is_the_same_operator(operator_qp, tmp_path):
@@ -110,3 +116,14 @@ def test_putting_an_operator_together_is_charged_to_every_prepare(operator_qp):
         assert measure(Looks(), operator_qp, 1e-6).solution.status is Status.FAILED
 
     assert built_before_prepare == [1, 2]
+
+
+def test_an_operator_too_large_as_a_matrix_is_written_as_one_only(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("MORTARBENCH_MOST_MIB", "1")
+    qp = operator_of(np.ones(400))  # 1.2 MiB
+
+    save_qp(tmp_path / "qp.npz", qp, serialised=True)
+    with pytest.raises(InputError, match="P, an operator, as a dense matrix of 400"):
+        save_qp(tmp_path / "qp.npz", qp)

@@ -276,8 +276,8 @@ def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transfo
     geometry = (3, 2, 4, "strain")
     bodies, inverse = model(*geometry), Counted(factorise(*geometry))
     path = LoadPath(
-        bodies, linearisation(bodies, "nts", "dual"), inverse, reference_solution, 6,
-        transform=transform,
+        bodies, linearisation(bodies, "nts", "dual"), lambda: inverse,
+        reference_solution, 6, transform=transform,
     )  # fmt: skip
 
     last = path.answer(6)

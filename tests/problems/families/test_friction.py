@@ -273,8 +273,9 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
     path = LoadPath(
-        bodies, lambda u: rows, clamped(bodies), reference_solution, 1, laws=laws
-    )
+        bodies, lambda u: rows, lambda: clamped(bodies), reference_solution, 1,
+        laws=laws,
+    )  # fmt: skip
 
     told = r"step 1 does not settle: after 3. Tresca problems .* is [789]\.\de-01, and"
     with pytest.raises(InputError, match=told):

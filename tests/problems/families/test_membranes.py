@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from scipy.sparse import issparse
 
 from harness import InputError, kkt_residuals
+from harness.files.matfile import read_mat, save_mat
 from problems import PROBLEMS
 from problems.models.membranes import Membranes, shares, stiffness
 from solvers.reference.solve import reference_solution
@@ -104,6 +107,25 @@ def test_energies_fall_to_a_limit_as_the_mesh_is_refined():
     steps = -np.diff(found)
     assert (steps > 0).all()
     assert (steps[1:] < 0.5 * steps[:-1]).all()
+
+
+def test_the_mat_file_holds_the_dual_in_the_notation_of_the_paper(tmp_path):
+    case = built("dual", S=2, n=2)
+    save_mat(tmp_path / "m.mat", case.qp, {}, case.matrices)
+    M = {
+        name: M.toarray() if issparse(M) else M
+        for name, M in read_mat(tmp_path / "m.mat").items()
+        if name != "meta"
+    }
+    K = block_diag(*[stiffness(2).toarray()] * 8)
+    expected = M["B"] @ np.linalg.pinv(K) @ M["B"].T
+    G = M["R"].T @ M["B"].T
+    P = np.eye(len(expected)) - np.linalg.pinv(G) @ G
+
+    assert G == pytest.approx(M["A"], abs=1e-14)
+    assert M["F"] == pytest.approx(M["P"])
+    assert P @ M["F"] @ P == pytest.approx(P @ expected @ P, abs=1e-12)
+    assert M["d"] == pytest.approx(-M["q"])
 
 
 def test_values_out_of_range_are_refused():

@@ -50,7 +50,7 @@ def sign(bodies):
 
 def path_of(bodies, contact, basis, relin=1):
     return LoadPath(
-        bodies, linearisation(bodies, contact, basis), clamped(bodies),
+        bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
         reference_solution, STEPS, relin,
     )  # fmt: skip
 

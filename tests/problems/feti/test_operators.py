@@ -15,7 +15,6 @@ from problems import OPERATORS
 from problems.contact.linearise import linearisation
 from problems.duality.stepping import primal_qp
 from problems.feti.elastic import subdivide, torn
-from problems.feti.local import kernel, local, subdomains
 from problems.feti.operators import dual_operator, made
 from problems.feti.tearing import blocks
 from problems.models.beam_ring import model
@@ -51,13 +50,13 @@ def pair(request):
 
 
 def operator_of(pair):
-    return dual_operator(pair.B, subdomains(pair))
+    return dual_operator(pair.B, pair.domains)
 
 
 def dense(pair):
     """K as a whole, with B and R."""
     K = block_diag(*(pair.kinds[k].K.toarray() for k in pair.kind))
-    return K, pair.B.toarray(), kernel(pair).toarray()
+    return K, pair.B.toarray(), pair.domains.kernel.toarray()
 
 
 def test_the_kernel_is_orthonormal_and_costs_no_energy(pair):
@@ -69,7 +68,7 @@ def test_the_kernel_is_orthonormal_and_costs_no_energy(pair):
 
 def test_the_inverse_of_torn_bodies_is_a_generalised_one_and_symmetric(pair):
     K, _, _ = dense(pair)
-    inverse = subdomains(pair).inverse
+    inverse = pair.domains.inverse
     K_plus = np.stack([inverse(e) for e in np.eye(len(K))], axis=1)
 
     assert abs(K @ K_plus @ K - K).max() < 1e-12 * abs(K).max()
@@ -223,4 +222,4 @@ def test_a_kind_without_kernel_has_its_inverse():
     nothing = np.zeros(0, dtype=np.int64)
     regular = replace(kind, K=K, R=np.zeros((n, 0)), fixing=nothing)
 
-    assert_allclose(local(regular).inverse(K.toarray()), np.eye(n), atol=1e-13)
+    assert_allclose(regular.inverse(K.toarray()), np.eye(n), atol=1e-13)

@@ -1,0 +1,119 @@
+"""The plate in subdomains: published condition numbers, and one answer in all ways."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from harness import Case, InputError
+from problems.families.plate import Plate
+from problems.models.plate import dual_quantities, model
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+FAMILY = Plate()
+#: a test of MSolve (Papagiannakis 2011): E of the left column is 1/1000 of the others'
+CANTILEVER = (
+    "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/load=nodal/"
+    "plane=stress/supports=eliminated/glue=redundant"
+)
+#: κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet; n multipliers
+PUBLISHED = [
+    ({"Sx": 2, "Sy": 2}, 56, (9.9829, 5.63810, 2.9140, 1.8597)),
+    ({"Sx": 2, "Sy": 2, "n": 8}, 104, (19.4934, 10.92276, 5.5564, 2.7512)),
+    ({}, 256, (10.7836, 5.96542, 3.0658, 1.8299)),
+    ({"Sx": 16, "Sy": 2, "n": 8}, 832, (19.5099, 10.93137, 5.7382, 2.7958)),
+]
+
+
+def built(name: str) -> Case:
+    keys = dict(key.split("=") for key in name.split("/")[1:])
+    typed = {k: type(FAMILY.defaults[k])(v) for k, v in keys.items()}
+    return FAMILY.build("dual", FAMILY.complete(typed), reference_solution)
+
+
+def reported(**keys: Any) -> dict[str, Any]:
+    return dual_quantities(model(tuple(FAMILY.complete(keys).items())))
+
+
+@pytest.mark.parametrize(("keys", "multipliers", "numbers"), PUBLISHED)
+def test_condition_numbers_are_those_of_a_prototype(keys, multipliers, numbers):
+    found = reported(**keys)
+    names = ("kappa", "norm_PFP", "kappa_lumped", "kappa_dirichlet")
+    assert found["multipliers"] == multipliers
+    assert_allclose([found[name] for name in names], numbers, rtol=3e-5)
+    assert found["kappa_dirichlet_stiffness"] == pytest.approx(found["kappa_dirichlet"])
+    assert all(found[f"{name}_error"] <= 3e-5 * found[name] for name in names)
+
+
+@pytest.mark.parametrize(
+    ("jump", "name", "value"),
+    [
+        (10.0, "kappa", 86.2039),
+        (10.0, "kappa_dirichlet", 9.1477),
+        (10.0, "kappa_dirichlet_stiffness", 3.5126),
+        (1e4, "kappa_dirichlet_stiffness", 2350.7),
+    ],
+)
+def test_jumps_cost_what_they_cost_a_prototype(jump, name, value):
+    found = reported(pattern="checkerboard", jump=jump)
+    assert found[name] == pytest.approx(value, rel=3e-5)
+
+
+def test_the_cantilever_of_msolve_has_its_sizes():
+    keys = {"Sy": 2, "n": 5, "ny": 10, "supports": "eliminated", "glue": "redundant"}
+    torn = model(tuple(FAMILY.complete(keys).items())).torn
+    rows = model(tuple(FAMILY.complete(keys | {"supports": "rows"}).items())).torn
+    assert torn.c.size == 190  # no gluing of what is held
+    assert rows.f.size == 1056
+    assert torn.f.size == 1056 - 44
+    modes = [torn.kinds[k].R.shape[1] for k in torn.kind]
+    assert modes == [0, 3, 3, 3] * 2  # the column at the held edge does not float
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"plate/pattern=checkerboard/jump=100.0/glue={glue}"
+          for glue in ("orthonormal", "chain", "redundant")),
+        "plate/Sx=3/Sy=2/n=3/load=point/supports=eliminated",
+        CANTILEVER,
+    ],
+)  # fmt: skip
+def test_the_dual_has_the_displacement_of_the_plate(name):
+    case = built(name)
+    s = SMALBE().prepare(case.qp, 1e-9)()
+    primal = case.mechanics.primal
+    u = case.mechanics.inverse(-primal.q)
+    back = case.mechanics.back(s)
+    K_norm = np.sqrt(u @ (primal.P @ u))
+    off = back.x - u
+    assert np.sqrt(off @ (primal.P @ off)) <= 1e-7 * K_norm
+    assert_allclose(back.y, -(primal.A @ (primal.P @ u + primal.q)), atol=1e-6)
+    assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
+        primal.objective(u), rel=1e-8
+    )
+
+
+@pytest.mark.parametrize("load", ["point", "edge", "nodal"])
+def test_every_load_pulls_with_one_newton(load):
+    f = -model(tuple(FAMILY.complete({"load": load}).items())).primal.q
+    assert f[1::2].sum() == pytest.approx(-1.0)
+    assert not f[0::2].any()
+
+
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        ({"jump": 2.0}, "jump=2.0 is not used by pattern=uniform"),
+        ({"pattern": "stripes"}, "'uniform' or 'checkerboard' or 'column'"),
+        ({"glue": "tape"}, "'orthonormal' or 'chain' or 'redundant'"),
+        ({"Sx": 0}, "Sx=0 must be at least 1"),
+        ({"width": -1.0}, "width=-1.0 must be positive"),
+        ({"Sx": 1, "Sy": 1, "supports": "eliminated"}, "without any row"),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused(keys, told):
+    with pytest.raises(InputError, match=told):
+        FAMILY.check(FAMILY.complete(keys))
