@@ -50,8 +50,9 @@ class Substructures(Protocol):
     """The stiffness as a sum over subdomains that float:  K = Tᵀ diag(K_1 … K_S) T.
 
     Torn unknowns v (N,) have a copy of each component in every subdomain around it, in
-    axes of that subdomain. The rigid motions R of the subdomains are the exact kernel
-    of what K_s stands for: what rounding left of K_s R_s is no part of the problem.
+    axes of that subdomain. The rigid motions R_s of a subdomain are exactly the kernel
+    of what is meant by K_s, that is of P_s K_s P_s with P_s = I − R_sR_sᵀ: what
+    rounding left of K_s R_s is no part of the problem.
     """
 
     @property
@@ -66,11 +67,11 @@ class Substructures(Protocol):
     def weight(self) -> Vector:
         """Relative stiffness (N,) of the copies, one for all components of a node."""
 
-    def product(self, v: Extended) -> Extended:
-        """Apply diag(K_1 … K_S) in extended precision."""
+    def product(self, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply PKP to v (N,) or (N, k), in its precision."""
 
     def solve(self, b: Vector) -> Vector:
-        """Apply K⁺ of every subdomain to forces (N,) that balance in each."""
+        """Apply PK⁺P to forces (N,)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -71,7 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import equilibrated, torn_norm
+from harness.verify.substructured import equilibrated
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -189,20 +189,20 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    none = np.zeros(multipliers.size, dtype=bool)
-    own = _proved(mechanics, claimed, u, multipliers, none)
-    yield own
-    if _sharp(own):
-        return
     states = suggested(mechanics, u, multipliers)
-    tidied = at_bounds(mechanics, states, multipliers)
-    other = _proved(mechanics, claimed, u, tidied, states == CLOSED)
-    yield other
-    proven = min(
-        (c.bound for c in (own, other) if isinstance(c, Certificate)), default=np.inf
-    )
+    tidied = at_bounds(mechanics, states, multipliers), states == CLOSED
+    pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
+    if mechanics.tear is not None:
+        pairs.reverse()  # of large problems what mostly is enough comes first
+    proven = np.inf
+    for pair in pairs:
+        found = _proved(mechanics, claimed, u, *pair)
+        yield found
+        if _sharp(found):
+            return
+        proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
     exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
-    if exchangeable and GOOD < proven <= NEAR and not _sharp(other):
+    if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
         yield _proved(mechanics, claimed, v, mu, states == CLOSED)
 
@@ -318,17 +318,22 @@ def _substructured_proof(
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
-    d, left = equilibrated(mechanics, feasible, lam)
-    apart = torn_norm(parts, d.astype(Real))
-    works = exact.friction_work(feasible) - lam * exact.motion(feasible)
-    T, half = parts.spread.astype(Real), d * Real(0.5)
-    torn = T @ feasible
-    norms = [torn_norm(parts, torn - shift) for shift in (0 * d, d, half)]
-    moved = T @ (claimed - feasible)
+    torn = equilibrated(mechanics, feasible, lam)
+    moved = parts.spread.astype(Real) @ (claimed - feasible)
+    v = np.column_stack([torn.u, torn.d, moved])
+    energy = v.T @ np.column_stack([torn.Ku, parts.product(v[:, 1:])])
+
+    def length(*combined: float) -> float:
+        """Return the norm of a combination of Tû, d and T(u − û)."""
+        w = np.array(combined, dtype=Real)
+        return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
+
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=torn - d, norms=norms,
-        apart=apart, left=left, works=works, rounding=0.0,
-        from_middle=torn_norm(parts, moved + half), moved=torn_norm(parts, moved),
+        mechanics, u=feasible, multipliers=lam, equilibrium=torn.u - torn.d,
+        norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
+        apart=length(0, 1, 0), left=torn.left,
+        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
+        rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
     )  # fmt: skip
 
 

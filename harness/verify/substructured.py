@@ -32,44 +32,41 @@ can hold; along these λ̂ balances the load, see `harness.verify.admissible.bal
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
 from scipy.sparse import csc_matrix, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from harness.mechanics import Extended, Mechanics, Real, Substructures
+from harness.mechanics import Extended, Mechanics, Real
 from harness.qp import Vector
 
 
-def equilibrated(
-    mechanics: Mechanics, u: Extended, multipliers: Extended
-) -> tuple[Vector, float]:
-    """Return d (N,) for an admissible u (n,) and λ̂ (m,), and what is undone of it.
+class Torn(NamedTuple):
+    """Forces of an admissible û that local problems do not balance, and what they do.
 
-    That is the energy norm of what one refinement left, as of `equilibrium` in
-    `harness.verify.active_set_refinement`.
+    Of torn displacements v, products are  vᵀKw  with the stiffness of the subdomains.
     """
+
+    u: Extended  #: Tû (N,)
+    Ku: Extended  #: K_T Tû
+    d: Vector  #: (N,) Tû − u_λ, as far as it was solved for
+    left: float  #: energy norm of the rest of d
+
+
+def equilibrated(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Torn:
+    """Find the u_λ of an admissible û (n,) and λ̂ (m,) that is near Tû."""
     exact, parts = mechanics.exact, mechanics.substructures
-    T = parts.spread
-    pull = parts.product(_deformed(parts, T.astype(Real) @ u))
-    residual = T.T @ pull - exact.f + exact.B.T @ multipliers
+    torn = parts.spread.astype(Real) @ u
+    pull = parts.product(torn)
+    residual = parts.spread.T @ pull - exact.f + exact.B.T @ multipliers
     residual[exact.held] = 0
     b = _sharing(mechanics)(residual.astype(np.float64))
-    d = np.zeros(b.size)
-    for _ in range(2):
-        left = b - parts.product(d.astype(Real)).astype(np.float64)
-        left = _deformed(parts, left)
-        step = _deformed(parts, parts.solve(left))
-        d = d + step
-    return d - step, float(np.sqrt(abs(float(left @ step))))
-
-
-def torn_norm(parts: Substructures, v: Extended) -> float:
-    """Return √(Σ v_sᵀK_s v_s) of a torn displacement (N,)."""
-    v = _deformed(parts, v)
-    return float(np.sqrt(max(float(v @ parts.product(v)), 0.0)))
+    d = parts.solve(b)
+    b = b - parts.product(d)
+    step = parts.solve(b)
+    return Torn(torn, pull, d, float(np.sqrt(abs(float(b @ step)))))
 
 
 def _sharing(mechanics: Mechanics) -> Callable[[Vector], Vector]:
@@ -115,9 +112,3 @@ def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
         return x
 
     return solve
-
-
-def _deformed(parts: Substructures, v: Any) -> Any:
-    """Take the rigid motions of every subdomain out of torn `v` (N,)."""
-    R = parts.kernel
-    return np.asarray(v - R @ (R.T @ v))

@@ -2,45 +2,70 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness import Vector
-from harness.mechanics import Extended, Real
-from problems.feti.torn import Subdomains, Torn
+from problems.feti.torn import Kind, Torn
+
+Columns = NDArray[Any]  #: (n_k, …) of the subdomains of one kind
 
 
 @dataclass(frozen=True, eq=False)
 class LocalProblems:
     """The local problems of torn bodies; see `harness.mechanics.Substructures`."""
 
-    spread: csr_array  #: (N, n)
-    kernel: csr_array  #: (N, r)
-    domains: Subdomains
+    torn: Torn
     components: int  #: of a node
+
+    @property
+    def spread(self) -> csr_array:
+        """T (N, n)."""
+        return self.torn.spread
+
+    @property
+    def kernel(self) -> csr_array:
+        """R (N, r)."""
+        return self.torn.domains.kernel
 
     @cached_property
     def weight(self) -> Vector:
         """Sum of the diagonal entries of K at each torn node, (N,)."""
         d, found = self.components, np.empty(self.spread.shape[0])
-        for local, place in zip(self.domains.kinds, self.domains.places(), strict=True):
-            trace = local.K.diagonal().reshape(-1, d).sum(axis=1)
+        for kind, place in self._kinds():
+            trace = kind.K.diagonal().reshape(-1, d).sum(axis=1)
             found[place] = np.repeat(trace, d)[:, None]
         return found
 
-    def product(self, v: Extended) -> Extended:
-        """Multiply by kinds, all their subdomains at once."""
-        found = np.empty_like(v)
-        for local, place in zip(self.domains.kinds, self.domains.places(), strict=True):
-            found[place] = local.K.astype(Real) @ v[place]
-        return found
+    def product(self, v: NDArray[Any]) -> NDArray[Any]:
+        """Apply PKP; all subdomains of a kind at once."""
+        return self._by_kinds(lambda kind, own: kind.K.astype(v.dtype) @ own, v)
 
     def solve(self, b: Vector) -> Vector:
-        """Solve by kinds, with one factor each."""
-        return self.domains.inverse(b)
+        """Apply PK⁺P with one factor per kind."""
+        return self._by_kinds(Kind.inverse, b)
+
+    def _by_kinds(
+        self, apply: Callable[[Kind, Columns], Columns], v: NDArray[Any]
+    ) -> NDArray[Any]:
+        """Apply a map of each kind between two projections P = I − RRᵀ."""
+        found = np.empty_like(v)
+        for kind, place in self._kinds():
+            own, R = v[place], kind.R
+            columns = own.reshape(len(R), -1)
+            image = apply(kind, columns - R @ (R.T @ columns))
+            found[place] = (image - R @ (R.T @ image)).reshape(own.shape)
+        return found
+
+    def _kinds(self) -> zip[tuple[Kind, NDArray[np.int64]]]:
+        """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
+        return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
 
 
 def local_problems(torn: Torn, components: int = 2) -> LocalProblems:
@@ -48,4 +73,4 @@ def local_problems(torn: Torn, components: int = 2) -> LocalProblems:
 
     components : of a node; torn unknowns are numbered node by node
     """
-    return LocalProblems(torn.spread, torn.domains.kernel, torn.domains, components)
+    return LocalProblems(torn, components)
