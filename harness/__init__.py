@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         Fields,
         Reference,
         Solver,
+        Tightening,
         Value,
     )
     from harness.qp import QP, Matrix, Structure, Vector, needs_matrices, no_rows
@@ -51,6 +52,7 @@ _MODULES = {
     "Status": "harness.solution",
     "Structure": "harness.qp",
     "UncertifiableError": "harness.verify.certificate",
+    "Tightening": "harness.plugin",
     "Value": "harness.plugin",
     "Vector": "harness.qp",
     "Verdict": "harness.record",
@@ -93,6 +95,7 @@ __all__ = [
     "Solver",
     "Status",
     "Structure",
+    "Tightening",
     "UncertifiableError",
     "Value",
     "Vector",

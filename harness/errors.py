@@ -21,6 +21,13 @@ class InputError(Exception):
     """
 
 
+class PastEndError(InputError):
+    """There are fewer problems than that, as of a fixed point that has settled before.
+
+    A sequence that asks for more ends at the last one there is.
+    """
+
+
 class FaultError(Exception):
     """A fault of ours or of the machine, never a solver's: a full disk, a lost file.
 

@@ -96,6 +96,7 @@ class Friction:
     row: NDArray[np.int64]  #: (k,) the contact row of each
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
+    unsettled: float = 0.0  #: `residual` at the solution with this bound, where known
 
     def demanded(self, normal: Vector) -> Vector:
         """Return cohesion + mu·λ_n (k,), never negative, for normal forces (m,)."""
@@ -108,8 +109,8 @@ class Friction:
 
     def __getitem__(self, kept: NDArray[Any]) -> Friction:
         """Keep some of the rows."""
-        data = {name: value[kept] for name, value in vars(self).items()}
-        return Friction(**data)
+        rows = {k: v[kept] for k, v in vars(self).items() if k != "unsettled"}
+        return replace(self, **rows)
 
 
 _NOTHING = np.zeros(0)

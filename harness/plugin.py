@@ -46,6 +46,17 @@ class Chained(Solver, Protocol):
         """
 
 
+class Tightening(Chained, Protocol):
+    """A solver that can carry work on where each QP comes with its own tolerance."""
+
+    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
+        """Begin a sequence: return the `prepare` for its QPs and their tolerances.
+
+        As `chain`, which has one tolerance for all: the early QPs of a fixed point are
+        not worth solving as accurately as the last.
+        """
+
+
 @dataclass(frozen=True, kw_only=True)
 class About:
     """The descriptive facts of a solver, kept with its adapter.
@@ -137,6 +148,9 @@ class Case:
     )
     mechanics: Mechanics | None = None  #: to certify errors with, where there are any
     remarks: tuple[str, ...] = ()  #: what may be wrong with the input, a line each
+    #: how far the QP itself is from the fixed point that it leads to, relative: no
+    #: solution of it comes nearer; 0 where it leads to none, or is there
+    unsettled: float = 0.0
 
 
 class Family(ABC):

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 SCHEMA = 2
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
 READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
+TIGHTENING = "sequence, tighten="  #: begins the mode of a sequence that tightens
 LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
 MOST_LEVELS = 20  #: of what is nested in a field
 
@@ -111,7 +112,12 @@ class Record(Measurement):
     canary_seconds: float | None = None  #: a fixed kernel, just before: drift
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to
-    mode: str = "cold"  #: or "sequence": may use what earlier steps left
+    #: or "sequence": may use what earlier steps left; "sequence, tighten=θ": to
+    #: tolerances that tighten, see `Record.tighten`
+    mode: str = "cold"
+    #: solved to and judged at, where that is looser than `tol`: an early step of a
+    #: sequence that tightens
+    step_tol: float | None = None
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
     role: str = ""  #: "null": the same solver once more, to show the noise
     primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
@@ -136,6 +142,25 @@ class Record(Measurement):
     started: str = ""  #: UTC, ISO 8601
     session: str = ""  #: of one command; empty in journals from before there were any
 
+    @property
+    def tighten(self) -> float:
+        """θ of a sequence whose tolerances tighten towards `tol`, else 0.
+
+        A step of it is solved to max(tol, θ·`harness.plugin.Case.unsettled`).
+        """
+        _, _, number = self.mode.partition(TIGHTENING)
+        return float(number or 0)
+
+    @property
+    def asked_tol(self) -> float:
+        """The tolerance that the solver was given."""
+        return self.tol if self.step_tol is None else self.step_tol
+
+    @property
+    def judged_at(self) -> float:
+        """The tolerance that the verdict is about."""
+        return self.asked_tol if self.accuracy is None else self.accuracy
+
     def but(self, **changes: Any) -> Self:
         """Copy with some fields changed."""
         return replace(self, **changes)
@@ -148,11 +173,14 @@ class Record(Measurement):
         """Serialise to one line of strict JSON.
 
         NaN, inf and integers that no reader can hold become null. A line from before
-        there were sessions is written as it was read.
+        there were sessions, or steps with a tolerance of their own, is written as it
+        was read.
         """
         row = finite(self.to_dict())
         if not self.session:
             del row["session"]
+        if self.step_tol is None:
+            del row["step_tol"]
         return json.dumps(row, allow_nan=False)
 
     @staticmethod
@@ -278,9 +306,16 @@ def _check(r: Record) -> None:
         raise ValueError(_WRONG_SCHEMA)
     if not r.run_id:
         raise ValueError("run_id is empty; expected a text")
-    for name, at in (("tol", r.tol), ("accuracy", r.accuracy)):
+    for name, at in (
+        ("tol", r.tol), ("accuracy", r.accuracy), ("step_tol", r.step_tol)
+    ):  # fmt: skip
         if at is not None and not 0 < at <= 1:
             raise ValueError(f"{name} = {at!r}; expected a number above 0, at most 1")
+    theta = r.mode.removeprefix(TIGHTENING)
+    if theta != r.mode and not re.fullmatch(r"0\.[0-9]+|[0-9.]+e-[0-9]+", theta):
+        raise ValueError(
+            f"mode = {shown(r.mode)}; expected {TIGHTENING}θ, θ between 0 and 1"
+        )
     numbers = [n for n in _not_negative(r) if n]
     if numbers and not 0 < min(numbers) <= max(numbers) <= LARGEST_INTEGER:
         for name, value in zip(_NOT_NEGATIVE, _not_negative(r), strict=True):

@@ -143,14 +143,14 @@ def _answer(
     g: Given, found: Assessment | None, doubt: float | None, prove: Proves
 ) -> Answer:
     """Put together what is known of an answer, and whether its claim stands."""
-    r, residuals = g.record, residuals_of(g)
-    error = decided(g.case.qp, g.solution, residuals, r.tol, prove)
+    r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
+    error = decided(g.case.qp, g.solution, residuals, tol, prove)
     answer = Answer(
         run_id=r.run_id, repeats=g.repeats, solver=g.label, case=r.case, form=r.form,
-        tol=r.tol, claimed=r.claimed or "", stored=r.verdict,
-        verdict=verdict(g.solution.status, residuals, r.tol, error=error),
-        residuals=residuals._asdict(), optimum_error=error, allowed=allowed(r.tol),
-        energy_allowed=energy_allowed(r.tol), energy_bound=r.energy_bound,
+        tol=tol, claimed=r.claimed or "", stored=r.verdict,
+        verdict=verdict(g.solution.status, residuals, tol, error=error),
+        residuals=residuals._asdict(), optimum_error=error, allowed=allowed(tol),
+        energy_allowed=energy_allowed(tol), energy_bound=r.energy_bound,
         doubt=doubt, assessment=found, remarks=g.remarks,
     )  # fmt: skip
     refuted = tuple(_refutations(answer))

@@ -74,7 +74,7 @@ def ground_truth_of(
     def assessed(g: Given) -> tuple[Assessment, Deviation]:
         assert g.case.mechanics is not None
         at = g.case.mechanics.back(g.solution)
-        return assess(mechanics, point, at, g.record.tol)
+        return assess(mechanics, point, at, g.record.asked_tol)
 
     exact = mechanics.exact
     contact = exact.contact

@@ -206,7 +206,7 @@ def _given(
     for r in records:
         if not r.vectors or not _stands(r):
             continue
-        key = (r.solver, r.case, r.tol, r.vectors)
+        key = (r.solver, r.case, r.asked_tol, r.vectors)
         if key in found:
             found[key] = replace(found[key], repeats=found[key].repeats + 1)
             continue

@@ -11,8 +11,9 @@ It answers the requests of `harness.processes.protocol` with these of its own:
   for verdicts that residuals cannot give; it writes a point to the second, and says
   ``{"event": "done", "found": true}``, or false where it finds none
 
-or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT}``; where NAME
-is ``{"family": …, "params": {…}, "form": …, "name": …}`` and N the number of cases that
+or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT, "past_end":
+…}``, the last true where a sequence has fewer problems (`PastEndError`); where NAME is
+``{"family": …, "params": {…}, "form": …, "name": …}`` and N the number of cases that
 are to stay in memory. What leads back from a point to the bodies is code, which no file
 can hold: a case that is on file is built again when a point of it comes.
 """
@@ -27,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.errors import PastEndError
 from harness.files.qpfile import load_qp, save_qp
 from harness.files.store import (
     digest_of,
@@ -75,7 +77,11 @@ class CaseWorker:
         try:
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # the family's code
-            return {"unbuilt": unbuilt(name, e), "trace": traceback.format_exc()}
+            return {
+                "unbuilt": unbuilt(name, e),
+                "trace": traceback.format_exc(),
+                "past_end": isinstance(e, PastEndError),
+            }
         if "build" in request:
             return self._written(case, name, Path(request["qp"]))
         return self._described(case, name, request)
@@ -153,6 +159,7 @@ class CaseWorker:
         seconds = {
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
+            "unsettled": case.unsettled,
         }
         return {"meta": {**meta, **seconds, "qp": digest}}
 

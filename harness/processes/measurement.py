@@ -83,7 +83,7 @@ def measured(
     try:
         _clear(out, returned)
         reply = worker.ask(
-            {**request, **limited, "out": str(returned), "tol": record.tol},
+            {**request, **limited, "out": str(returned), "tol": record.asked_tol},
             time_limit=time_limit,
             memory_limit=memory_limit,
         )
@@ -109,7 +109,9 @@ def measured(
     cost, *notes = _believed(reply)
     if not notes:
         first = reply.answer["first_seconds"]
-        notes = _cached(cost, first, worker.first_seconds, (record.qp, record.tol))
+        notes = _cached(
+            cost, first, worker.first_seconds, (record.qp, record.asked_tol)
+        )
     record = judged(record.but(**asdict(cost)), qp, solution, prove)
     record = noted(record, reply.message, *notes)
     return _within(memory_limit, record).but(

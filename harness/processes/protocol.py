@@ -201,7 +201,10 @@ _MEASURED: Mapping[str, Accepts] = {
 _CHECKED: Mapping[str, Accepts] = {
     "grade": _is_text, "message": _is_any_text, "work": _maybe(_is_number),
 }  # fmt: skip
-_UNBUILT: Mapping[str, Accepts] = {"unbuilt": _is_any_text, "trace": _is_any_text}
+_UNBUILT: Mapping[str, Accepts] = {
+    "unbuilt": _is_any_text, "trace": _is_any_text,
+    "past_end": lambda value: isinstance(value, bool),
+}  # fmt: skip
 _BUILT: Mapping[str, Accepts] = {"meta": lambda value: isinstance(value, dict)}
 _DESCRIBED: Mapping[str, Accepts] = {
     "quantities": lambda value: isinstance(value, dict),

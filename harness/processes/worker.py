@@ -7,7 +7,8 @@ It answers the requests of `harness.processes.protocol` with these of its own:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
   writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
   without which the file may hold no operator; ``memory_limit`` in MiB;
-  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence
+  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence,
+  and whether it ``tightens``: then every step comes with its own tolerance
 * ``{"check": NAME}``: it runs one of `harness.conformance.conformance.CHECKS`
 
 Every measurement loads its QP afresh, so that nothing that a solver did to the last one
@@ -24,6 +25,7 @@ import resource
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -40,7 +42,7 @@ from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
 from harness.qp import QP, Vector, no_rows
 from harness.record import finite, journal_name
-from harness.solution import Solution
+from harness.solution import Solution, Status
 from harness.verify.measure import Prepare, Timed, measure, memory_mib
 
 _MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
@@ -66,7 +68,7 @@ class _Bench:
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
         self._operators = operators
-        self._chain: Prepare | None = None
+        self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
         self._at = -1  # the step of the sequence that came last
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
         self._ballast = np.empty(0)
@@ -149,17 +151,17 @@ class _Bench:
             return None
         if step and self._at != step - 1:
             raise LookupError("the process that drove the sequence so far has gone")
-        self._at = step
+        self._at, tol = step, request["tol"]
         if step == 0:
             self._chain = None
-            chain, tol = self._solver.chain, request["tol"]
+        begin = partial(_begun, self._solver, tightens=request.get("tightens", False))
 
-            def begin(qp: QP) -> Callable[[], Solution]:  # on the clock, as its step is
-                self._chain = chain(tol)
-                return self._chain(qp)
+        def prepare(qp: QP) -> Callable[[], Solution]:
+            if self._chain is None:  # on the clock, as its step is
+                self._chain = begin(tol)
+            return self._chain(qp, tol)
 
-            return begin
-        return self._chain
+        return prepare
 
     def _check(self, path: Path, digest: str | None) -> None:
         """Refuse a file that is not what it was; one that has not changed is known."""
@@ -171,6 +173,20 @@ class _Bench:
             if content_digest(path) != digest:
                 raise ValueError(f"{path.name} was changed on disk")
             self._trusted[digest] = seen
+
+
+def _begun(
+    solver: Any, tol: float, *, tightens: bool
+) -> Callable[[QP, float], Callable[[], Solution]]:
+    """Begin a sequence whose steps all have that tolerance, or each its own."""
+    if not tightens:
+        same: Prepare = solver.chain(tol)
+        return lambda qp, tol: same(qp)
+    if hasattr(solver, "tightening"):
+        own: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
+        return own
+    why = "its chain() has one tolerance for all steps; tightening() would take others"
+    return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 
 def canary_seconds() -> float:

@@ -57,7 +57,7 @@ def open_stored_run(
     spec = _asked(record, asked_solvers(text))
     try:
         name = assemble(_family(record, families), record.params, record.form)
-        in_sequence = record.mode == "sequence"
+        in_sequence = record.mode != "cold"
         cases = steps_up_to(text, name, families) if in_sequence else (name,)
         spec = _with_options(record, spec, solvers)
     except InputError as e:

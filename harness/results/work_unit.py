@@ -44,7 +44,7 @@ class WorkUnit:
     @property
     def is_sequence(self) -> bool:
         """Whether each solver may use, at a step, what the earlier ones left."""
-        return self.turns[0][0].mode == "sequence"
+        return self.turns[0][0].mode != "cold"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

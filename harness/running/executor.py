@@ -34,6 +34,7 @@ from harness.verify.optimum import Optimum, proven_optimum
 from harness.verify.verdicts import has_point, noted
 
 _MOST_PROVEN = 1000  #: small QPs whose optima are kept
+LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
 
 
 class Executor:
@@ -61,6 +62,7 @@ class Executor:
         )
         self._workers: dict[str, WorkerProcess] = {}
         self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
+        self._end = ""  # why there are fewer than its sequence asked for
         self._loaded: dict[str, QP] = {}  # theirs, by digest
         self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
 
@@ -125,16 +127,18 @@ class Executor:
 
         """
         if not self._entries:
-            self._entries = tuple(self._entry(record, block) for record in turn)
+            self._entries, self._end = self._built(block, turn)
             self._loaded = {e.digest: self._qp(e) for e in self._entries}
         worker = self._worker(turn[0].solver)
-        for step, (record, at) in enumerate(zip(turn, self._entries, strict=True)):
+        there, beyond = turn[: len(self._entries)], turn[len(self._entries) :]
+        for step, (record, at) in enumerate(zip(there, self._entries, strict=True)):
             request = {
                 "qp": str(at.qp),
                 "digest": at.digest,
                 "out": str(self._point),
                 "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
                 **({"step": step} if block.is_sequence else {}),
+                **({"tightens": True} if record.tighten else {}),
             }
             record, solution = measured(
                 worker,
@@ -143,6 +147,7 @@ class Executor:
                     qp=at.meta.get("qp"),
                     build_seconds=at.meta.get("build_seconds"),
                     dualise_seconds=at.meta.get("dualise_seconds"),
+                    step_tol=_step_tol(record, at),
                 ),
                 request,
                 time_limit=block.time_limit,
@@ -156,8 +161,25 @@ class Executor:
                 solution is None or not has_point(solution)
             )
             if block.is_sequence and stopped:  # what it carried is lost
-                yield from _broken(turn[step + 1 :], record)
-                return
+                yield from _broken(there[step + 1 :], record)
+                break
+        for record in beyond:
+            declined = record.but(verdict=Verdict.DECLINED, message=self._end)
+            yield Result(record=declined)
+
+    def _built(
+        self, block: WorkUnit, turn: tuple[Record, ...]
+    ) -> tuple[tuple[Entry, ...], str]:
+        """Have the cases built; of a sequence those that there are, and why no more."""
+        entries: list[Entry] = []
+        for record in turn:
+            try:
+                entries.append(self._entry(record, block))
+            except _UnbuiltError as e:
+                if not entries or not e.past_end:
+                    raise
+                return tuple(entries), e.reason
+        return tuple(entries), ""
 
     def _described(
         self, block: WorkUnit, record: Record, solution: Solution | None
@@ -215,7 +237,10 @@ class Executor:
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:
             refuse_full_disk(self._scratch, reply.answer["unbuilt"])
-            raise _UnbuiltError(reply.answer["unbuilt"], reply.answer["trace"])
+            answer = reply.answer
+            raise _UnbuiltError(
+                answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
+            )
         return reply.answer
 
     def _optimum(self, at: Entry, qp: QP) -> Optimum | None:
@@ -298,6 +323,17 @@ class OneByOne:
             yield from self._executor.execute(block)
 
 
+def _step_tol(record: Record, at: Entry) -> float | None:
+    """Find what a step is worth solving to, where that is looser than what is asked.
+
+    The QP is as far from the fixed point as `harness.plugin.Case.unsettled` says, and
+    a part θ of that is enough (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). The
+    last QP of a fixed point is solved to the tolerance.
+    """
+    worth = min(LOOSEST, record.tighten * float(at.meta.get("unsettled", 0.0)))
+    return worth if worth > record.tol else None
+
+
 def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     """Give the steps that a sequence did not come to, because of how one ended."""
     for record in rest:
@@ -311,10 +347,11 @@ def _in_a_line(e: Exception) -> str:
 
 
 class _UnbuiltError(Exception):
-    def __init__(self, reason: str, trace: str) -> None:
+    def __init__(self, reason: str, trace: str, *, past_end: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
         self.trace = trace
+        self.past_end = past_end
 
 
 def _case(r: Record) -> dict[str, Any]:

@@ -277,10 +277,10 @@ def _check_same(
 
 def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
     """Refuse a sequence that has new steps before some that were driven."""
-    driven: dict[tuple[str, float, int], list[str]] = {}
+    driven: dict[tuple[str, str, float, int], list[str]] = {}
     for r in past:
-        if r.mode == "sequence":
-            driven.setdefault((r.solver, r.tol, r.repeat), []).append(r.case)
+        if r.mode != "cold":
+            driven.setdefault((r.mode, r.solver, r.tol, r.repeat), []).append(r.case)
     for sequence in suite.sequences:
         steps = [case.name for case in sequence]
         for cases in driven.values():

@@ -16,15 +16,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.names import CaseId
 from harness.record import Record, Verdict
 from harness.results.work_unit import WorkUnit
 from harness.running.pairs import Block, widest
 from harness.running.progress import Progress
-from harness.suite.suite import Suite
+from harness.suite.suite import Group, Suite
 from harness.verify.verdicts import new_record
 
-Group = tuple[CaseId, ...]
 Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 
@@ -87,7 +85,7 @@ class Schedule:
             for tol in self.suite.tolerances:
                 for repeat in range(self._most):
                     if repeat >= self.suite.repeats and self._enough(group, tol):
-                        self._skip(len(group) * len(self.suite.solvers))
+                        self._skip(len(group.cases) * len(self.suite.solvers))
                         continue
                     block = self._block(group, tol, repeat)
                     if block is not None:
@@ -107,8 +105,8 @@ class Schedule:
         assert self.suite.precision is not None
         records = [
             r
-            for case in group
-            for r in self._seen.get((_mode(group), case.name, tol), ())
+            for case in group.cases
+            for r in self._seen.get((group.mode, case.name, tol), ())
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
@@ -134,10 +132,10 @@ class Schedule:
                     block=self._next,
                     environment=self.environment,
                     session=self.session,
-                    mode=_mode(group),
+                    mode=group.mode,
                     accuracy=self.suite.accuracy,
                 )
-                for case in group
+                for case in group.cases
             )
             if self._given_up(group) or all(map(self.knows, turn)):
                 self._skip(len(turn))
@@ -145,7 +143,7 @@ class Schedule:
                 left.append(turn)
         if not left:
             return None
-        seed = f"{self.suite.name} {group[0]} {tol} {repeat // 2}"
+        seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
         random.Random(seed).shuffle(left)
         if repeat % 2:  # who was first is last: no place in a block favours anybody
             left.reverse()
@@ -158,7 +156,7 @@ class Schedule:
         )
 
     def _given_up(self, group: Group) -> bool:
-        return any(case.name in self.unbuilt for case in group)
+        return any(case.name in self.unbuilt for case in group.cases)
 
     def _skip(self, cells: int) -> None:
         for _ in range(cells):
@@ -180,10 +178,6 @@ def _by_block(records: Iterable[Record]) -> dict[Block, float]:
         )
         for repeat, steps in repeats.items()
     }
-
-
-def _mode(group: Group) -> str:
-    return "sequence" if len(group) > 1 else "cold"
 
 
 def _cell(record: Record) -> Cell:

@@ -6,13 +6,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness import checked
 from harness.errors import InputError, shown, unknown
 from harness.files.reading import MOST_TOML, read_text, toml
 from harness.names import CaseId
 from harness.plugin import Family, Solver
+from harness.record import TIGHTENING
 from harness.registry import SolverSpec, resolve
 from harness.suite.parameter_grid import planned
 
@@ -26,11 +27,19 @@ DEFAULTS: Mapping[str, Any] = {
     "budget": 600,
     "accuracy": None,
     "null_arm": None,
+    "tighten": [0],
     "max_cases": 100_000,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _SOLVER_KEYS = ("name", "label", "options")
 NULL = " (A/A)"  #: after the label of a solver that is measured once more
+
+
+class Group(NamedTuple):
+    """What is measured together: one case, or a sequence."""
+
+    cases: tuple[CaseId, ...]
+    mode: str  #: of its records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +55,8 @@ class Suite:
     cases: tuple[CaseId, ...]  #: all distinct; those that are solved cold
     text: str  #: the TOML as read, but with the limits that hold
     sequences: tuple[tuple[CaseId, ...], ...] = ()  #: each: its steps in order
+    #: each sequence is driven once with each: θ of `harness.record.Record.tighten`
+    tighten: tuple[float, ...] = (0.0,)
     precision: float | None = None
     """Go on beyond `repeats` until every ratio to the fastest is known so well."""
     max_repeats: int = 30  #: where there is a precision to reach
@@ -54,14 +65,21 @@ class Suite:
     every: frozenset[str] = frozenset()  #: names of the cases, where these are some
 
     @property
-    def groups(self) -> tuple[tuple[CaseId, ...], ...]:
+    def groups(self) -> tuple[Group, ...]:
         """What one block is made of: a single case, or the steps of a sequence."""
-        return (*((case,) for case in self.cases), *self.sequences)
+        return (
+            *(Group((case,), "cold") for case in self.cases),
+            *(
+                Group(steps, f"{TIGHTENING}{theta:g}" if theta else "sequence")
+                for steps in self.sequences
+                for theta in self.tighten
+            ),
+        )
 
     @property
     def names(self) -> tuple[CaseId, ...]:
         """Every case, cold or in a sequence."""
-        return tuple(case for group in self.groups for case in group)
+        return tuple(case for group in self.groups for case in group.cases)
 
 
 def load_suite(
@@ -109,6 +127,7 @@ def load_suite(
             max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
             budget=checked.positive("budget", table["budget"]),
             accuracy=_between("accuracy", table["accuracy"]),
+            tighten=_tightening(table, sequences),
             text=text,
         )
 
@@ -195,6 +214,29 @@ def _between(key: str, value: Any) -> float | None:
     if not checked.is_number(value) or not 0 < value < 1:
         raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
     return float(value)
+
+
+def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
+    """Read how sequences tighten; refuse that where it means nothing."""
+    thetas = checked.filled_list("tighten", table["tighten"])
+    if not all(checked.is_number(t) and 0 <= t < 1 for t in thetas) or len(
+        set(thetas)
+    ) < len(thetas):
+        raise InputError(
+            f"tighten = {shown(thetas)}; expected distinct numbers from 0 (each step "
+            "to the tolerance) to below 1"
+        )
+    if any(thetas) and not sequences:
+        raise InputError(
+            f"tighten = {shown(thetas)}: no problems are a sequence; expected sequence "
+            "= KEY in one of them"
+        )
+    if any(thetas) and table["accuracy"] is not None:
+        raise InputError(
+            f"tighten = {shown(thetas)}: every answer is judged at accuracy = "
+            f"{shown(table['accuracy'])}; expected only one of the two"
+        )
+    return tuple(map(float, thetas))
 
 
 def _tolerances(value: object) -> tuple[float, ...]:

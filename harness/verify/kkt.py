@@ -393,9 +393,8 @@ def rejudged(record: Record, factor: float) -> Verdict:
         return record.verdict
     stored = (getattr(record, name) for name in Residuals._fields)
     residuals = Residuals(*(np.inf if r is None else r for r in stored))
-    tol = record.tol if record.accuracy is None else record.accuracy
+    tol, error = record.judged_at, record.optimum_error
     claimed = Status(record.claimed)
-    error = record.optimum_error
     if verdict(claimed, residuals, tol, error=error) is not record.verdict:
         return record.verdict
     return verdict(claimed, residuals, tol, factor, error=error)

@@ -91,7 +91,7 @@ def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> 
     with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
         residuals = kkt_residuals(qp, s)
         objective = qp.objective(s.x)
-    tol, error = record.accuracy or record.tol, None
+    tol, error = record.judged_at, None
     if prove is not None:
         error = decided(qp, s, residuals, tol, prove)
     return record.but(

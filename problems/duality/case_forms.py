@@ -98,6 +98,7 @@ def contact_case(
             ),
             friction=friction, tear=tear,
         ),
+        unsettled=friction.unsettled,
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +33,7 @@ from harness import (
     Vector,
     kkt_residuals,
 )
+from harness.errors import PastEndError
 from problems.contact.bodies import Bodies
 from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.node_to_segment import ContactRows
@@ -59,27 +60,23 @@ class ContactProblem:
     friction: Friction
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
     dual: Callable[[], Transformed]  #: of these rows, whatever the bounds of friction
-    solve: Callable[[QP], Solution]
-
-    @cached_property
-    def _solution(self) -> Solution:
-        return self.solve(bounded(self.dual().qp, self.friction))
+    solution: Callable[[], Solution]  #: of the dual with the bounds of this friction
 
     @cached_property
     def on_sides(self) -> Vector:
         """Displacement u (n,), right on the contact sides."""
-        return self.dual().touched(self._solution)
+        return self.dual().touched(self.solution())
 
     @cached_property
     def answer(self) -> Solution:
         """Solution of the primal problem."""
-        return self.dual().recover(self._solution)
+        return self.dual().recover(self.solution())
 
     @property
     def normal(self) -> Vector:
         """Multipliers λ_n (m,) of the contact rows; those of friction follow them."""
         m, k = self.place.size, self.friction.bound.size
-        return self._solution.x[-m - k :][:m]
+        return self.solution().x[-m - k :][:m]
 
 
 class State(NamedTuple):
@@ -138,7 +135,7 @@ class LoadPath:
             self._steps.append(self._posed(len(self._steps) + 1))
         sequence = self._steps[k - 1]
         if iterate > len(sequence):
-            raise InputError(
+            raise PastEndError(
                 f"iterate={iterate}: the fixed point of step {k} has {len(sequence)} "
                 "problems; expected at most that, or 0 for the last"
             )
@@ -194,24 +191,32 @@ class LoadPath:
             free = self._free * (k / self.steps)
             return self.transform(primal, self.inverse, free, first)
 
-        solve = partial(self._solve, load_factor=k / self.steps)
+        def posed(friction: Friction) -> ContactProblem:
+            @cache
+            def solution() -> Solution:
+                return self._solve(bounded(dual().qp, friction), k / self.steps)
+
+            return ContactProblem(primal, friction, rows.place, dual, solution)
+
+        if not coulomb:
+            return [posed(first)]
         found, friction = list[ContactProblem](), first
         residuals: list[float] = []
         while len(found) < MOST_ITERATES:
-            found.append(ContactProblem(primal, friction, rows.place, dual, solve))
-            if not coulomb:
-                return found
+            problem = posed(friction)
             try:
-                normal = found[-1].normal
+                normal = problem.normal
             except ArithmeticError as e:
                 raise InputError(
-                    f"load step {k}: no equilibrium was found with the {len(found)}. "
-                    "bound of Coulomb's law; expected supports or friction that hold "
-                    f"the bodies: {e}"
+                    f"load step {k}: no equilibrium was found with the "
+                    f"{len(found) + 1}. bound of Coulomb's law; expected supports or "
+                    f"friction that hold the bodies: {e}"
                 ) from None
             residuals.append(friction.residual(normal))
             if residuals[-1] <= SETTLED:
-                return found
+                return [*found, problem]
+            unsettled = replace(friction, unsettled=residuals[-1])
+            found.append(replace(problem, friction=unsettled))
             if len(found) - int(np.argmin(residuals)) > PATIENCE:
                 break
             friction = replace(friction, bound=friction.demanded(normal))

@@ -8,7 +8,14 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from harness import Family, InputError
-from problems.ranges import CONTACT_FORMS, MOST, at_least, fits
+from problems.ranges import (
+    CONTACT_FORMS,
+    DECOMPOSITION,
+    MOST,
+    at_least,
+    fits,
+    torn_by,
+)
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
@@ -20,9 +27,11 @@ class Greco(Family):
 
     name: str = "greco"
     defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"n": 32, "mu": 1.0, "iterate": 0}),
+        default_factory=lambda: MappingProxyType({
+            "n": 32, "mu": 1.0, "iterate": 0, **DECOMPOSITION,
+        }),
         hash=False,
-    )
+    )  # fmt: skip
     forms: tuple[str, ...] = CONTACT_FORMS
 
     def check(self, params: Mapping[str, Value]) -> None:
@@ -35,6 +44,7 @@ class Greco(Family):
                 "of 0 or more"
             )
         at_least(0, self.name, params, ("iterate",))
+        torn_by(self.name, params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
+    DECOMPOSITION,
     FRICTION,
     METHODS,
     MOST_STEPS,
@@ -20,6 +21,7 @@ from problems.ranges import (
     positive,
     rough,
     tangential,
+    torn_by,
     without_friction,
 )
 
@@ -35,6 +37,7 @@ class HertzPlane(Family):
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "n": 10, "load": 10.0, "plane": "strain", "halvings": 0,
+            **DECOMPOSITION,
         }),
         hash=False,
     )  # fmt: skip
@@ -48,6 +51,7 @@ class HertzPlane(Family):
         fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         positive(self.name, params, ("load",))
         one_of(self.name, params, PLANES)
+        torn_by(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved; the arcs are other polygons."""
@@ -74,7 +78,7 @@ class HertzCylinder(Family):
             "n": 10, "m": 8, "load": 1.0, "radius": 1.0, "ratio": 1.0,
             "slave": "upper", "contact": "mortar", "basis": "dual", "plane": "strain",
             "halvings": 0, **FRICTION, "Q": 0.0, "peak": 0.0,
-            "programme": "normal-first", "steps": 20,
+            "programme": "normal-first", "steps": 20, **DECOMPOSITION,
         }),
         hash=False,
     )  # fmt: skip
@@ -96,6 +100,7 @@ class HertzCylinder(Family):
         one_of(self.name, params, {
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
+        torn_by(self.name, params)
 
     def _check_tangential(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless the keys of the tangential force fit together."""

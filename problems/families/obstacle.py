@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from harness import Family, InputError
-from problems.ranges import at_least, doubled, fits, one_of
+from problems.ranges import DECOMPOSITION, at_least, doubled, fits, one_of, torn_by
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
@@ -20,10 +20,12 @@ class Obstacle(Family):
 
     name: str = "obstacle"
     defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"dim": 2, "n": 20, "shape": "flat"}),
+        default_factory=lambda: MappingProxyType(
+            {"dim": 2, "n": 20, "shape": "flat", **DECOMPOSITION}
+        ),
         hash=False,
     )
-    forms: tuple[str, ...] = ("primal", "dual-bounds")
+    forms: tuple[str, ...] = ("primal", "dual", "dual-bounds")
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
@@ -31,6 +33,7 @@ class Obstacle(Family):
         if params["shape"] == "hemisphere" and params["dim"] != 2:
             raise InputError(f"{self.name}: shape=hemisphere needs dim=2")
         at_least(2, self.name, params, ("n",))
+        torn_by(self.name, params)
         fits(self.name, int(params["n"]) ** int(params["dim"]))
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:

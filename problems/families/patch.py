@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
+    DECOMPOSITION,
     FRICTION,
     METHODS,
     PLANES,
@@ -18,6 +19,7 @@ from problems.ranges import (
     one_of,
     positive,
     rough,
+    torn_by,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ class ContactPatch(Family):
         default_factory=lambda: MappingProxyType({
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
-            **FRICTION,
+            **FRICTION, **DECOMPOSITION,
         }),
         hash=False,
     )  # fmt: skip
@@ -48,6 +50,7 @@ class ContactPatch(Family):
             "slave": ("lower", "upper"), **METHODS, **PLANES,
         })  # fmt: skip
         rough(self.name, params)
+        torn_by(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved; the odd row of cells is not.

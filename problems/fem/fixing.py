@@ -21,11 +21,11 @@ PARTS = 4  #: per body; fewer condition worse, more fill the factor
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
     """Choose `parts` (a power of two) of the nodes (N, 2) of one body by geometry.
 
-    Recursive bisection across the longest principal axis; of each part, the node
-    nearest to its centroid.
+    Recursive bisection across the longest principal axis, down to single nodes at most;
+    of each part, the node nearest to its centroid.
     """
     groups = [np.arange(len(points))]
-    while len(groups) < parts:
+    while len(groups) < parts and all(group.size > 1 for group in groups):
         groups = [half for group in groups for half in _halves(points, group)]
     chosen = []
     for group in groups:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import QP, Friction, Vector
+from harness import QP, Friction, Value, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.fem.elasticity import rigid_modes, stiffness
@@ -55,6 +56,18 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
         boundary=dofs_of(np.unique(boundary_edges(cells))),
         stiffness=np.repeat(around / np.bincount(cells.ravel()), 2),
     )
+
+
+def posed_on(
+    params: Mapping[str, Value],
+    subdivided: Callable[[], SubdividedBodies],
+    primal: QP,
+    friction: Friction = NO_FRICTION,
+) -> Callable[[], Torn] | None:
+    """Prepare what the keys `feti` and `glue` ask for; None for bodies in one piece."""
+    if not params["feti"]:
+        return None
+    return lambda: torn(subdivided(), primal, friction, str(params["glue"]))
 
 
 def torn(

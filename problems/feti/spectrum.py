@@ -16,7 +16,7 @@ the last row of the tridiagonal matrix says.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +27,8 @@ from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
 from harness import Vector
+from problems.feti.operators import dual_operator, made
+from problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 
@@ -147,6 +149,27 @@ def spectrum(
                 break
         beta.append(length)
     return found
+
+
+def spectra_of_equations(
+    torn: Torn,
+    preconditioners: Sequence[tuple[str, str] | None] = (None,),
+    tol: float = 1e-5,
+) -> list[Spectrum]:
+    """Find the spectra for the rows of supports and gluing, as if no contact was there.
+
+    Parameters
+    ----------
+    torn : its supports hold every body
+    preconditioners : kind and scaling of each, see `problems.feti.operators`, or none
+    tol : as of `spectrum`
+
+    """
+    B_E = torn.B[: torn.equalities]
+    F = made(dual_operator(B_E, torn.domains).arrays)
+    G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
+    inverses = [p and F.preconditioner(*p) for p in preconditioners]
+    return [spectrum(F, G, M, tol) for M in inverses]
 
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:

@@ -11,6 +11,7 @@ each is the best one in the sense of least squares (Kabsch 1976).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,6 +77,23 @@ def blocks(
         along = np.arange(cells) * count // cells
         label = (label[:, None] * count + along).ravel()
     return label
+
+
+def structured_bodies(
+    divisions: Sequence[tuple[int, ...]], most: int
+) -> NDArray[np.int64]:
+    """Label the cells of structured meshes, one after another, each by its `blocks`.
+
+    Parameters
+    ----------
+    divisions : of each body, as of `blocks`
+    most : H/h
+
+    """
+    labels = [np.zeros(0, dtype=np.int64)]
+    for body in divisions:
+        labels.append(blocks(body, most) + labels[-1].max(initial=-1) + 1)
+    return np.concatenate(labels)
 
 
 def decompose(

@@ -25,6 +25,7 @@ from harness import Vector
 from problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
+_STRIP = 256  #: right-hand sides that are solved for at once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,9 +51,12 @@ class Kind:
 
     def compliance(self, b: Nodes) -> Dense:
         """Return (K⁺)_bb."""
-        unit = np.zeros((self.K.shape[0], b.size))
-        unit[b, np.arange(b.size)] = 1
-        return _symmetric(self.inverse(unit)[b])
+        C = np.empty((b.size, b.size))
+        for columns in _strips(b.size):
+            unit = np.zeros((self.K.shape[0], columns.stop - columns.start))
+            unit[b[columns], np.arange(unit.shape[1])] = 1
+            C[:, columns] = self.inverse(unit)[b]
+        return _symmetric(C)
 
     def block(self, b: Nodes) -> csr_array:
         """Return K_bb."""
@@ -60,13 +64,16 @@ class Kind:
 
     def schur(self, b: Nodes) -> Dense:
         """Return S_bb of  S = K_gg − K_gi K_ii⁻¹K_ig  on g: boundary and b."""
-        g = np.union1d(self.boundary, b)
-        S, i = self.block(g).toarray(), np.setdiff1d(np.arange(self.K.shape[0]), g)
+        i = np.setdiff1d(np.arange(self.K.shape[0]), np.union1d(self.boundary, b))
+        S = self.block(b).toarray()
         if i.size:
-            K_ig = self.K[i][:, g]
-            S -= K_ig.T @ cholesky(csc_matrix(self.K[i][:, i]))(K_ig.toarray())
-        kept = np.isin(g, b)
-        return _symmetric(S[kept][:, kept])
+            K_ib, inner = (
+                csc_array(self.K[i][:, b]),
+                cholesky(csc_matrix(self.K[i][:, i])),
+            )
+            for columns in _strips(b.size):
+                S[:, columns] -= K_ib.T @ inner(K_ib[:, columns].toarray())
+        return _symmetric(S)
 
     @cached_property
     def _factor(self) -> Factor:
@@ -155,6 +162,12 @@ class Torn:
     def domains(self) -> Subdomains:
         """The subdomains on their own, with what is factorised once."""
         return Subdomains(self.kinds, self.kind)
+
+
+def _strips(columns: int) -> Iterator[slice]:
+    """Split columns so that few right-hand sides are dense at a time."""
+    for begin in range(0, columns, _STRIP):
+        yield slice(begin, min(begin + _STRIP, columns))
 
 
 def _symmetric(M: Dense) -> Dense:

@@ -28,8 +28,8 @@ from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
 from problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from problems.feti.elastic import SubdividedBodies, subdivide, torn
-from problems.feti.tearing import blocks
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
@@ -51,13 +51,10 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     primal, friction = problem.primal, problem.friction
     sides = bodies.mesh.boundaries
     tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
-    pieces = None
-    if p["feti"]:
-        pieces = partial(
-            torn, _subdivided(*geometry, p["feti"]), primal, friction, p["glue"]
-        )
+    subdivided = partial(_subdivided, p["feti"], *geometry)
     return contact_case(
-        bodies, primal, form, torn=pieces,
+        bodies, primal, form,
+        torn=posed_on(params, subdivided, primal, friction),
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
@@ -86,10 +83,9 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
 
 @lru_cache(maxsize=4)
 def _subdivided(
-    Nr: int, Nh: int, radial: int, plane: Plane, most: int
+    most: int, Nr: int, Nh: int, radial: int, plane: Plane
 ) -> SubdividedBodies:
-    beam, ring = blocks((8 * Nr, Nr), most), blocks((12 * Nh, radial), most)
-    label = np.append(beam, ring + beam.max() + 1)
+    label = structured_bodies([(8 * Nr, Nr), (12 * Nh, radial)], most)
     return subdivide(model(Nr, Nh, radial, plane), label)
 
 

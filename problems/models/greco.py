@@ -35,6 +35,8 @@ from problems.duality.case_forms import contact_case
 from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material
 from problems.fem.mesh import nodal_lengths, rectangle
+from problems.feti.elastic import posed_on, subdivide
+from problems.feti.tearing import blocks
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
@@ -54,6 +56,10 @@ def greco(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
         bodies, primal, form,
         floating=lambda: floating(bodies), clamped=lambda: path.inverse,
         supported=lambda: supported(bodies), friction=friction,
+        torn=posed_on(
+            params, lambda: subdivide(bodies, blocks((p["n"], p["n"]), p["feti"])),
+            primal, friction,
+        ),
         quantities=lambda s: quantities(bodies, primal, s, friction)
         | along_the_side(bodies, primal, s, friction) | {"tresca_problems": count},
     )  # fmt: skip

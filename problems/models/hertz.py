@@ -61,6 +61,8 @@ from problems.duality.dualisation import dualise
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
@@ -86,7 +88,8 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    return _case(bodies, above_plane(mesh, mesh.boundaries["arc"]), form, exact)
+    rows = above_plane(mesh, mesh.boundaries["arc"])
+    return _case(bodies, rows, form, exact, params)
 
 
 def cylinder_on_cylinder(
@@ -100,7 +103,8 @@ def cylinder_on_cylinder(
     if p["friction"] == "none":
         bodies, exact = two_cylinders(params)
         linearise = linearisation(bodies, p["contact"], p["basis"])
-        return _case(bodies, linearise(np.zeros(bodies.mesh.dofs)), form, exact)
+        rows = linearise(np.zeros(bodies.mesh.dofs))
+        return _case(bodies, rows, form, exact, params)
     same_path = {**params, "iterate": 0}
     path, exact = _friction_path(tuple(same_path.items()), reference)
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
@@ -121,6 +125,7 @@ def cylinder_on_cylinder(
         bodies, primal, form,
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal, friction),
     )  # fmt: skip
     return _beside(case, exact, shear) if shear is not None else case
 
@@ -164,6 +169,20 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
                else ContactPair(lower, upper),),
     )  # fmt: skip
     return bodies, exact
+
+
+def subdivided(bodies: Bodies, most: int) -> SubdividedBodies:
+    """Cut the half discs into blocks of rings and sectors.
+
+    most : cells a side; the triangles at a centre are the last ring
+    """
+    sides, cells = bodies.mesh.boundaries, np.bincount(bodies.body)
+    arcs = [sides[name] for name in ("arc", "upper_arc", "lower_arc") if name in sides]
+    divisions = [
+        (arc.size - 1, int(count) // (arc.size - 1))
+        for arc, count in zip(arcs, cells, strict=True)
+    ]
+    return subdivide(bodies, structured_bodies(divisions, most))
 
 
 def kept_on_axis(bodies: Bodies) -> Bodies:
@@ -381,7 +400,11 @@ def _beside(
     return replace(case, fields=fields)
 
 
-def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> Case:
+def _case(
+    bodies: Bodies, rows: ContactRows, form: str, exact: LineContact,
+    params: Mapping[str, Value],
+) -> Case:  # fmt: skip
+    p: Any = params
     primal = primal_qp(bodies, rows)
     case = contact_case(
         bodies, primal, form,
@@ -389,6 +412,7 @@ def _case(bodies: Bodies, rows: ContactRows, form: str, exact: LineContact) -> C
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
+        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal),
     )  # fmt: skip
     return _beside(case, exact)
 

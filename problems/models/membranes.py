@@ -22,19 +22,20 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, csc_array, csr_array, diags_array, eye_array, kron
+from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
 from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from problems.contact.sides import active
 from problems.duality.dualisation import posed
 from problems.duality.torn_dual import torn_dual, torn_matrices
-from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
-from problems.fem.mesh import Mesh, Nodes, boundary_edges, join, prefixed, rectangle
+from problems.fem.laplacian import grid_stiffness
+from problems.fem.mesh import Mesh, Nodes, join, prefixed, rectangle
 from problems.feti.gluing import glue
+from problems.feti.membrane import membrane_kind
 from problems.feti.substructures import local_problems
-from problems.feti.tearing import Part, blocks, decompose
-from problems.feti.torn import Kind, Torn
+from problems.feti.tearing import blocks, decompose
+from problems.feti.torn import Torn
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
@@ -108,7 +109,7 @@ class Membranes:
     def qp(self) -> QP:
         """The primal problem: unknowns are the heights of the nodes."""
         nodes, sides = len(self.mesh.points), self.mesh.boundaries
-        K = stiffness(self.side)
+        K = grid_stiffness((self.side, self.side))
         loads = [
             f * np.outer(shares(self.side, *y), shares(self.side, 0.0, 1.0)).ravel()
             for f, y in LOADED
@@ -141,7 +142,7 @@ class Membranes:
         label = np.concatenate([squares, squares + self.S**2])
         parts = decompose(mesh.points, mesh.cells, label, np.zeros_like(self.body))
         return glue(
-            parts, tuple(map(_kind, parts.parts)), load=-qp.q,
+            parts, tuple(map(membrane_kind, parts.parts)), load=-qp.q,
             supports=csr_array(qp.A), supported=qp.b, contact=csr_array(qp.G), c=qp.h,
             E=np.ones(nodes), rows=rows,
         )  # fmt: skip
@@ -166,29 +167,8 @@ class Membranes:
         }
 
 
-def stiffness(n: int) -> csc_array:
-    """Assemble ∫ ∇N_a·∇N_b of a square of n × n bilinear cells, of any size."""
-    inside = np.ones(n)
-    ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]
-    K = diags_array([-inside, ends, -inside], offsets=[-1, 0, 1])
-    M = diags_array([inside, 2 * ends, inside], offsets=[-1, 0, 1]) / 6
-    return csc_array(kron(K, M) + kron(M, K))
-
-
 def shares(n: int, lower: float, upper: float) -> Vector:
     """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
     begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
     rising = (end**2 - begin**2) / 2
     return np.asarray((np.append(end - begin - rising, 0) + np.append(0, rising)) / n)
-
-
-def _kind(part: Part) -> Kind:
-    """Assemble one square."""
-    nodes = len(part.points)
-    return Kind(
-        K=stiffness(round(nodes**0.5) - 1),
-        R=np.full((nodes, 1), nodes**-0.5),
-        fixing=fixing_nodes(part.points),
-        boundary=np.unique(boundary_edges(part.cells)),
-        stiffness=np.ones(nodes),
-    )

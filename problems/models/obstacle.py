@@ -29,13 +29,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
+from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import (
     QP,
@@ -48,8 +49,15 @@ from harness import (
     no_rows,
 )
 from problems.contact.sides import ACTIVE
-from problems.duality.dualisation import Transformed, dual_bounds
-from problems.fem.inverse import GeneralisedInverse, regular_inverse
+from problems.duality.dualisation import Transformed, dual_bounds, dualise
+from problems.duality.torn_dual import torn_dual
+from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_inverse
+from problems.fem.laplacian import grid_stiffness
+from problems.feti.gluing import glue
+from problems.feti.membrane import membrane_kind
+from problems.feti.substructures import local_problems
+from problems.feti.tearing import blocks, decompose
+from problems.feti.torn import Torn
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
@@ -62,9 +70,14 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     p: Any = params
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start = problem.qp, perf_counter()
+    rows, start, tear = problem.qp, perf_counter(), None
     if form == "primal":
         new = with_bounds(rows)
+    elif p["feti"]:
+        pieces = problem.torn(p["feti"], p["glue"])
+        new, tear = torn_dual(pieces, rows), partial(local_problems, pieces, 1)
+    elif form == "dual":
+        new = dualise(rows, problem.floating())
     else:
         new = dual_bounds(rows, problem.factorise())
     seconds = None if form == "primal" else perf_counter() - start
@@ -79,6 +92,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         mechanics=Mechanics(
             primal=rows, back=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
+            tear=tear,
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,
@@ -107,6 +121,27 @@ class Problem:
         """Factorise K without the prescribed components."""
         return regular_inverse(self.qp.P, self.qp.G.indices)
 
+    def floating(self) -> GeneralisedInverse:
+        """Factorise K with its kernel, the constants."""
+        N = self.qp.q.size
+        return supported_inverse(self.qp.P, np.arange(N), np.full((N, 1), N**-0.5))
+
+    def torn(self, most: int, rows: str) -> Torn:
+        """Tear the grid into blocks of at most `most` cells a side.
+
+        rows : what glues them, see `problems.feti.gluing`
+        """
+        qp, (N, dim) = self.qp, self.x.shape
+        n = round(self.cells ** (1 / dim))
+        label, h = blocks((n,) * dim, most), 2 * HALF[self.shape] / n
+        of_cell = np.zeros(self.cells, dtype=np.int64)
+        parts = decompose(self.x, cells(dim, n), label, of_cell)
+        return glue(
+            parts, tuple(membrane_kind(part, h) for part in parts.parts), load=-qp.q,
+            supports=csr_array(qp.A), supported=qp.b, contact=csr_array(qp.G), c=qp.h,
+            E=np.ones(N), rows=rows,
+        )  # fmt: skip
+
     def energy(self, v: Vector) -> float:
         """Return ∫ ½|∇u|² + q u, per tension."""
         w, qp = self.lift, self.qp
@@ -118,12 +153,9 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     """Assemble the problem on a uniform grid of n cells per side."""
     h = 2 * HALF[shape] / n
     ends = np.array([1.0] + [2.0] * (n - 1) + [1.0])
-    side = np.ones(n)
-    K = csc_array(diags_array([-side, ends, -side], offsets=[-1, 0, 1]) / h)
+    K = grid_stiffness((n,) * dim, h)
     share: Vector = h / 2 * ends  # ∫N
     if dim == 2:
-        M = diags_array([side, 2 * ends, side], offsets=[-1, 0, 1]) * (h / 6)
-        K = csc_array(kron(K, M) + kron(M, K))
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2

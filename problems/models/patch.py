@@ -38,6 +38,8 @@ from problems.duality.stepping import single_load
 from problems.fem.elasticity import Material
 from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 from problems.fem.stress import gauss_stress
+from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.tearing import structured_bodies
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 PRESSURE = 1e6  #: p, Pa
@@ -57,12 +59,20 @@ def two_blocks(form: str, params: Mapping[str, Value], reference: Reference) -> 
     )  # fmt: skip
     return contact_case(
         bodies, primal, form,
+        torn=posed_on(params, lambda: subdivided(bodies, params), primal, friction),
         floating=factorised, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s, friction)
         | {"stress_error": stress_error(bodies, s)},
         friction=friction,
     )  # fmt: skip
+
+
+def subdivided(bodies: Bodies, params: Mapping[str, Value]) -> SubdividedBodies:
+    """Cut the blocks into subdomains of at most `feti` cells a side."""
+    p: Any = params
+    divisions = [_divisions(p[name]) for name in ("lower", "upper")]
+    return subdivide(bodies, structured_bodies(divisions, p["feti"]))
 
 
 def model(params: Mapping[str, Value]) -> Bodies:
@@ -88,8 +98,12 @@ def model(params: Mapping[str, Value]) -> Bodies:
     )  # fmt: skip
 
 
+def _divisions(n: int) -> tuple[int, int]:
+    return n, -(-n // 2)
+
+
 def _block(bottom: float, n: int) -> Mesh:
-    return rectangle((0.0, bottom), (LENGTH, HEIGHT), (n, -(-n // 2)))
+    return rectangle((0.0, bottom), (LENGTH, HEIGHT), _divisions(n))
 
 
 def stress_error(bodies: Bodies, s: Solution) -> float:

@@ -22,25 +22,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array, vstack
+from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
 from harness.mechanics import Substructures
 from problems.duality.dualisation import Transformed, posed
-from problems.duality.torn_dual import torn_dual
+from problems.duality.torn_dual import torn_dual, torn_matrices
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
-from problems.feti.spectrum import Spectrum, dependencies, spectrum
+from problems.feti.spectrum import Spectrum, spectra_of_equations
 from problems.feti.substructures import local_problems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
 NU = 0.3
 #: preconditioner and scaling, by the names under which their spectra are reported
-PRECONDITIONERS = {
+PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
+    "none": None,
     "lumped": ("lumped", "multiplicity"),
     "dirichlet": ("dirichlet", "multiplicity"),
     "dirichlet_stiffness": ("dirichlet", "stiffness"),
@@ -70,6 +71,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         ),
         scale=new.sign,
         constant=new.constant,
+        matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal, back=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells))),
@@ -117,13 +119,8 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        F = self.dual.qp.P
-        G = vstack([self.dual.qp.A, dependencies(self.torn.B)], format="csr")
-        found = {"none": spectrum(F.matvec, G)}
-        for name, (kind, scaling) in PRECONDITIONERS.items():
-            M = F.build().preconditioner(kind, scaling)
-            found[name] = spectrum(F.matvec, G, M)
-        return found
+        found = spectra_of_equations(self.torn, list(PRECONDITIONERS.values()))
+        return dict(zip(PRECONDITIONERS, found, strict=True))
 
     @property
     def held(self) -> NDArray[np.int64]:

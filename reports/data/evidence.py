@@ -68,8 +68,7 @@ class Outcome:
     @property
     def allowed(self) -> float:
         """The largest residual that verification allows, as `harness.verify.kkt`."""
-        at = self.first.tol if self.first.accuracy is None else self.first.accuracy
-        return allowed(at, self.factor)
+        return allowed(self.first.judged_at, self.factor)
 
     @property
     def solver(self) -> str:

@@ -22,7 +22,7 @@ from solvers.common.conversion import (
     to_two_sided,
     two_sided,
 )
-from solvers.common.sequence import Session, in_sequence
+from solvers.common.sequence import Session, tightening
 
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
@@ -77,7 +77,11 @@ class OSQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        prepare = self.tightening()
+        return lambda qp: prepare(qp, tol)
+
+    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
+        return tightening(self._begin)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import osqp
@@ -116,4 +120,7 @@ class OSQP:
         def start(s: Solution) -> None:
             solver.warm_start(x=s.x, y=to_two_sided(qp, s) * scale)
 
-        return Session(solve, update, start)
+        def tighten(tol: float) -> None:
+            solver.update_settings(eps_rel=tol)
+
+        return Session(solve, update, start, tighten)

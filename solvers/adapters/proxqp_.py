@@ -26,7 +26,7 @@ from solvers.common.conversion import (
     positive,
     two_sided,
 )
-from solvers.common.sequence import Session, in_sequence
+from solvers.common.sequence import Session, tightening
 
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
@@ -89,7 +89,11 @@ class ProxQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        prepare = self.tightening()
+        return lambda qp: prepare(qp, tol)
+
+    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
+        return tightening(self._begin)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
@@ -98,13 +102,17 @@ class ProxQP:
         form = _Dense(qp) if backend == "dense" else _Sparse(qp)
         solver = form.made(proxqp)
         settings = solver.settings
-        settings.eps_abs, settings.eps_rel = NEGLIGIBLE, tol
+        settings.eps_abs = settings.eps_duality_gap_abs = NEGLIGIBLE
         settings.check_duality_gap = settings.compute_timings = True
-        settings.eps_duality_gap_abs, settings.eps_duality_gap_rel = NEGLIGIBLE, tol
         settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
         settings.initial_guess = proxqp.NO_INITIAL_GUESS
         settings.max_iter = self.max_iter
         warm: list[Solution] = []
+
+        def tighten(tol: float) -> None:
+            settings.eps_rel = settings.eps_duality_gap_rel = tol
+
+        tighten(tol)
 
         def solve() -> Solution:
             if warm:
@@ -134,7 +142,7 @@ class ProxQP:
 
         # the dense backend takes no multipliers of bounds to start from
         no_start = isinstance(form, _Dense) and form.boxed
-        return Session(solve, update, None if no_start else warm.append)
+        return Session(solve, update, None if no_start else warm.append, tighten)
 
 
 class _Dense:

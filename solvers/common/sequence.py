@@ -18,30 +18,42 @@ class Session(NamedTuple):
     update: Callable[[QP], None]
     #: start the next solve from the point of an earlier QP of the same shape
     start: Callable[[Solution], None] | None = None
+    #: solve to another tolerance from now on
+    tighten: Callable[[float], None] | None = None
 
 
 def in_sequence(
     begin: Callable[[QP], Session],
 ) -> Callable[[QP], Callable[[], Solution]]:
-    """Make the `prepare` of a chain: update where only vectors changed, else rebuild.
+    """Make the `prepare` of a chain, whose one tolerance `begin` knows."""
+    prepare = tightening(lambda qp, tol: begin(qp))
+    return lambda qp: prepare(qp, 0.0)
+
+
+def tightening(
+    begin: Callable[[QP, float], Session],
+) -> Callable[[QP, float], Callable[[], Solution]]:
+    """Make the `prepare` of a sequence: update where only vectors changed, or rebuild.
 
     After a rebuild the last point is where the new session starts, if it has one of
     the right shape. (A session that was updated starts where it ended, if its library
-    can.)
+    can.) A session that takes no other tolerance is rebuilt for it.
     """
     held: Session | None = None
     last: tuple[QP, Solution] | None = None
-    of: QP | None = None
+    of: tuple[QP, float] | None = None
 
-    def prepare(qp: QP) -> Callable[[], Solution]:
+    def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
         nonlocal held, of
-        if held is not None and of is not None and only_vectors_differ(of, qp):
+        if held is not None and of is not None and _goes_on(held, *of, qp, tol):
             held.update(qp)
+            if held.tighten is not None:
+                held.tighten(tol)
         else:
-            held = begin(qp)
+            held = begin(qp, tol)
             if last is not None and held.start is not None and _fits(*last, qp):
                 held.start(last[1])
-        of = qp
+        of = qp, tol
         session = held
 
         def solve() -> Solution:
@@ -53,6 +65,11 @@ def in_sequence(
         return solve
 
     return prepare
+
+
+def _goes_on(held: Session, of: QP, at: float, qp: QP, tol: float) -> bool:
+    """Whether a session that holds `of` to the tolerance `at` can take the next QP."""
+    return (at == tol or held.tighten is not None) and only_vectors_differ(of, qp)
 
 
 def only_vectors_differ(one: QP, other: QP) -> bool:

@@ -59,10 +59,14 @@ class SMALBE(Options):
         return lambda: solve()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
+        prepare = self.tightening()
+        return lambda qp: prepare(qp, tol)
+
+    def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Begin a sequence, warm: with points, multipliers, Ritz pairs and factors."""
         carry: Carry | None = None
 
-        def prepare(qp: QP) -> Callable[[], Solution]:
+        def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
             eliminate = self.eliminate != "never"
             solve = prepared(qp, tol, self, carry, eliminate=eliminate)
 

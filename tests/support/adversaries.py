@@ -19,6 +19,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from harness.errors import PastEndError
 from harness.processes import case_worker as generator
 from harness.processes.worker import serve
 
@@ -37,6 +38,8 @@ class Tiny:
             raise ZeroDivisionError("no stiffness")
         if params["fault"] == "input":
             raise InputError("tiny: fault=input is out of range")
+        if params["fault"] == "end":
+            raise PastEndError("tiny: there is no further problem")
         if params["fault"] == "memory":
             raise MemoryError("Unable to allocate 1 PiB")
         if params["fault"] == "exit":
@@ -62,7 +65,10 @@ class Tiny:
             G=csr_array([[1.0, 0.0]]), h=np.array([params["h"]]),
             lb=np.zeros(2), ub=np.full(2, np.inf),
         )  # fmt: skip
-        return Case(qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields)
+        return Case(
+            qp=qp, recover=lambda s: s.x, quantities=quantities, fields=fields,
+            unsettled=1e-3 * params["h"],
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -276,6 +282,19 @@ class Chains(Honest):
             return lambda: replace(at_the_row(qp), iterations=len(seen))
 
         return prepare
+
+
+class Tightens(Chains):
+    """Tells the tolerance of each QP of a sequence, too."""
+
+    def tightening(self):
+        prepare = self.chain(0.0)
+
+        def at(qp, tol):
+            solve = prepare(qp)
+            return lambda: replace(solve(), reported={"tol": tol})
+
+        return at
 
 
 class BreaksItsChain(Honest):

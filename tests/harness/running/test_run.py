@@ -259,6 +259,48 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
     assert all(len(o.records) == 1 for o in evidence.flat)
 
 
+def test_the_steps_of_a_sequence_that_tightens_are_solved_to_what_they_are_worth(
+    measure, tmp_path
+):
+    """max(tol, θ·unsettled), at most 1e-2: here unsettled is 1e-3·h."""
+    names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (500, 1.0, 1e-3)]
+    solvers = ("tightens", "chains", "honest")
+    asked = suite(
+        *solvers, cases=(), sequences=(tuple(names),), tighten=(0.0, 0.1)
+    )  # fmt: skip
+    watched = measure(asked)
+    records = read_journal(tmp_path)
+
+    assert watched.total == len(records) == 18
+    for mode, tols in (
+        ("sequence", [None] * 3), ("sequence, tighten=0.1", [1e-2, 1e-4, None])
+    ):  # fmt: skip
+        for solver in solvers:
+            steps = [r for r in records if (r.solver, r.mode) == (solver, mode)]
+            assert [r.step_tol for r in steps] == pytest.approx(tols)
+    verdicts = {(r.solver, r.mode): r.verdict for r in records}
+    assert verdicts.pop(("chains", "sequence, tighten=0.1")) is Verdict.DECLINED
+    assert set(verdicts.values()) == {Verdict.VERIFIED}
+    told = [r.reported["tol"] for r in records if r.reported]
+    assert told == pytest.approx([1e-2, 1e-4, 1e-6])
+    assert {r.asked_tol for r in records if r.accuracy is None} == {1e-2, 1e-4, 1e-6}
+
+
+def test_a_sequence_that_asks_for_more_than_there_is_ends_there(measure, tmp_path):
+    cases = ({"h": 0.5}, {"h": 1.0}, {"fault": "end"}, {"fault": "end", "h": 0.5})
+    names = tuple(assemble(FAMILIES["tiny"], case, "plain") for case in cases)
+    asked = suite("chains", "honest", cases=(), sequences=(names,))
+    measure(asked)
+    records = read_journal(tmp_path)
+
+    for solver in ("chains", "honest"):
+        steps = [r for r in records if r.solver == solver]
+        assert [str(r.verdict) for r in steps] == 2 * ["verified"] + 2 * ["declined"]
+        assert "there is no further problem" in steps[2].message
+    measure(asked)
+    assert len(read_journal(tmp_path)) == 8  # nothing is left to be measured
+
+
 def test_a_sequence_that_breaks_says_where(measure, tmp_path):
     measure(three_steps("breaksitschain"))
 

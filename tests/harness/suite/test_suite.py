@@ -539,6 +539,29 @@ def test_a_schedule_that_makes_no_sense_is_refused(tmp_path, line, message):
         load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
 
 
+SEQUENCE = "sequence = 'n'\nparams = { n = [4, 8] }"
+
+
+@pytest.mark.parametrize(
+    ("line", "block", "message"),
+    [
+        ("tighten = 0.1", SEQUENCE, "tighten = 0.1; expected a list"),
+        ("tighten = [1]", SEQUENCE, r"tighten = \[1\]; expected distinct numbers"),
+        ("tighten = [0.1, 0.1]", SEQUENCE, "expected distinct numbers"),
+        ("tighten = [0.1]", "", "no problems are a sequence; expected sequence"),
+        ("tighten = [0.1]\naccuracy = 1e-6", SEQUENCE, "only one of the two"),
+    ],
+)
+def test_tightening_that_cannot_be_is_refused(tmp_path, line, block, message):
+    file = tmp_path / "s.toml"
+    file.write_text(
+        f"name = 's'\nsolvers = ['smalbe']\n{line}\n"
+        f"[[problems]]\nfamily = 'obstacle'\n{block}\n"
+    )
+    with pytest.raises(InputError, match=message):
+        load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
+
+
 @pytest.mark.parametrize("key", ["'dim'", "'m'", "3"])
 def test_a_sequence_along_no_list_is_refused(tmp_path, key):
     file = tmp_path / "s.toml"

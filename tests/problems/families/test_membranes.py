@@ -10,7 +10,8 @@ from scipy.sparse import issparse
 from harness import InputError, kkt_residuals
 from harness.files.matfile import read_mat, save_mat
 from problems import PROBLEMS
-from problems.models.membranes import Membranes, shares, stiffness
+from problems.fem.laplacian import grid_stiffness
+from problems.models.membranes import Membranes, shares
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
@@ -52,7 +53,9 @@ def test_the_stiffness_is_exact_for_what_the_elements_hold():
     y = np.repeat(np.linspace(0, 1, n + 1), n + 1)
     U = np.stack([x**0, x, y, x * y], axis=1)
 
-    assert np.diag(U.T @ (stiffness(n) @ U)) == pytest.approx([0, 1, 1, 2 / 3])
+    assert np.diag(U.T @ (grid_stiffness((n, n)) @ U)) == pytest.approx(
+        [0, 1, 1, 2 / 3]
+    )
 
 
 @pytest.mark.parametrize("n", [3, 4, 8])

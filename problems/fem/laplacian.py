@@ -1,0 +1,36 @@
+"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes on uniform grids, unit tension."""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array, kron
+
+
+def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
+    """Assemble it for linear (one direction) or bilinear elements (two).
+
+    Nodes are numbered along the last direction first.
+
+    Parameters
+    ----------
+    cells : along each direction, one or two
+    h : length of a cell, the same in all directions; in two it does not matter
+
+    """
+    K, M = zip(*(_along(n, h) for n in cells), strict=True)
+    terms = (
+        reduce(kron, [K[i] if i == j else M[i] for i in range(len(cells))])
+        for j in range(len(cells))
+    )
+    return csc_array(sum(terms))
+
+
+def _along(n: int, h: float) -> tuple[csc_array, csc_array]:
+    """Return ∫N_a′N_b′ and ∫N_aN_b of n cells in a row."""
+    inside = np.ones(n)
+    ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]
+    K = diags_array([-inside, ends, -inside], offsets=[-1, 0, 1]) / h
+    M = diags_array([inside, 2 * ends, inside], offsets=[-1, 0, 1]) * (h / 6)
+    return csc_array(K), csc_array(M)
