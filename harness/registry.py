@@ -16,10 +16,11 @@ import ast
 import builtins
 import importlib
 import importlib.util
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -30,7 +31,6 @@ from importlib.machinery import (
     PathFinder,
     SourceFileLoader,
 )
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -251,6 +251,10 @@ def entry_point_plugins() -> Plugin:
 
     """
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
+    if not _some_package_offers():
+        return Plugin(origin="entry points")
+    from importlib.metadata import entry_points  # slow to load, and seldom needed
+
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
             try:
@@ -259,6 +263,23 @@ def entry_point_plugins() -> Plugin:
             except Exception as e:  # somebody else's code
                 raise _import_error(f"entry point {point.value}", e) from None
     return _checked("entry points", found["solvers"], found["problems"])
+
+
+def _some_package_offers() -> bool:
+    """Whether an installed package declares entry points for us.
+
+    Looks into the folders of `sys.path`; of an archive there nothing is known.
+    """
+    for place in sys.path:
+        if os.path.isfile(place):
+            return True
+        with suppress(OSError), os.scandir(place or ".") as folders:
+            for folder in folders:
+                if folder.name.endswith((".dist-info", ".egg-info", "EGG-INFO")):
+                    file = Path(folder.path, "entry_points.txt")
+                    if file.is_file() and b"[mortarbench." in file.read_bytes():
+                        return True
+    return False
 
 
 def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[str, T]:

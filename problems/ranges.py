@@ -26,9 +26,24 @@ LAW: Mapping[str, Value] = {
     "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static"
 }  # fmt: skip
 FRICTION: Mapping[str, Value] = {**LAW, "iterate": 0}
+#: the keys of large deformation with their defaults; newton: 0 is the last iteration
+KINEMATICS: Mapping[str, Value] = {
+    "kinematics": "linear", "material": "neo-hooke", "newton": 0
+}  # fmt: skip
+#: whether second derivatives of the gaps join the tangent
+CONTACT_STIFFNESS: Mapping[str, Value] = {"contact_stiffness": "none"}
+FINITE = {
+    "kinematics": ("linear", "finite"), "material": ("neo-hooke", "svk"),
+    "contact_stiffness": ("none", "geometric"),
+}  # fmt: skip
+#: what is not built at finite strain, where a family has the key
+LINEAR_ONLY: Mapping[str, Value] = {
+    "feti": 0, "parts": 0, "friction": "none", "plane": "strain", "relin": 1
+}  # fmt: skip
 #: what the name of a case of bodies may set, with the value where its file says nothing
 SETTINGS: Mapping[str, Value] = {
-    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1, **LAW
+    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1,
+    **LAW, "kinematics": "linear", "material": "neo-hooke", **CONTACT_STIFFNESS,
 }  # fmt: skip
 #: the laws of friction, each with the key that it needs
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
@@ -37,6 +52,7 @@ NEEDED = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
 }
+SHORTEST = 0.1  #: stretch that a body is pressed to
 LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
 MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
 COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
@@ -142,6 +158,32 @@ def torn_by(family: str, params: Mapping[str, Value]) -> None:
         raise InputError(
             f"{family}: glue={params['glue']} is not used by feti=0, one piece per "
             "body; expected no glue, or feti, the most cells along a subdomain's side"
+        )
+
+
+def deformed(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError unless the keys of large deformation fit together."""
+    own = {**KINEMATICS, **CONTACT_STIFFNESS}
+    one_of(family, params, {k: v for k, v in FINITE.items() if k in params})
+    at_least(0, family, params, ("newton",))
+    if params["kinematics"] == "linear":
+        for key, default in own.items():
+            if params.get(key, default) != default:
+                raise InputError(
+                    f"{family}: {key}={params[key]} is not used by kinematics=linear; "
+                    f"expected no {key}, or kinematics=finite"
+                )
+        return
+    for key, built in LINEAR_ONLY.items():
+        if params.get(key, built) != built:
+            raise InputError(
+                f"{family}: {key}={params[key]} with kinematics=finite is not built; "
+                f"expected {key}={built}, or kinematics=linear"
+            )
+    if params.get("contact_stiffness") == "geometric" and params["contact"] != "nts":
+        raise InputError(
+            f"{family}: contact_stiffness=geometric with contact={params['contact']} "
+            "is not built; expected contact=nts"
         )
 
 

@@ -19,6 +19,7 @@ FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
     # the digits of a stiffness, and the order of its factor, are the same everywhere
     "problems.fem.kernels": ["-ffp-contract=off"],
+    "problems.fem.tangents": ["-ffp-contract=off"],
     "problems.fem.ordering": ["-ffp-contract=off"],
     "problems.fem.elimination": ["-ffp-contract=off"],
     # sums may be vectorised, which needs another order; inf and NaN are kept

@@ -25,7 +25,7 @@ def planned(
     """All cold cases in the order written, and all sequences of cases.
 
     A case that two blocks share is kept once. A sequence are the cases that differ in
-    its key only, in the order of that key.
+    its key only, and in those zipped with it, in the order of their values.
 
     folder : of the suite; a path that leads nowhere from here is sought there
     most : cases that the blocks may span in all
@@ -33,13 +33,13 @@ def planned(
     cold: dict[str, CaseId] = {}
     sequences: dict[str, tuple[CaseId, ...]] = {}
     for block in _blocks(blocks, families, folder, most):
-        if block.along is None:
+        if not block.along:
             for case in block.cases:
                 cold.setdefault(case.name, case)
             continue
         steps: dict[str, list[CaseId]] = {}
         for case in block.cases:
-            rest = {k: v for k, v in case.params.items() if k != block.along}
+            rest = {k: v for k, v in case.params.items() if k not in block.along}
             steps.setdefault(f"{case.form} {rest}", []).append(case)
         sequences |= {repr(cases): tuple(cases) for cases in steps.values()}
     return tuple(cold.values()), tuple(sequences.values())
@@ -48,7 +48,7 @@ def planned(
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Block:
     cases: list[CaseId]
-    along: str | None  #: the key of a sequence
+    along: tuple[str, ...]  #: the keys of a sequence; none where cases are cold
 
 
 def _blocks(
@@ -70,11 +70,12 @@ def _blocks(
             for key in params:
                 if key not in family.defaults:
                     raise unknown("key", key, family.defaults, where=name)
-            along = _along(table.get("sequence"), params)
+            over = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
             if family.path_suffix is not None and "path" in params:
                 params = {**params, "path": _expanded(params["path"], folder)}
             axes = _axes(params, table.get("zip", []))
+            along = next((tuple(axis[0]) for axis in axes if over in axis[0]), ())
             spanned += prod(map(len, axes)) * len(forms)
             if spanned > most:
                 raise InputError(

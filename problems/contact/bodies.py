@@ -26,7 +26,7 @@ from problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from problems.fem.mesh import Mesh, Nodes, dofs_of
+from problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
 
 
 class ContactPair(NamedTuple):
@@ -76,9 +76,8 @@ class Bodies:
     @property
     def interface(self) -> Nodes:
         """Displacement components that contact rows can touch, ascending."""
-        return np.unique(
-            dofs_of(np.concatenate([np.concatenate(p) for p in self.pairs]))
-        )
+        sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
+        return np.unique(dofs_of(np.concatenate(sides)))
 
     @property
     def rigid(self) -> NDArray[np.float64]:
@@ -89,8 +88,12 @@ class Bodies:
 
     @property
     def mesh_size(self) -> float:
-        """Mean distance of neighbours on the slave sides, in lengths `length`."""
-        sides = [self.mesh.points[pair.slave] for pair in self.pairs]
+        """Mean distance of neighbours on the slave sides, in lengths `length`.
+
+        Where there are none, on all sides.
+        """
+        chains = [pair.slave for pair in self.pairs] or boundary_edges(self.mesh.cells)
+        sides = [self.mesh.points[chain] for chain in chains]
         steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
         return float(np.concatenate(steps).mean() / self.length)
 

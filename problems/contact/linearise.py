@@ -7,13 +7,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from harness import InputError, Vector
 from problems.contact.bodies import Bodies
 from problems.contact.friction import FrictionLaw
 from problems.contact.mortar import mortar
-from problems.contact.node_to_segment import ContactRows, node_to_segment
+from problems.contact.node_to_segment import (
+    ContactRows,
+    geometric_stiffness,
+    node_to_segment,
+)
+from problems.fem.mesh import Nodes
 
 
 def linearisation(
@@ -55,3 +61,24 @@ def linearisation(
         )
 
     return linearise
+
+
+def contact_stiffness(
+    bodies: Bodies,
+) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
+    """Return the map from u (n,) in m and λ (m,) in N/m to the blocks −λ_i g_i''(u).
+
+    The rows are those of node-to-segment contact, one for every slave node, see
+    `problems.contact.node_to_segment.geometric_stiffness`.
+    """
+    ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]
+
+    def blocks(u: Vector, multipliers: Vector) -> tuple[NDArray[np.float64], Nodes]:
+        found = [
+            geometric_stiffness(bodies.mesh.points, u, *pair, own)
+            for pair, own in zip(bodies.pairs, np.split(multipliers, ends), strict=True)
+        ]
+        values, components = zip(*found, strict=True)
+        return np.concatenate(values), np.concatenate(components)
+
+    return blocks

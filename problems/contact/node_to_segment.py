@@ -44,7 +44,7 @@ from problems.contact.polyline import (
     unit,
 )
 from problems.contact.segment_search import Reach, nearest
-from problems.fem.mesh import Nodes, nodal_lengths
+from problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 
@@ -118,6 +118,57 @@ def node_to_segment(
     return ContactRows(
         B, gap[kept] + B @ u, T, np.arange(held.size), nodal_lengths(x)[kept], kept
     )
+
+
+def geometric_stiffness(
+    points: Points, u: Vector, slave: Nodes, master: Nodes, multipliers: Vector
+) -> tuple[NDArray[np.float64], Nodes]:
+    """Differentiate the forces Bᵀλ of the slave nodes, λ held: −λ g''(u), per node.
+
+    With the edge e = x_2 − x_1 of the segment and d = x_s − x_1 the gap is the area
+    a = d_x e_y − d_y e_x over the length L = |e|, and
+
+        g'' = a''/L − (a' L'ᵀ + L' a'ᵀ)/L² − a L''/L² + 2a L' L'ᵀ/L³.
+
+    Where the closest point is a vertex of the master, whose averaged normal has no
+    derivative of its own here, it is taken to be zero.
+
+    Parameters
+    ----------
+    points, u, slave, master : as of `node_to_segment`, with the normals of segments
+    multipliers : (s,) λ, N/m
+
+    Returns
+    -------
+    blocks (s, 6, 6), Pa, and the displacement components (s, 6) that they are of: those
+    of the slave node and of both ends of its segment
+
+    """
+    x = current_positions(points, u, slave, "slave")
+    line = current_polyline(points, u, master, "master")
+    at = closest_points(x, line)
+    x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
+    d, e = x - x_1, x_2 - x_1
+    L = np.linalg.norm(e, axis=1)
+    t, area = e / L[:, None], d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0]
+    one, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])  # a = dᵀ turn e
+    in_d, in_e = np.hstack([one, -one, 0 * one]), np.hstack([0 * one, -one, one])
+    area_1 = (e @ turn.T) @ in_d + (d @ turn) @ in_e  # (s, 6)
+    area_2 = in_d.T @ turn @ in_e
+    length_1 = t @ in_e
+    across = (one - t[:, :, None] * t[:, None, :]) / L[:, None, None]
+    length_2 = in_e.T @ across @ in_e
+
+    def outer(a: Points, b: Points) -> NDArray[np.float64]:
+        return a[:, :, None] * b[:, None, :]
+
+    mixed, (L, area) = outer(area_1, length_1), (v[:, None, None] for v in (L, area))
+    gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
+    gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
+    inside = (at.xi > 0) & (at.xi < 1)
+    blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
+    nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
+    return blocks, dofs_of(nodes.ravel()).reshape(-1, 6)
 
 
 def closest_points(

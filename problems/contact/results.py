@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,12 @@ from problems.fem.stress import centre_stress, recover, von_mises
 
 
 def quantities(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
-) -> dict[str, Any]:
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    stresses: Mapping[str, Vector] | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Report counts, energy, contact forces and stresses.
+
+    stresses : at the nodes (N,), where they are not those of linear elasticity
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
     its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
@@ -26,12 +30,9 @@ def quantities(
     `pair_results`. With friction those of `frictional`, too.
     """
     l, F = bodies.length, bodies.force
-    slave, master = bodies.pairs[0]
-    side = master if master.size else slave
-    held = bodies.body_of_node == bodies.body_of_node[side[0]]
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
-    stress = nodal_stresses(bodies, s.x * l)["von_mises"]
+    stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
     return {
         "nodes": len(bodies.mesh.points),
         "elements": len(bodies.mesh.cells),
@@ -40,7 +41,7 @@ def quantities(
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
         "energy": primal.objective(s.x) * F * l,
-        "contact_force": forces[held].sum(axis=0).tolist(),
+        "contact_force": forces[_loaded(bodies)].sum(axis=0).tolist(),
         "multiplier_sum": float(normal.sum() * F),
         "max_von_mises": {
             name: float(stress[bodies.body_of_node == b].max())
@@ -48,6 +49,15 @@ def quantities(
         },
         "contacts": pair_results(bodies, primal, s, friction),
     } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
+
+
+def _loaded(bodies: Bodies) -> NDArray[np.bool_]:
+    """Mark the nodes (N,) of the body that `contact_force` acts on; none if nothing."""
+    owner = bodies.body_of_node
+    if not bodies.pairs:
+        return np.zeros(owner.size, dtype=bool)
+    slave, master = bodies.pairs[0]
+    return np.asarray(owner == owner[(master if master.size else slave)[0]])
 
 
 def frictional(
@@ -101,17 +111,19 @@ def pair_results(
 
 
 def fields(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
-) -> Fields:
-    """Collect the deformed state for pictures."""
+    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    stresses: Mapping[str, Vector] | None = None,
+) -> Fields:  # fmt: skip
+    """Collect the deformed state for pictures; stresses as of `quantities`."""
     u = s.x * bodies.length
-    slaves = np.concatenate([pair.slave for pair in bodies.pairs])
+    sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
+    slaves = np.concatenate(sides)
     return Fields(
         points=bodies.mesh.points,
         cells=bodies.mesh.cells,
         bodies=bodies.body,
         displacement=as_vectors(u),
-        nodal=nodal_stresses(bodies, u),
+        nodal=stresses or nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
         contacts=contact_sides(bodies, primal, s, friction),

@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 from harness import Family, InputError
 from problems.ranges import (
     CONTACT_FORMS,
+    CONTACT_STIFFNESS,
     DECOMPOSITION,
     FRICTION,
+    KINEMATICS,
     METHODS,
     MOST_STEPS,
     PLANES,
     at_least,
     at_most,
+    deformed,
     doubled,
     fits,
     one_of,
@@ -41,6 +44,7 @@ class BeamRing(Family):
             "Nr": 10, "Nh": 5, "radial": 0, "steps": 10, "step": 0,
             "contact": "nts", "basis": "dual", "relin": 1, "plane": "strain",
             **FRICTION, **DECOMPOSITION,
+            **KINEMATICS, **CONTACT_STIFFNESS,
         }),
         hash=False,
     )  # fmt: skip
@@ -74,12 +78,16 @@ class BeamRing(Family):
         one_of(self.name, p, METHODS | PLANES)
         rough(self.name, p)
         torn_by(self.name, p)
+        deformed(self.name, p)
 
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; its load steps are linearised anew.
 
-        The arcs of the ring are other polygons.
+        The arcs of the ring are other polygons. At finite strain there is none: the
+        QP of another mesh is linearised at another state.
         """
+        if params["kinematics"] == "finite":
+            return None
         without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 

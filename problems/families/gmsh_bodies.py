@@ -20,6 +20,7 @@ from problems.ranges import (
     SETTINGS,
     at_least,
     at_most,
+    deformed,
     one_of,
     rough,
 )
@@ -40,7 +41,7 @@ class GmshBodies(Family):
     path_suffix: str = ".toml"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType(
-            {"path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0}
+            {"path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0}
         ),
         hash=False,
     )
@@ -81,6 +82,7 @@ class GmshBodies(Family):
         table = read_description(path)
         own = any(key in entry for entry in table["contacts"] for key in LAW)
         rough(self.name, p, elsewhere=own)
+        deformed(self.name, p)
         with located(str(path)):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]

@@ -11,11 +11,13 @@ from harness import Family, InputError
 from problems.ranges import (
     DECOMPOSITION,
     FRICTION,
+    KINEMATICS,
     METHODS,
     MOST_STEPS,
     PLANES,
     at_least,
     at_most,
+    deformed,
     fits,
     one_of,
     positive,
@@ -37,7 +39,7 @@ class HertzPlane(Family):
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "n": 10, "load": 10.0, "plane": "strain", "halvings": 0,
-            **DECOMPOSITION,
+            **DECOMPOSITION, **KINEMATICS,
         }),
         hash=False,
     )  # fmt: skip
@@ -52,9 +54,16 @@ class HertzPlane(Family):
         positive(self.name, params, ("load",))
         one_of(self.name, params, PLANES)
         torn_by(self.name, params)
+        deformed(self.name, params)
 
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return the case with every cell halved; the arcs are other polygons."""
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        """Return the case with every cell halved; the arcs are other polygons.
+
+        At finite strain there is none: the QP of another mesh is linearised at another
+        state.
+        """
+        if params["kinematics"] == "finite":
+            return None
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def build(
@@ -63,9 +72,8 @@ class HertzPlane(Family):
         """Emit the QP in one form."""
         from problems.models.hertz import cylinder_on_plane
 
-        del reference  # the gap to a plane is linear in u
         self.check(params)
-        return cylinder_on_plane(form, params)
+        return cylinder_on_plane(form, params, reference)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,15 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
+    CONTACT_STIFFNESS,
     DECOMPOSITION,
     FRICTION,
+    KINEMATICS,
     METHODS,
     PLANES,
+    SHORTEST,
     at_least,
+    deformed,
     doubled,
     fits,
     one_of,
@@ -36,6 +40,7 @@ class ContactPatch(Family):
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
             **FRICTION, **DECOMPOSITION,
+            **KINEMATICS, **CONTACT_STIFFNESS, "stretch": 1.0,
         }),
         hash=False,
     )  # fmt: skip
@@ -51,12 +56,33 @@ class ContactPatch(Family):
         })  # fmt: skip
         rough(self.name, params)
         torn_by(self.name, params)
+        deformed(self.name, params)
+        self._check_stretch(params)
 
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
+    def _check_stretch(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless a stretch is given that pressure can bring about."""
+        stretch = float(params["stretch"])
+        if stretch == self.defaults["stretch"]:
+            return
+        if params["kinematics"] == "linear":
+            raise InputError(
+                f"{self.name}: stretch={stretch:g} is not used by kinematics=linear; "
+                "expected no stretch, or kinematics=finite"
+            )
+        if not SHORTEST <= stretch < 1:
+            raise InputError(
+                f"{self.name}: stretch={stretch:g} must be at least {SHORTEST:g} and "
+                "below 1: blocks on each other can only be pressed"
+            )
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; the odd row of cells is not.
 
-        Coulomb's law is refused: its solutions minimise nothing.
+        Coulomb's law is refused: its solutions minimise nothing. At finite strain there
+        is none: the QP of another mesh is linearised at another state.
         """
+        if params["kinematics"] == "finite":
+            return None
         if params["friction"] == "coulomb":
             raise InputError(
                 f"{self.name}: friction=coulomb minimises no energy on any mesh; "

@@ -220,7 +220,7 @@ def _inverse(
     number = np.full(K.shape[0], -1, dtype=np.int32)
     number[touched] = np.arange(touched.size, dtype=np.int32)
     compliance = np.zeros((touched.size, touched.size))
-    for components, U in factor.trailing():
+    for components, U in factor.trailing() if touched.size else ():
         lower, _ = lapack.dpotri(U.T, lower=1)
         spread_symmetric(lower.T, number[components], compliance)
     return Condensed(factor, touched, compliance, kernel, perf_counter() - start)

@@ -83,6 +83,12 @@ def von_mises(stress: NDArray[np.float64], nu: Vector | float, plane: Plane) -> 
     """Return σ_vM of (…, 3) stresses; plane strain has σ_z = ν(σ_x + σ_y)."""
     x, y, shear = np.moveaxis(stress, -1, 0)
     z = nu * (x + y) if plane == "strain" else np.zeros_like(x)
+    return von_mises_of(np.stack([x, y, shear, z], axis=-1))
+
+
+def von_mises_of(stress: NDArray[np.float64]) -> Vector:
+    """Return σ_vM of stresses (…, 4): σ_x, σ_y, τ_xy, σ_z."""
+    x, y, shear, z = np.moveaxis(stress, -1, 0)
     squares = ((x - y) ** 2 + (y - z) ** 2 + (z - x) ** 2) / 2 + 3 * shear**2
     return np.asarray(np.sqrt(squares))
 

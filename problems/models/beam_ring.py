@@ -18,12 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case, Reference, Value
+from harness import Case, Reference, Solution, Value
 from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
 from problems.contact.friction import FrictionLaw, law_of
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
+from problems.duality.newton import NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
@@ -43,14 +45,24 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     bodies = model(*geometry)
     method = (p["contact"], p["basis"])
+    sides = bodies.mesh.boundaries
+    tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+
+    def tip_of(s: Solution) -> dict[str, Any]:
+        return {"tip": (s.x[tip] * LENGTH).tolist()}
+
+    if p["kinematics"] == "finite":
+        finite = _newton_path(
+            geometry, method, p["steps"], p["material"], p["contact_stiffness"],
+            reference,
+        )  # fmt: skip
+        return newton_case(finite, form, p["step"], p["newton"], lambda _, s: tip_of(s))
     path = _path(
         geometry, method, p["steps"], p["relin"], law_of(params),
         p["loading"] == "quasi-static", reference,
     )  # fmt: skip
     problem = path.problem(p["step"], p["iterate"])
     primal, friction = problem.primal, problem.friction
-    sides = bodies.mesh.boundaries
-    tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
     subdivided = partial(_subdivided, p["feti"], *geometry)
     return contact_case(
         bodies, primal, form,
@@ -58,8 +70,7 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
-        quantities=lambda s: quantities(bodies, primal, s, friction)
-        | {"tip": (s.x[tip] * LENGTH).tolist()},
+        quantities=lambda s: quantities(bodies, primal, s, friction) | tip_of(s),
         friction=friction,
     )  # fmt: skip
 
@@ -114,3 +125,17 @@ def _path(
         model(*geometry), linearise, lambda: _clamped(*geometry), reference,
         steps, relin, laws=(law,), quasi_static=quasi_static,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    geometry: tuple[Any, ...],
+    method: tuple[Any, Any],
+    steps: int,
+    material: str,
+    contact_stiffness: str,
+    reference: Reference,
+) -> NewtonPath:
+    bodies = model(*geometry)
+    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)

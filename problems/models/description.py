@@ -9,6 +9,8 @@
     basis = "dual"             # of mortar; or "standard"
     steps = 10                 # load steps
     relin = 1                  # linearisations of the contact per step
+    kinematics = "linear"      # or "finite": finite strain, with Newton's method
+    material = "neo-hooke"     # of finite strain; or "svk", St. Venant-Kirchhoff
     units = { length = 2.0, force = 1e8 }   # m, N/m: scales of the QP, see below
 
     [[bodies]]                 # one for each physical surface
@@ -35,8 +37,8 @@
 Whatever the length unit is, everything in this file is in SI units, and so are results:
 E and tractions in Pa, forces in N/m, units.length in m.
 
-Length unit, plane, contact, basis, steps and relin may be left out for the values
-above; bodies that contact alone holds need ``steps = 1`` and have no form dual-bounds.
+What stands between mesh and units may be left out for the values above; bodies that
+contact alone holds have no form dual-bounds and, with linear kinematics, ``steps = 1``.
 So may units, for the larger side of the box around the mesh and the sum of |load| over
 nodes. Without a law of its own a pair has that of the keys friction, bound and mu,
 which the file may set at its top: none by default. There, ``loading = "static"`` makes
@@ -62,6 +64,7 @@ from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
 from problems.fem.mesh import Mesh, Nodes
 from problems.ranges import (
+    FINITE,
     LAWS,
     LOADINGS,
     METHODS,
@@ -112,7 +115,7 @@ def read_description(path: Path) -> dict[str, Any]:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
             checked.at_least_one(key, table.get(key, SETTINGS[key]), MOST_STEPS)
-        for key, known in (METHODS | PLANES).items():
+        for key, known in (METHODS | PLANES | FINITE).items():
             value = checked.text(key, table.get(key, SETTINGS[key]))
             if value not in known:
                 raise unknown(f"value of {key}", value, known)

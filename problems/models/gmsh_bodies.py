@@ -22,6 +22,8 @@ from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
+from problems.duality.newton import NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, single_load
 from problems.fem.inverse import GeneralisedInverse
 from problems.models.description import (
@@ -37,6 +39,8 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     p: Any = params
     source = (p["path"], p["sha256"], p["plane"])
     bodies = model(*source)
+    if p["kinematics"] == "finite":
+        return _finite(form, source, p, reference)
     primal, friction = _posed(source, p, reference)
     case = contact_case(
         bodies, primal, form,
@@ -46,6 +50,25 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
         friction=friction,
     )  # fmt: skip
     return replace(case, remarks=remarks(Path(p["path"])))
+
+
+def _finite(
+    form: str, source: tuple[str, str, Any], p: Any, reference: Reference
+) -> Case:
+    """Emit the QP of one Newton iteration of one load step."""
+    laws = pair_laws(read_description(Path(source[0]))["contacts"], p)
+    with located(source[0]):
+        if any(law.acts for law in laws):
+            raise InputError(
+                "friction of a contact with kinematics=finite is not built; expected "
+                "no friction, or kinematics=linear"
+            )
+        path = _newton_path(
+            source, (p["contact"], p["basis"]), p["steps"], p["material"],
+            p["contact_stiffness"], reference,
+        )  # fmt: skip
+        case = newton_case(path, form, p["step"], p["newton"])
+    return replace(case, remarks=remarks(Path(source[0])))
 
 
 def _posed(
@@ -110,3 +133,13 @@ def _path(
         bodies, linearisation(bodies, *method, laws), lambda: inverse, reference, steps,
         relin, laws=laws, quasi_static=quasi_static,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    source: tuple[str, str, Any], method: tuple[str, str], steps: int, material: str,
+    contact_stiffness: str, reference: Reference,
+) -> NewtonPath:  # fmt: skip
+    bodies = model(*source)
+    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)

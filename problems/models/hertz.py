@@ -58,6 +58,8 @@ from problems.contact.results import contact_forces, quantities
 from problems.contact.rigid_plane import above_plane
 from problems.duality.case_forms import contact_case
 from problems.duality.dualisation import dualise
+from problems.duality.newton import NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
@@ -74,8 +76,33 @@ UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
 CURVE = 601  #: points of exact tractions in pictures, over that part
 
 
-def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP in one form."""
+def cylinder_on_plane(
+    form: str, params: Mapping[str, Value], reference: Reference
+) -> Case:
+    """Emit the QP in one form; at finite strain the gap to the plane is linear, too."""
+    bodies, rows, exact = _on_plane(params)
+    if params["kinematics"] == "linear":
+        return _case(bodies, rows, form, exact, params)
+    path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
+    case = newton_case(
+        path, form, 1, int(params["newton"]),
+        lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
+    )  # fmt: skip
+    return _beside(case, exact)
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    items: tuple[tuple[str, Any], ...], reference: Reference
+) -> NewtonPath:
+    bodies, rows, _ = _on_plane(dict(items))
+    return newton_path(bodies, lambda u: rows, dict(items), reference)
+
+
+def _on_plane(
+    params: Mapping[str, Value],
+) -> tuple[Bodies, ContactRows, LineContact]:
+    """Mesh and assemble the cylinder, n cells per a; with Hertz's solution."""
     p: Any = params
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
@@ -88,8 +115,7 @@ def cylinder_on_plane(form: str, params: Mapping[str, Value]) -> Case:
         load=pressed(mesh, mesh.boundaries["flat"], exact.P),
         pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
     )  # fmt: skip
-    rows = above_plane(mesh, mesh.boundaries["arc"])
-    return _case(bodies, rows, form, exact, params)
+    return bodies, above_plane(mesh, mesh.boundaries["arc"]), exact
 
 
 def cylinder_on_cylinder(

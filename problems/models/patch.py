@@ -11,17 +11,27 @@ and Papadopoulos 1991). Mortar methods do, node-to-segment contact in one pass d
 its error in σ_y is of order one and does not vanish with the mesh size. Friction makes
 no difference while the blocks are of one material. Contact alone holds the upper block
 up, so that ``dual-bounds`` does not exist.
+
+At finite strain (kinematics=finite) the pressure is a dead load, a nominal stress, and
+the exact solution is homogeneous: with the stretches λ₁ along x and λ₂ along y
+
+    F = diag(λ₁, λ₂),   P₁₁(λ₁, λ₂) = 0,   P₂₂(λ₁, λ₂) = −p,   σ_y = P₂₂/λ₁
+
+while the blocks are of one material. `stretch` is λ₂ in place of p.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
-from typing import Any
+from dataclasses import replace
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
 
-from harness import Case, Reference, Solution, Value
+from harness import Case, InputError, Reference, Solution, Value
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -32,14 +42,19 @@ from problems.contact.bodies import (
 )
 from problems.contact.friction import law_of
 from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
+from problems.contact.results import contact_forces, quantities
 from problems.duality.case_forms import contact_case
+from problems.duality.newton import Iteration, NewtonPath
+from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import single_load
 from problems.fem.elasticity import Material
-from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from problems.fem.finite_strain import cauchy_stress, strain_energy
+from problems.fem.hyperelastic import Hyperelastic, hyperelastic
+from problems.fem.mesh import Mesh, as_vectors, join, nodal_lengths, prefixed, rectangle
 from problems.fem.stress import gauss_stress
 from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
 from problems.feti.tearing import structured_bodies
+from problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 PRESSURE = 1e6  #: p, Pa
@@ -49,6 +64,8 @@ E_UPPER, NU = 10e6, 0.3  #: Pa
 def two_blocks(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     """Emit the QP in one form."""
     p: Any = params
+    if p["kinematics"] == "finite":
+        return _finite(form, params, reference)
     bodies = model(params)
     laws = (law_of(params),)
     linearise = linearisation(bodies, p["contact"], p["basis"], laws)
@@ -73,6 +90,140 @@ def subdivided(bodies: Bodies, params: Mapping[str, Value]) -> SubdividedBodies:
     p: Any = params
     divisions = [_divisions(p[name]) for name in ("lower", "upper")]
     return subdivide(bodies, structured_bodies(divisions, p["feti"]))
+
+
+class Homogeneous(NamedTuple):
+    """Uniform compression of a free block between frictionless plates."""
+
+    lateral: float  #: stretch λ₁ along x
+    stretch: float  #: λ₂ along y
+    nominal: float  #: P₂₂, force per reference length and thickness, Pa
+    cauchy: float  #: σ_y, Pa
+    energy: float  #: W per reference area, Pa
+    stiffness: float  #: dP₂₂/dλ₂ with P₁₁ = 0, Pa
+
+
+def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
+    """Solve P₁₁ = 0 for the lateral stretch under a stretch of the height."""
+
+    def at(lateral: float) -> NDArray[np.float64]:
+        return np.diag([lateral, stretch])
+
+    lateral = float(brentq(
+        lambda lateral: material.stress(at(lateral))[0, 0], 0.5, 3.0, xtol=1e-15
+    ))  # fmt: skip
+    P, A = material.stress(at(lateral)), material.tangent(at(lateral))
+    return Homogeneous(
+        lateral, stretch, float(P[1, 1]), float(P[1, 1] / lateral),
+        float(material.energy(at(lateral))),
+        float(A[1, 1, 1, 1] - A[0, 0, 1, 1] ** 2 / A[0, 0, 0, 0]),
+    )  # fmt: skip
+
+
+def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
+    """Find the state with a given stretch, which a growing load must come to.
+
+    Raises
+    ------
+    InputError
+        When the material softens before.
+
+    """
+    softest = _softest(material)
+    if stretch <= softest:
+        raise InputError(
+            f"contact-patch: stretch={stretch:g} cannot be reached by a growing load: "
+            f"material=svk softens from {softest:.4f} on; expected a larger stretch, "
+            "or material=neo-hooke"
+        )
+    return homogeneous(material, stretch)
+
+
+def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
+    """Find the state under a nominal pressure, Pa."""
+    least = max(_softest(material), SHORTEST)
+    stretch = float(brentq(
+        lambda stretch: homogeneous(material, stretch).nominal + pressure, least, 1.0,
+        xtol=1e-15,
+    ))  # fmt: skip
+    return homogeneous(material, stretch)
+
+
+def _softest(material: Hyperelastic) -> float:
+    """Return the stretch at which the pressure is largest; 0 where there is none."""
+    if homogeneous(material, SHORTEST).stiffness > 0:
+        return 0.0
+    return float(
+        brentq(lambda stretch: homogeneous(material, stretch).stiffness, SHORTEST, 1.0)
+    )
+
+
+def _finite(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
+    """Emit the QP of one Newton iteration."""
+    p: Any = params
+    path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
+    exact = _uniform(params)
+
+    def results(at: Iteration, s: Solution) -> dict[str, Any]:
+        found = _measured(path, at, s)
+        if p["ratio"] == 1:
+            found |= _compared(path, s, exact)
+        return found
+
+    return newton_case(path, form, 1, p["newton"], results)
+
+
+@lru_cache(maxsize=4)
+def _newton_path(
+    items: tuple[tuple[str, Any], ...], reference: Reference
+) -> NewtonPath:
+    params = dict(items)
+    bodies = model(params)
+    bodies = replace(bodies, f=bodies.f * (-_uniform(params).nominal / PRESSURE))
+    linearise = linearisation(bodies, params["contact"], params["basis"])
+    return newton_path(bodies, linearise, params, reference)
+
+
+def _uniform(params: Mapping[str, Any]) -> Homogeneous:
+    """Find the uniform state of the upper block that its load belongs to."""
+    material = hyperelastic(params["material"], Material(E_UPPER, NU))
+    if params["stretch"] == 1:
+        return pressed_by(material, PRESSURE)
+    return pressed_to(material, float(params["stretch"]))
+
+
+def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
+    """Report mean stretches of the blocks, [λ₁, λ₂], and what is between them.
+
+    nominal_stress: the contact force over the undeformed length, Pa. cauchy_stress:
+    mean of σ_y over the cells, Pa. strain_energy: ∫W, J/m.
+    """
+    bodies, u = path.bodies, as_vectors(s.x * path.bodies.length)
+    sides = bodies.mesh.boundaries
+    right = np.concatenate([sides["lower_right"], sides["upper_right"]])
+    force = contact_forces(bodies, at.primal, s)[sides["lower_top"], 1].sum()
+    stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
+    return {
+        "stretches": [
+            1 + float(u[right, 0].mean()) / LENGTH,
+            1 + float(u[sides["upper_top"], 1].mean()) / (2 * HEIGHT),
+        ],
+        "nominal_stress": float(force / LENGTH),
+        "cauchy_stress": float(stress.mean()),
+        "strain_energy": strain_energy(path.cells, s.x) * bodies.length * bodies.force,
+    }
+
+
+def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]:
+    """Report the largest errors: of σ_y over the cells, relative; of x at nodes, m."""
+    bodies = path.bodies
+    stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
+    u = as_vectors(s.x * bodies.length)
+    strains = np.array([exact.lateral - 1, exact.stretch - 1])
+    return {
+        "stress_error": float(np.abs(stress / exact.cauchy - 1).max()),
+        "position_error": float(np.abs(u - bodies.mesh.points * strains).max()),
+    }
 
 
 def model(params: Mapping[str, Value]) -> Bodies:

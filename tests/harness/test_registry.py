@@ -2,11 +2,11 @@
 
 import sys
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint
+from zipfile import ZipFile
 
 import pytest
 
-from harness import InputError, registry
+from harness import InputError
 from harness.registry import (
     PluginFile,
     SolverSpec,
@@ -255,25 +255,53 @@ def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
         load_plugin(text)
 
 
-def test_entry_points_are_solvers_under_their_names(monkeypatch):
-    def installed(*, group):
-        here = [EntryPoint("mine", "fractions:Fraction.from_float", group)]
-        return here if group == "mortarbench.solvers" else []
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install a package, whose files are metadata alone, that offers something."""
 
-    monkeypatch.setattr(registry, "entry_points", installed)
+    def install(metadata, offers):
+        folder = tmp_path / "installed" / metadata
+        folder.mkdir(parents=True)
+        (folder / "entry_points.txt").write_text(offers)
+        monkeypatch.syspath_prepend(folder.parent)
+
+    return install
+
+
+@pytest.mark.parametrize("metadata", ["its-1.0.dist-info", "its.egg-info"])
+def test_entry_points_are_solvers_under_their_names(install, metadata):
+    install(metadata, "[mortarbench.solvers]\nmine = fractions:Fraction.from_float\n")
 
     with pytest.raises(InputError, match=r"entry points: SOLVERS\['mine'\] is of "):
         entry_point_plugins()
 
 
-def test_an_entry_point_that_fails_to_import_is_named(monkeypatch):
-    broken = EntryPoint("mine", "nothing_of_that_name:X", "mortarbench.solvers")
-    monkeypatch.setattr(registry, "entry_points", lambda *, group: [broken])
+def test_an_entry_point_that_fails_to_import_is_named(install):
+    install("its-1.0.dist-info", "[mortarbench.problems]\nmine = no_such_module:X\n")
 
     with pytest.raises(
-        InputError, match="entry point nothing_of_that_name:X: failed to import: Mod"
+        InputError, match="entry point no_such_module:X: failed to import: Mod"
     ):
         entry_point_plugins()
+
+
+def test_entry_points_in_an_archive_are_found(tmp_path, monkeypatch):
+    with ZipFile(tmp_path / "its.zip", "w") as archive:
+        archive.writestr("its-1.0.dist-info/METADATA", "Name: its\n")
+        archive.writestr(
+            "its-1.0.dist-info/entry_points.txt",
+            "[mortarbench.problems]\nmine = no_such_module:X\n",
+        )
+    monkeypatch.syspath_prepend(tmp_path / "its.zip")
+
+    with pytest.raises(InputError, match="entry point no_such_module:X"):
+        entry_point_plugins()
+
+
+def test_entry_points_for_others_are_not_loaded(install):
+    install("its-1.0.dist-info", "[console_scripts]\nmortarbench = no_such_module:X\n")
+
+    assert not entry_point_plugins().solvers
 
 
 def test_a_name_that_exists_cannot_be_taken_by_a_plugin():

@@ -27,6 +27,7 @@ from mortarbench.cli.main import main
 from mortarbench.progress import shown_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.waiting import LONGEST
 
 SOLVERS = load_plugin(TOY_PROBLEM).solvers
 FAMILIES = load_plugin(TOY_PROBLEM).problems
@@ -321,7 +322,7 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
             time.sleep(0.05)
         command.send_signal(signal.SIGINT)
         try:
-            out, err = command.communicate(timeout=60)
+            out, err = command.communicate(timeout=LONGEST)
         finally:
             command.kill()  # leaving the block waits for it
 

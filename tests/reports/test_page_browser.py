@@ -83,7 +83,7 @@ def visit(browser):
         )
         contexts.append(context)
         page = context.new_page()
-        page.set_default_timeout(5000)
+        page.set_default_timeout(60_000)
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
@@ -578,11 +578,11 @@ def test_the_policy_of_the_page_stops_what_an_injection_would_do(browser, folder
     page.on("console", lambda message: refused.append(message.text))
     page.on("requestfailed", lambda r: stopped.append((r.url, r.failure)))
     page.goto((folder / "report" / "index.html").as_uri())
-    page.evaluate(
-        "document.body.insertAdjacentHTML('beforeend', "
-        '\'<img src="http://evil.example/x" onerror="window.broken=1">\')'
-    )
-    page.wait_for_timeout(200)
+    with page.expect_console_message(), page.expect_event("requestfailed"):
+        page.evaluate(
+            "document.body.insertAdjacentHTML('beforeend', "
+            '\'<img src="http://evil.example/x" onerror="window.broken=1">\')'
+        )
     assert page.evaluate("window.broken") is None
     assert any("Content Security Policy" in text for text in refused)
     assert stopped == [("http://evil.example/x", "csp")]

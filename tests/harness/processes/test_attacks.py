@@ -7,7 +7,6 @@ import secrets
 import signal
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -31,10 +30,10 @@ from harness.verify.measure import SAMPLE_SECONDS
 from harness.verify.optimum import proves
 from harness.verify.verdicts import new_record
 from solvers.reference.solve import reference_solution
-from tests.support import ATTACKERS
+from tests.support import ATTACKERS, ROOT
+from tests.support.waiting import soon
 
 PLUGIN = ATTACKERS
-ROOT = Path(__file__).parents[3]
 START = [sys.executable, "-P", str(PLUGIN)]
 ATTACKERS = load_plugin(PLUGIN)
 TINY = ATTACKERS.problems["tiny"]
@@ -146,13 +145,6 @@ def left(attacked):
             if mine and int(entry.name) != os.getpid() and lives(int(entry.name)):
                 found.append(int(entry.name))
     return found
-
-
-def soon(condition):
-    deadline = time.monotonic() + 180
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 class Bench:

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -16,6 +15,7 @@ from mortarbench import case
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.waiting import soon
 
 #: asks workers that are forks of it, prints what came of each, and is killed; a process
 #: of its own, since what forks safely has one thread
@@ -114,13 +114,6 @@ results["stay"] = told("stay")
 print(json.dumps(results), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 '''
-
-
-def soon(condition):
-    deadline = time.monotonic() + 20
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 @pytest.fixture(scope="module")

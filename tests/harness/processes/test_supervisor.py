@@ -2,7 +2,6 @@ import json
 import os
 import signal
 import sys
-import time
 from pathlib import Path
 from select import select
 
@@ -15,6 +14,7 @@ from harness.processes.reaper import descendants
 from harness.processes.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
 from harness.registry import load_plugin
 from tests.support import ADVERSARIES
+from tests.support.waiting import soon
 
 PLUGIN = ADVERSARIES
 
@@ -66,13 +66,6 @@ def ignores_sigterm(process):
     status = Path(f"/proc/{process}/status").read_text()
     mask = next(line for line in status.splitlines() if line.startswith("SigIgn:"))
     return bool(int(mask.split()[1], 16) & 1 << (signal.SIGTERM - 1))
-
-
-def soon(condition):
-    deadline = time.monotonic() + 20
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return condition()
 
 
 @pytest.fixture

@@ -24,6 +24,7 @@ from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.fork_server import INSTALL
+from tests.support.waiting import soon
 
 pytest.importorskip("distributed")
 
@@ -62,8 +63,7 @@ class Cluster:
             "--scheduler-file", str(self._file), *options, env=self._env,
         )  # fmt: skip
         self.workers = []
-        while not (self._file.exists() and self._file.read_text()):
-            time.sleep(0.05)
+        assert soon(lambda: self._file.exists() and self._file.read_text())
 
     @property
     def address(self):
@@ -159,14 +159,6 @@ def meanwhile(action):
     thread.join()
 
 
-def wait_for(condition):
-    """Wait however long it takes; what never comes is given up after ten minutes."""
-    end = time.monotonic() + 600
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 @pytest.mark.alone  # each node takes a CPU
 def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cli, cluster, tmp_path
@@ -177,7 +169,7 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cluster.starts.write_text("")
 
     def kill():
-        wait_for(lambda: victim.pid in map(node_of, cluster.started_solvers()))
+        assert soon(lambda: victim.pid in map(node_of, cluster.started_solvers()))
         victim.kill()  # in the middle of a measurement
 
     with meanwhile(kill):
@@ -208,7 +200,7 @@ def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
     cut = []
 
     def kill():
-        wait_for(lambda: cut or cut.extend(halved("d")))
+        assert soon(lambda: cut or cut.extend(halved("d")))
         victim.kill()  # what it had given back of that block is in the journal
         cluster.join()
 
@@ -294,7 +286,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
     cluster.join()
 
     def kill():
-        wait_for(lambda: halved("d"))  # a worker is in the middle of a block
+        assert soon(lambda: halved("d"))  # a worker is in the middle of a block
         cluster.scheduler.kill()
 
     with meanwhile(kill):
@@ -322,7 +314,7 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     idle = []
 
     def look():
-        wait_for(cluster.started_solvers)
+        assert soon(cluster.started_solvers)
         idle.extend(descendants(worker.pid))
 
     with meanwhile(look):
@@ -330,7 +322,7 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
         assert cli(*run, "--dask", cluster.address)[0] == 0
 
     assert len(idle) >= 2  # a solver and the generator
-    wait_for(lambda: not descendants(worker.pid))
+    assert soon(lambda: not descendants(worker.pid))
 
 
 @pytest.mark.slow
@@ -358,7 +350,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
         "toy.toml",
     ]
     run = subprocess.Popen([*command, "--out", "d", "--dask", cluster.address])
-    wait_for(lambda: halved("d"))  # the worker is in the middle of a block
+    assert soon(lambda: halved("d"))  # the worker is in the middle of a block
     run.kill()
     run.wait()
     before = measured("d")
@@ -367,7 +359,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     cli("run", "toy.toml", "--out", "alone")
     assert measured("d") == measured("alone")
     assert 0 < len(before) < len(measured("d"))
-    wait_for(lambda: not descendants(worker.pid))
+    assert soon(lambda: not descendants(worker.pid))
 
 
 @pytest.mark.slow

@@ -1,0 +1,149 @@
+"""From one Newton iteration at finite strain to the case of each form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from harness import Case, Fields, Reference, Solution, Vector
+from problems.contact.bodies import Bodies, clamped, supported
+from problems.contact.linearise import contact_stiffness
+from problems.contact.results import fields, quantities
+from problems.duality.case_forms import contact_case
+from problems.duality.newton import Iteration, NewtonPath, guided
+from problems.duality.stepping import Linearise
+from problems.fem.finite_strain import (
+    Cells,
+    InvertedCellError,
+    cauchy_stress,
+    cells_of,
+    strain_energy,
+)
+from problems.fem.hyperelastic import hyperelastic
+from problems.fem.stress import recover, von_mises_of
+
+
+def newton_path(
+    bodies: Bodies, linearise: Linearise, params: Mapping[str, Any],
+    reference: Reference, steps: int = 1,
+) -> NewtonPath:  # fmt: skip
+    """Prepare the load steps of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
+
+    params : material, and contact_stiffness where the gaps are not linear
+    """
+    geometric = params.get("contact_stiffness") == "geometric"
+    return NewtonPath(
+        bodies, cells_without_units(bodies, params["material"]), linearise, reference,
+        steps, curvature=contact_stiffness(bodies) if geometric else None,
+    )  # fmt: skip
+
+
+def cells_without_units(bodies: Bodies, material: str) -> Cells:
+    """Prepare the cells of bodies in lengths l and forces F₀, as their K is."""
+    l, F = bodies.length, bodies.force
+    mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
+    laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
+    return cells_of(mesh, laws, bodies.body)
+
+
+def newton_case(
+    path: NewtonPath,
+    form: str,
+    step: int,
+    newton: int,
+    results: Callable[[Iteration, Solution], Mapping[str, Any]] = lambda _, s: {},
+) -> Case:
+    """Emit the QP of a Newton iteration in one of `problems.duality.case_forms.FORMS`.
+
+    Its objective stands for the quadratic model of the potential Π about the iterate;
+    the quantity `energy` is Π itself. K is definite on what the supports hold, so that
+    all forms are of one QP: only translations are left to `dual`.
+
+    Parameters
+    ----------
+    step, newton : as of `NewtonPath.iteration`
+    results : further quantities from a solution of the primal problem
+
+    """
+    at = path.iteration(step, newton)
+    iterations = path.iterations(step)
+    bodies, primal = at.tangent, at.primal
+    unit = bodies.length * bodies.force
+    found = {
+        "newton": newton or len(iterations),
+        "newton_iterations": len(iterations),
+        "load_parts": path.parts(step),
+        "clipped": at.clipped,
+        "clipped_in_step": sum(i.clipped for i in iterations),
+        "residuals": [i.residual for i in iterations],
+        "step_lengths": [i.length for i in iterations],
+    }
+
+    def collected(s: Solution) -> Mapping[str, Any]:
+        stresses = cauchy_stresses(path.cells, bodies, s.x)
+        told = quantities(bodies, primal, s, stresses=stresses)
+        return told | path_state(path, at, s) | found | dict(results(at, s))
+
+    case = contact_case(
+        bodies, primal, form,
+        floating=lambda: guided(bodies), clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies), quantities=collected,
+    )  # fmt: skip
+    assert case.mechanics is not None
+    back, constant = case.mechanics.back, at.constant * unit
+
+    def drawn(s: Solution) -> Fields:
+        s = back(s)
+        stresses = cauchy_stresses(path.cells, bodies, s.x)
+        return fields(bodies, primal, s, stresses=stresses)
+
+    return replace(
+        case, fields=drawn, constant=case.constant + constant,
+        mechanics=replace(
+            case.mechanics, constant=constant, rigid=translations(bodies)
+        ),
+    )  # fmt: skip
+
+
+def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
+    """Evaluate the nonlinear problem at an answer; NaN where it inverts a cell.
+
+    energy: Π, J/m. residual: of equilibrium and contact, see
+    `NewtonPath.residual`. penetration: the largest one, m.
+    """
+    try:
+        energy, residual, penetration = path.state(at, s)
+    except InvertedCellError:
+        energy = residual = penetration = np.nan
+    bodies = at.tangent
+    return {
+        "energy": energy * bodies.length * bodies.force,
+        "residual": residual,
+        "penetration": penetration * bodies.length,
+    }
+
+
+def cauchy_stresses(cells: Cells, bodies: Bodies, u: Vector) -> dict[str, Vector]:
+    """Recover Cauchy's stresses at the nodes (N,), Pa; NaN where one is inverted.
+
+    u : (n,) without dimensions
+    """
+    stress = cauchy_stress(cells, u) * (bodies.force / bodies.length)
+    if not np.isfinite(strain_energy(cells, u)):
+        stress[:] = np.nan
+    nodal = recover(bodies.mesh, stress)
+    named = dict(zip(("sxx", "syy", "sxy", "szz"), nodal.T, strict=True))
+    return named | {"von_mises": von_mises_of(nodal)}
+
+
+def translations(bodies: Bodies) -> Vector:
+    """Return orthonormal translations of every body on its own, (n, 2 bodies)."""
+    owner = bodies.body_of_node
+    sizes = np.bincount(owner, minlength=len(bodies.names))
+    return np.asarray(
+        block_diag(*(np.tile(np.eye(2), (size, 1)) / np.sqrt(size) for size in sizes))
+    )

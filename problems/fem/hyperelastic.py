@@ -1,0 +1,199 @@
+"""Hyperelastic materials in plane strain: energy, stress and tangent from F.
+
+A material is a strain energy W per reference area of the deformation gradient F = ∂x/∂X
+(plane strain: F₃₃ = 1), split into what shear and what a change of volume cost,
+
+    W(F) = w(F) + U(θ(F)),        P = ∂W/∂F  (first Piola-Kirchhoff),  A = ∂P/∂F
+
+with a measure θ of the dilatation. The split is what the mean dilatation method needs,
+see `problems.fem.finite_strain`. With Lamé's constants Λ, μ of E and ν:
+
+    neo-Hooke                 w = μ/2 (F:F − 2 − 2 ln J),    θ = J,     U = Λ/2 ln²θ
+    St. Venant-Kirchhoff      w = μ E:E,   E = ½(FᵀF − I),   θ = tr E,  U = Λ/2 θ²
+
+(neo-Hooke as Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite Element
+Analysis", Section 6.4; the trace of C in three dimensions is F:F + 1). At F = I both
+are linear elasticity. St. Venant-Kirchhoff softens under compression and has no barrier
+against J → 0: below a uniaxial stretch of 1/√3 its stress falls again.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from problems.fem.elasticity import Material
+
+Floats = NDArray[np.float64]
+
+_I = np.eye(2)
+#: ε_ik ε_jl with the permutation symbol: the second derivative of J = det F
+_CURVATURE_OF_J = np.einsum("ik,jl->ijkl", [[0, 1], [-1, 0]], [[0, 1], [-1, 0]])
+
+
+class Derivatives(NamedTuple):
+    """A scalar function of F with its derivatives, at points (…)."""
+
+    value: Floats  #: (…)
+    first: Floats  #: (…, 2, 2)
+    second: Floats  #: (…, 2, 2, 2, 2)
+
+
+@dataclass(frozen=True)
+class Hyperelastic(ABC):
+    """An isotropic hyperelastic material; F has the shape (…, 2, 2) throughout."""
+
+    E: float  #: Young's modulus of small strains, Pa
+    nu: float  #: Poisson's ratio of small strains
+
+    @property
+    def lame(self) -> float:
+        """Λ, Pa."""
+        return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
+
+    @property
+    def shear_modulus(self) -> float:
+        """μ, Pa."""
+        return self.E / (2 * (1 + self.nu))
+
+    @abstractmethod
+    def shear(self, F: Floats) -> Derivatives:
+        """Return w with its derivatives, Pa."""
+
+    @abstractmethod
+    def dilatation(self, F: Floats) -> Derivatives:
+        """Return the measure θ of the change of volume with its derivatives."""
+
+    @abstractmethod
+    def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return U, U′ and U″ of θ (…), Pa."""
+
+    @abstractmethod
+    def thickness_rate(self, F: Floats) -> Floats:
+        """Return ∂θ/∂F₃₃ (…) at F₃₃ = 1; there w has none."""
+
+    def energy(self, F: Floats) -> Floats:
+        """Return W (…), Pa."""
+        theta = self.dilatation(F).value
+        return np.asarray(self.shear(F).value + self.volumetric(theta)[0])
+
+    def stress(self, F: Floats) -> Floats:
+        """Return P = ∂W/∂F (…, 2, 2), Pa: force per reference area."""
+        theta = self.dilatation(F)
+        slope = self.volumetric(theta.value)[1]
+        return np.asarray(self.shear(F).first + slope[..., None, None] * theta.first)
+
+    def tangent(self, F: Floats) -> Floats:
+        """Return A = ∂P/∂F (…, 2, 2, 2, 2), Pa."""
+        theta = self.dilatation(F)
+        _, slope, curvature = (
+            part[..., None, None, None, None] for part in self.volumetric(theta.value)
+        )
+        outer = np.einsum("...ij,...kl->...ijkl", theta.first, theta.first)
+        return np.asarray(
+            self.shear(F).second + slope * theta.second + curvature * outer
+        )
+
+
+class NeoHooke(Hyperelastic):
+    """W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J, compressible neo-Hooke."""
+
+    def shear(self, F: Floats) -> Derivatives:
+        """Return w = μ/2 (F:F − 2 − 2 ln J); NaN where J ≤ 0."""
+        mu, back = self.shear_modulus, _inverse_transpose(F)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log_J = np.log(determinant(F))
+        return Derivatives(
+            mu * ((F**2).sum((-2, -1)) / 2 - 1 - log_J),
+            mu * (F - back),
+            mu * (np.einsum("ik,jl->ijkl", _I, _I)
+                  + np.einsum("...il,...kj->...ijkl", back, back)),
+        )  # fmt: skip
+
+    def dilatation(self, F: Floats) -> Derivatives:
+        """Return θ = J."""
+        J = determinant(F)
+        return Derivatives(
+            J,
+            J[..., None, None] * _inverse_transpose(F),
+            np.broadcast_to(_CURVATURE_OF_J, (*J.shape, 2, 2, 2, 2)),
+        )
+
+    def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return U = Λ/2 ln²θ; NaN where θ ≤ 0."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            log = np.log(theta)
+        return (
+            self.lame / 2 * log**2,
+            self.lame * log / theta,
+            self.lame * (1 - log) / theta**2,
+        )
+
+    def thickness_rate(self, F: Floats) -> Floats:
+        """Return J."""
+        return determinant(F)
+
+
+class StVenantKirchhoff(Hyperelastic):
+    """W = Λ/2 (tr E)² + μ E:E of Green and Lagrange's strain E = ½(FᵀF − I)."""
+
+    def shear(self, F: Floats) -> Derivatives:
+        """Return w = μ E:E."""
+        mu, E = self.shear_modulus, (np.swapaxes(F, -1, -2) @ F - _I) / 2
+        return Derivatives(
+            mu * (E**2).sum((-2, -1)),
+            2 * mu * (F @ E),
+            mu * (2 * np.einsum("ik,...jl->...ijkl", _I, E)
+                  + np.einsum("...il,...kj->...ijkl", F, F)
+                  + np.einsum("...ik,jl->...ijkl", F @ np.swapaxes(F, -1, -2), _I)),
+        )  # fmt: skip
+
+    def dilatation(self, F: Floats) -> Derivatives:
+        """Return θ = tr E."""
+        theta = (F**2).sum((-2, -1)) / 2 - 1
+        identity = np.einsum("ik,jl->ijkl", _I, _I)
+        return Derivatives(
+            theta, F, np.broadcast_to(identity, (*theta.shape, 2, 2, 2, 2))
+        )
+
+    def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return U = Λ/2 θ²."""
+        lame = self.lame
+        return lame / 2 * theta**2, lame * theta, np.full_like(theta, lame)
+
+    def thickness_rate(self, F: Floats) -> Floats:
+        """Return 1."""
+        return np.ones(F.shape[:-2])
+
+
+#: the values of the key `material`
+MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyType(
+    {"neo-hooke": NeoHooke, "svk": StVenantKirchhoff}
+)
+
+
+def hyperelastic(name: str, linear: Material, unit: float = 1.0) -> Hyperelastic:
+    """Make the material `name` of MATERIALS that is `linear` under small strains.
+
+    unit : of stress, Pa; its moduli are multiples of this
+    """
+    return MATERIALS[name](linear.E / unit, linear.nu)
+
+
+def determinant(F: Floats) -> Floats:
+    """Return J = det F (…)."""
+    return np.asarray(F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0])
+
+
+def _inverse_transpose(F: Floats) -> Floats:
+    """Return F⁻ᵀ (…, 2, 2)."""
+    cofactors = np.empty_like(F)
+    cofactors[..., 0, 0], cofactors[..., 1, 1] = F[..., 1, 1], F[..., 0, 0]
+    cofactors[..., 0, 1], cofactors[..., 1, 0] = -F[..., 1, 0], -F[..., 0, 1]
+    return np.asarray(cofactors / determinant(F)[..., None, None])

@@ -1,0 +1,213 @@
+"""Families with kinematics=finite: exact states, all forms, what is refused."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+
+import problems
+from harness import InputError, certify, kkt_residuals
+from harness.names import parse
+from problems.families.beam_ring import BeamRing
+from problems.families.hertz import HertzPlane
+from problems.families.patch import ContactPatch
+from problems.fem.elasticity import Material
+from problems.fem.hyperelastic import hyperelastic
+from problems.models.patch import E_UPPER, NU, homogeneous, pressed_by
+from solvers.adapters.clarabel_ import Clarabel
+from solvers.adapters.osqp_ import OSQP
+from solvers.adapters.piqp_ import PIQP
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+RING = {"Nr": 2, "Nh": 2, "steps": 2, "contact_stiffness": "geometric"}
+CASES = {
+    "beam-ring": (BeamRing(), RING),
+    "contact-patch": (ContactPatch(), {"lower": 3, "upper": 2, "stretch": 0.7}),
+    "hertz-plane": (HertzPlane(), {"n": 2}),
+}
+FORMS = [(name, form) for name, (f, _) in CASES.items() for form in f.forms]
+
+
+@cache
+def built(name, form="dual", **given):
+    family, own = CASES[name]
+    params = family.complete({**own, "kinematics": "finite", **given})
+    return family.build(form, params, reference_solution)
+
+
+def quantities(name, form="dual", **given):
+    case = built(name, form, **given)
+    return case.quantities(reference_solution(case.qp))
+
+
+@pytest.mark.parametrize(
+    ("stretch", "lateral", "nominal", "cauchy"),
+    [
+        (0.8, 1.0948760560, -0.2686315279, -0.2453533680),
+        (0.6, 1.2144261693, -0.7146352056, -0.5884550446),
+    ],
+)
+@pytest.mark.parametrize("slave", ["lower", "upper"])
+def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave):
+    """Neo-Hooke between frictionless plates; digits found without this code."""
+    got = quantities("contact-patch", stretch=stretch, slave=slave)
+
+    np.testing.assert_allclose(got["stretches"], [lateral, stretch], atol=1e-9)
+    assert got["nominal_stress"] / 10e6 == pytest.approx(nominal, abs=2e-10)
+    assert got["cauchy_stress"] / 10e6 == pytest.approx(cauchy, abs=2e-10)
+    assert got["position_error"] <= 1e-9
+    assert got["stress_error"] <= 1e-9
+    if stretch == 0.8:
+        assert got["strain_energy"] / 10e6 == pytest.approx(0.0250180138, abs=2e-10)
+
+
+@pytest.mark.parametrize("stretch", [0.9, 0.65])
+def test_so_are_those_of_st_venant_and_kirchhoff(stretch):
+    """Closed form: λ₁² = 1 + ν/(1 − ν)(1 − λ₂²), P₂₂ = λ₂E/(1 − ν²)·½(λ₂² − 1)."""
+    got = quantities("contact-patch", stretch=stretch, material="svk")
+    strain = (stretch**2 - 1) / 2
+
+    assert got["stretches"] == pytest.approx(
+        [np.sqrt(1 - 2 * NU / (1 - NU) * strain), stretch], abs=1e-9
+    )
+    assert got["nominal_stress"] == pytest.approx(
+        stretch * E_UPPER / (1 - NU**2) * strain, rel=1e-9
+    )
+
+
+def test_the_pressure_of_the_family_is_a_nominal_stress():
+    got = quantities("contact-patch", stretch=1.0)
+    exact = pressed_by(hyperelastic("neo-hooke", Material(E_UPPER, NU)), 1e6)
+
+    assert got["nominal_stress"] == pytest.approx(-1e6, rel=1e-9)
+    assert got["stretches"] == pytest.approx([exact.lateral, exact.stretch], abs=1e-9)
+
+
+def test_small_loads_differ_from_linear_elasticity_by_their_square():
+    """σ_y = −p exactly where strains are small; u of contact-patch with p ∝ 1 − λ₂."""
+    differences = []
+    for stretch in (0.99, 0.995):
+        exact = homogeneous(hyperelastic("neo-hooke", Material(E_UPPER, NU)), stretch)
+        got = quantities("contact-patch", stretch=stretch)
+        linear = 1 + exact.nominal * (1 - NU**2) / E_UPPER
+        differences.append(abs(got["stretches"][1] - linear))
+
+    assert np.log2(differences[0] / differences[1]) == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_all_forms_are_of_one_qp(name):
+    family, _ = CASES[name]
+    cases = [built(name, form) for form in family.forms]
+    energy, points = [], []
+    for case in cases:
+        s = reference_solution(case.qp)
+        energy.append(case.scale * case.qp.objective(s.x) + case.constant)
+        points.append(case.recover(s))
+        assert (case.mechanics.primal.P != cases[0].qp.P).nnz == 0
+
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-9)
+    for point in points:
+        np.testing.assert_allclose(point, points[0], atol=1e-9 * abs(point).max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_model_of_the_last_iteration_has_the_energy_of_the_potential(name):
+    case = built(name)
+    s = reference_solution(case.qp)
+    model = case.scale * case.qp.objective(s.x) + case.constant
+    got = case.quantities(s)
+
+    assert got["energy"] == pytest.approx(model, rel=1e-9)
+    assert got["residual"] <= 1e-8
+    assert got["penetration"] <= 1e-10
+    json.dumps(got, allow_nan=False)
+
+
+@pytest.mark.parametrize(("name", "form"), FORMS)
+def test_answers_are_certified(name, form):
+    case = built(name, form)
+    s = reference_solution(case.qp)
+
+    assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-7
+
+
+@pytest.mark.parametrize("name", ["beam-ring", "contact-patch", "hertz-plane"])
+def test_every_iteration_is_verified_by_smalbe_and_three_generic_solvers(name):
+    steps = [1, 2] if name == "beam-ring" else [None]
+    for step in steps:
+        at = {} if step is None else {"step": step}
+        count = quantities(name, **at)["newton_iterations"]
+        assert count >= 3
+        for newton in range(1, count + 1):
+            qp = built(name, newton=newton, **at).qp
+            for solver in (SMALBE(), Clarabel(), OSQP(), PIQP()):
+                s = solver.prepare(qp, 1e-8)()
+                assert kkt_residuals(qp, s).worst <= 1e-7, (solver, step, newton)
+
+
+def test_the_contact_force_of_hertz_is_the_load():
+    got = quantities("hertz-plane")
+
+    assert got["contact_force"][1] == pytest.approx(10e6, rel=1e-9)
+    assert got["force_error"] == pytest.approx(0, abs=1e-9)
+
+
+def test_stresses_are_cauchys_and_vanish_on_no_side_of_a_body_under_pressure():
+    case = built("contact-patch", stretch=0.8)
+    drawn = case.fields(reference_solution(case.qp))
+
+    np.testing.assert_allclose(drawn.nodal["syy"] / 10e6, -0.2453533680, atol=1e-9)
+    np.testing.assert_allclose(drawn.nodal["sxx"] / 10e6, 0, atol=1e-9)
+    assert drawn.displacement[:, 1].min() == pytest.approx(-0.2, abs=1e-9)
+
+
+def test_the_keys_leave_the_names_and_problems_of_linear_elasticity_as_they_are():
+    given = parse("beam-ring/Nr=2/Nh=2/steps=1/dual", problems.PROBLEMS)
+    finite = parse(
+        "beam-ring/Nr=2/Nh=2/steps=1/kinematics=finite/newton=2/dual",
+        problems.PROBLEMS,
+    )
+
+    assert given.name == "beam-ring/Nr=2/Nh=2/steps=1/dual"
+    assert finite.name.endswith("steps=1/kinematics=finite/newton=2/dual")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("beam-ring/newton=2/dual", "newton=2 is not used by kinematics=linear"),
+        ("beam-ring/material=svk/dual", "material=svk is not used by"),
+        ("beam-ring/contact_stiffness=geometric/dual", "is not used by"),
+        ("beam-ring/kinematics=finite/relin=2/dual", "relin=2 with kinematics=finite "
+         "is not built; expected relin=1, or kinematics=linear"),
+        ("beam-ring/kinematics=finite/plane=stress/dual", "plane=stress with"),
+        ("beam-ring/kinematics=finite/friction=coulomb/mu=0.3/dual",
+         "friction=coulomb with kinematics=finite is not built"),
+        ("beam-ring/kinematics=finite/contact=mortar/contact_stiffness=geometric/dual",
+         "contact_stiffness=geometric with contact=mortar is not built; expected "
+         "contact=nts"),
+        ("beam-ring/kinematics=large/dual", "kinematics='large' is unknown"),
+        ("hertz-plane/kinematics=finite/newton=-1/dual", "newton=-1 must be at least"),
+        ("contact-patch/stretch=0.8/dual", "stretch=0.8 is not used by"),
+        ("contact-patch/kinematics=finite/stretch=1.2/dual", "can only be pressed"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_together_is_refused_in_one_line(name, message):
+    with pytest.raises(InputError, match=message) as e:
+        parse(name, problems.PROBLEMS)
+    assert "\n" not in str(e.value)
+
+
+def test_a_material_that_softens_is_refused_where_it_does():
+    """The largest pressure of St. Venant-Kirchhoff is that at the stretch 1/√3."""
+    with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):
+        built("contact-patch", stretch=0.5, material="svk")
+
+
+def test_there_is_no_refined_case_at_finite_strain():
+    for family, own in CASES.values():
+        given = {**own, "kinematics": "finite"}
+        assert family.refined(family.complete(given)) is None
