@@ -68,7 +68,7 @@ class Substructures(Protocol):
         """Relative stiffness (N,) of the copies, one for all components of a node."""
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,) or (N, k), in its precision."""
+        """Apply PKP to v (N,), in its precision."""
 
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P to forces (N,)."""

@@ -375,10 +375,14 @@ def _waited(child: int, limit: float) -> int | None:
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy what git knows of, as it is in the working tree."""
+    """Copy what git knows of, as it is in the working tree, and compiled modules."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
-    for name in filter(None, os.fsdecode(listed.stdout).split("\0")):
+    compiled = [
+        str(path.relative_to(ROOT))
+        for room in ("problems", "solvers") for path in (ROOT / room).rglob("*.so")
+    ]  # fmt: skip
+    for name in filter(None, [*os.fsdecode(listed.stdout).split("\0"), *compiled]):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)

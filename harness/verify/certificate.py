@@ -71,7 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import equilibrated
+from harness.verify.substructured import neighbour
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -318,10 +318,10 @@ def _substructured_proof(
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
-    torn = equilibrated(mechanics, feasible, lam)
-    moved = parts.spread.astype(Real) @ (claimed - feasible)
-    v = np.column_stack([torn.u, torn.d, moved])
-    energy = v.T @ np.column_stack([torn.Ku, parts.product(v[:, 1:])])
+    near = neighbour(mechanics, feasible, lam)
+    moved = (parts.spread @ (claimed - feasible)).astype(np.float64)
+    stretched = (near.Ku, near.Kd, parts.product(moved))
+    energy = np.array([[v @ Kw for Kw in stretched] for v in (near.u, near.d, moved)])
 
     def length(*combined: float) -> float:
         """Return the norm of a combination of Tû, d and T(u − û)."""
@@ -329,9 +329,9 @@ def _substructured_proof(
         return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
 
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=torn.u - torn.d,
+        mechanics, u=feasible, multipliers=lam, equilibrium=near.u - near.d,
         norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
-        apart=length(0, 1, 0), left=torn.left,
+        apart=length(0, 1, 0), left=near.left,
         works=exact.friction_work(feasible) - lam * exact.motion(feasible),
         rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
     )  # fmt: skip

@@ -39,56 +39,60 @@ from scipy.linalg import qr
 from scipy.sparse import csc_matrix, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from harness.mechanics import Extended, Mechanics, Real
+from harness.mechanics import Extended, Mechanics
 from harness.qp import Vector
 
 
-class Torn(NamedTuple):
-    """Forces of an admissible û that local problems do not balance, and what they do.
+class Neighbour(NamedTuple):
+    """The u_λ near a displacement û, as torn displacements (N,)."""
 
-    Of torn displacements v, products are  vᵀKw  with the stiffness of the subdomains.
-    """
-
-    u: Extended  #: Tû (N,)
+    u: Extended  #: Tû
     Ku: Extended  #: K_T Tû
-    d: Vector  #: (N,) Tû − u_λ, as far as it was solved for
+    d: Vector  #: Tû − u_λ, as far as it was solved for
+    Kd: Vector  #: K_T d
     left: float  #: energy norm of the rest of d
 
 
-def equilibrated(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Torn:
-    """Find the u_λ of an admissible û (n,) and λ̂ (m,) that is near Tû."""
+def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neighbour:
+    """Find u_λ from an admissible û (n,) and λ̂ (m,)."""
     exact, parts = mechanics.exact, mechanics.substructures
-    torn = parts.spread.astype(Real) @ u
+    torn = parts.spread @ u
     pull = parts.product(torn)
     residual = parts.spread.T @ pull - exact.f + exact.B.T @ multipliers
     residual[exact.held] = 0
-    b = _sharing(mechanics)(residual.astype(np.float64))
+    b = _shared(mechanics, residual.astype(np.float64))
     d = parts.solve(b)
-    b = b - parts.product(d)
-    step = parts.solve(b)
-    return Torn(torn, pull, d, float(np.sqrt(abs(float(b @ step)))))
+    Kd = parts.product(d)
+    step = parts.solve(b - Kd)
+    return Neighbour(torn, pull, d, Kd, float(np.sqrt(abs(float((b - Kd) @ step)))))
 
 
-def _sharing(mechanics: Mechanics) -> Callable[[Vector], Vector]:
-    """Return the map from a residual ρ (n,) to forces b (N,) of subdomains."""
+def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
+    """Share ρ (n,) among the subdomains, balanced in each: b (N,).
+
+    Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
+    """
     parts, held = mechanics.substructures, mechanics.exact.held
-    T, R, w = parts.spread, parts.kernel, parts.weight
-    total = T.multiply(T).T @ w
-    total[held] = np.inf
-    WT = csr_array(diags_array(w) @ T)
+    squares = parts.spread.copy()
+    squares.data **= 2
+    total = squares.T @ parts.weight
+    part = parts.weight / (squares @ total)
+    single = np.ones(total.size, dtype=bool)
+    single[held] = False
+    inner = (part > 1 - 1e-9) & (squares @ single > 1 - 1e-9)
+    at = np.flatnonzero(~inner)
+    T, R, w = parts.spread[at], parts.kernel[at], parts.weight[at]
+    inverse = 1 / total
+    inverse[held] = 0
     WR = csr_array(diags_array(w) @ R)
     TWR = csr_array(T.T @ WR)
-    coarse = R.T @ WR - TWR.T @ (diags_array(1 / total) @ TWR)
+    coarse = R.T @ WR - TWR.T @ (diags_array(inverse) @ TWR)
     solve = _coarse_solve(csr_array(coarse), _moved_together(mechanics))
-
-    def share(residual: Vector) -> Vector:
-        b = WT @ (residual / total)
-        for _ in range(2):  # the second one for the digits that the first one lost
-            mu = solve(R.T @ b)
-            b = b - WR @ mu + WT @ ((TWR @ mu) / total)
-        return np.asarray(b)
-
-    return share
+    b = part * (parts.spread @ residual)
+    for _ in range(2):  # the second time for the digits that the first one lost
+        mu = solve(parts.kernel.T @ b)
+        b[at] -= WR @ mu - w * (T @ (inverse * (TWR @ mu)))
+    return np.asarray(b)
 
 
 def _moved_together(mechanics: Mechanics) -> Any:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import InputError, Vector
@@ -83,8 +82,11 @@ class Bodies:
     def rigid(self) -> NDArray[np.float64]:
         """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
         owner, points = self.body_of_node, self.mesh.points
-        modes = [rigid_modes(points[owner == b]) for b in range(len(self.names))]
-        return np.asarray(block_diag(*modes))
+        motions = np.zeros((points.size, 3 * len(self.names)))
+        for b in range(len(self.names)):
+            own = dofs_of(np.flatnonzero(owner == b))
+            motions[own, 3 * b : 3 * b + 3] = rigid_modes(points[owner == b])
+        return motions
 
     @property
     def mesh_size(self) -> float:

@@ -15,7 +15,7 @@ from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import Bodies
 from problems.contact.results import fields
 from problems.duality.dualisation import dual_bounds, dualise, posed
-from problems.duality.torn_dual import torn_dual, torn_matrices
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.inverse import GeneralisedInverse
 from problems.feti.substructures import local_problems
 from problems.feti.torn import Torn
@@ -58,6 +58,7 @@ def contact_case(
 
     """
     matrices: Mapping[str, Any] = {}
+    decomposition: Mapping[str, Any] = {}
     seconds, tear = None, None
     if torn is not None:
         if form != "dual":
@@ -69,6 +70,7 @@ def contact_case(
         new, tear = torn_dual(pieces, primal, friction), partial(local_problems, pieces)
         seconds = perf_counter() - start
         matrices = torn_matrices(pieces, new.qp)
+        decomposition = torn_quantities(pieces, new.qp)
     elif form == "primal":
         new = posed(primal, friction)
     else:
@@ -83,7 +85,7 @@ def contact_case(
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x * bodies.length,
-        quantities=lambda s: quantities(new.recover(s)),
+        quantities=lambda s: {**quantities(new.recover(s)), **decomposition},
         fields=lambda s: fields(bodies, primal, new.recover(s), friction),
         scale=new.sign * energy,
         constant=new.constant * energy,

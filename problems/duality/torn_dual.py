@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from harness import QP, Friction, Solution, Vector, no_rows
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.duality.dualisation import Transformed
-from problems.feti.operators import dual_operator
+from problems.feti.operators import block_bytes, dual_operator, touched
 from problems.feti.torn import Torn
 
 
@@ -70,3 +70,23 @@ def torn_matrices(torn: Torn, dual: QP) -> dict[str, Any]:
     """Name the matrices of the dual as the paper does: F, d, B, c and R."""
     R = torn.domains.kernel
     return {"F": dual.P, "d": -dual.q, "B": torn.B, "c": torn.c, "R": R}
+
+
+def torn_quantities(torn: Torn, dual: QP) -> dict[str, Any]:
+    """Report how bodies are torn, and how F is multiplied with.
+
+    kinds: of subdomains, each with one factor. torn_dofs: all copies counted.
+    multipliers: rows of B. explicit_subdomains: whose blocks (K⁺)_bb and S_bb are
+    formed, the others solve in every product. explicit_mib: what they take, MiB.
+    """
+    explicit = dual.P.arrays["explicit"]
+    sizes = np.array([part.size for part in touched(torn.B, torn.domains)])
+    taken = block_bytes(sizes, torn.domains)
+    return {
+        "subdomains": torn.kind.size,
+        "kinds": len(torn.kinds),
+        "torn_dofs": torn.f.size,
+        "multipliers": torn.c.size,
+        "explicit_subdomains": int(explicit[torn.kind].sum()),
+        "explicit_mib": float(taken[explicit].sum() / 2**20),
+    }

@@ -37,7 +37,6 @@ from problems.feti.operators import (
     SHIFT,
     DualOperator,
     touched,
-    weighted_blocks,
 )
 from problems.feti.torn import Dense, Subdomains
 
@@ -195,7 +194,7 @@ class RankOperator:
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
         of, ranks = self.local.packed, self.exchange.ranks
-        blocks, weights = weighted_blocks(of.groups, kind, scaling)
+        blocks, weights = self.local.weighted_blocks(kind, scaling)
         BW = csr_array(of.B @ diags_array(weights))
         WB = csr_array(BW.T)
         solve = self._gram_inverse(csr_array(BW @ of.BT))

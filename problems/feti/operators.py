@@ -6,9 +6,10 @@ packed group by group, a product is sparse, dense, sparse:
     F λ = B_b diag((K⁺)_bb) B_bᵀ λ
 
 A group is subdomains that share a dense block; what they gather are the columns of one
-matrix, so that a group is one product of two dense matrices. A block (K⁺)_bb is formed
-where it fits (*explicit*; it pays after about ten products, and memory traffic is less
-than that of a factor); beyond, a product solves with the factor of its kind.
+matrix, so that a group is one product of two dense matrices. Of the block of a single
+subdomain one triangle is kept, since reading it takes the time. Blocks (K⁺)_bb and S_bb
+are formed where they fit (*explicit*; it pays after about ten products); beyond, a
+product solves with the factors of its kind.
 
 Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999):
 
@@ -29,6 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
 from sksparse.cholmod import cholesky
 
@@ -118,11 +120,11 @@ class DualOperator:
 
     B: csr_array  #: (m, N)
     domains: Subdomains
-    explicit: NDArray[np.bool_]  #: (kinds,) whether (K⁺)_bb is formed
+    explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
-        return self.packed.congruence(self._blocks, x)
+        return self.packed.congruence([inverse for inverse, _ in self._blocks], x)
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
@@ -136,7 +138,35 @@ class DualOperator:
             For other names.
 
         """
-        return _scaled(self.packed, *weighted_blocks(self.packed.groups, kind, scaling))
+        return _scaled(self.packed, *self.weighted_blocks(kind, scaling))
+
+    def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
+        """Return D of each group, and the weights W of all that rows touch.
+
+        Raises
+        ------
+        ValueError
+            As of `preconditioner`.
+
+        """
+        for name, value, known in (
+            ("preconditioner", kind, ("lumped", "dirichlet")),
+            ("scaling", scaling, ("multiplicity", "stiffness")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
+        groups = self.packed.groups
+        blocks = (
+            [g.kind.block(g.touched) for g in groups] if kind == "lumped"
+            else [schur for _, schur in self._blocks]
+        )  # fmt: skip
+        softness = [
+            np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
+        ]
+        weights = np.concatenate(softness)
+        if scaling == "multiplicity":
+            weights = np.ones_like(weights)
+        return blocks, weights
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Take this rank's share of a dual with this F."""
@@ -150,51 +180,54 @@ class DualOperator:
         return packed(self.B, self.domains, self.explicit)
 
     @cached_property
-    def _blocks(self) -> list[Any]:
+    def _blocks(self) -> list[tuple[Any, Any]]:
+        """(K⁺)_bb and S_bb of each group: matrices, or what multiplies with them."""
         return [
-            g.kind.compliance(g.touched) if g.explicit else _Solved(g.kind, g.touched)
-            for g in self.packed.groups
+            _explicit(g) if g.explicit else _implicit(g) for g in self.packed.groups
         ]
 
 
-def weighted_blocks(
-    groups: Sequence[Group], kind: str, scaling: str
-) -> tuple[list[Any], Vector]:
-    """Return the blocks D of groups, and the weights W of all that they touch.
-
-    Raises
-    ------
-    ValueError
-        For other names than those of `DualOperator.preconditioner`.
-
-    """
-    for name, value, known in (
-        ("preconditioner", kind, ("lumped", "dirichlet")),
-        ("scaling", scaling, ("multiplicity", "stiffness")),
-    ):
-        if value not in known:
-            raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
-    if kind == "lumped":
-        blocks: list[Any] = [g.kind.block(g.touched) for g in groups]
-    else:
-        blocks = [g.kind.schur(g.touched) for g in groups]
-    softness = [
-        np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
-    ]
-    weights = np.concatenate(softness)
-    return blocks, np.ones_like(weights) if scaling == "multiplicity" else weights
+def _explicit(group: Group) -> tuple[Any, Any]:
+    blocks = group.kind.condensed(group.touched)
+    if group.members.size == 1:
+        return _Triangle.of(blocks.compliance), _Triangle.of(blocks.schur)
+    return blocks
 
 
-class _Solved(NamedTuple):
-    """(K⁺)_bb that is not formed: a product solves with the factor."""
+def _implicit(group: Group) -> tuple[Any, Any]:
+    kind, b = group.kind, group.touched
+    g = np.union1d(kind.boundary, b)
+    at = np.searchsorted(g, b)
+    return _Part(kind.K.shape[0], b, kind.inverse), _Part(
+        g.size, at, kind.elimination(g).__matmul__
+    )
 
-    kind: Kind
-    b: Nodes
+
+class _Triangle(NamedTuple):
+    """A symmetric matrix by its upper triangle, column by column."""
+
+    n: int
+    entries: Vector
+
+    @classmethod
+    def of(cls, M: Dense) -> _Triangle:
+        return cls(len(M), lapack.dtrttp(M)[0])
 
     def __matmul__(self, X: Dense) -> Dense:
-        whole = np.zeros((self.kind.K.shape[0], X.shape[1]))
+        return np.stack([blas.dspmv(self.n, 1.0, self.entries, x) for x in X.T], axis=1)
+
+
+class _Part(NamedTuple):
+    """M_bb of a matrix M (n, n) that columns can be multiplied with."""
+
+    n: int
+    b: Nodes
+    product: Product
+
+    def __matmul__(self, X: Dense) -> Dense:
+        whole = np.zeros((self.n, X.shape[1]))
         whole[self.b] = X
-        return self.kind.inverse(whole)[self.b]
+        return self.product(whole)[self.b]
 
 
 def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:
@@ -243,7 +276,7 @@ def dual_operator(B: csr_array, domains: Subdomains) -> SerialisableOperator:
         "fixing": np.concatenate([kind.fixing for kind in kinds]),
         "boundary": np.concatenate([kind.boundary for kind in kinds]),
         "kind": domains.kind,
-        "explicit": _explicit(B, domains),
+        "explicit": explicit_kinds(B, domains),
     }
     for name in _OF_KINDS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
@@ -274,10 +307,16 @@ def made(arrays: Arrays) -> DualOperator:
     return DualOperator(B, domains, arrays["explicit"])
 
 
-def _explicit(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
-    """Choose the kinds whose block is formed: the smallest, as many as fit."""
+def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
+    """Choose the kinds whose blocks are formed: the smallest, as many as fit."""
     sizes = np.array([part.size for part in touched(B, domains)])
     order = np.argsort(sizes, kind="stable")
     found = np.zeros(sizes.size, dtype=bool)
-    found[order] = np.cumsum(8 * sizes[order] ** 2) <= EXPLICIT_MIB * 2**20
+    found[order] = np.cumsum(block_bytes(sizes, domains)[order]) <= EXPLICIT_MIB * 2**20
     return found
+
+
+def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
+    """Return what both blocks of each kind take, formed on so many components."""
+    alone = np.array([members.size == 1 for members in domains.members])
+    return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

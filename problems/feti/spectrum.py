@@ -6,9 +6,10 @@ With P the orthogonal projector onto ker G ∩ range B, the condition numbers ar
     P M P F               in the inner product  xᵀF y,
 
 the latter with a preconditioner M ≈ F⁻¹; both on the range of P. Both are self-adjoint
-there, so that one Lanczos process serves both (Parlett 1998, Chapter 13):
-orthogonalised against all earlier vectors, twice, it keeps what it found. Every vector
-is projected anew, as what rounding leaves of a kernel grows from step to step.
+there, so that one Lanczos process serves both (Parlett 1998, Chapter 13). Each vector
+is orthogonalised against the last two, as the recurrence says, then against all, so
+that nothing is found twice; and it is projected anew, as what rounding leaves of a
+kernel grows from step to step.
 
 Of a Ritz value θ with residual r an eigenvalue is no farther than ‖r‖, and ‖r‖ is what
 the last row of the tridiagonal matrix says.
@@ -138,8 +139,8 @@ def spectrum(
         V[k], WV[k] = v / length, Wv / length
         v = image(WV[k])
         alpha.append(float(v @ WV[k]))
-        for _ in range(2):
-            v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
+        v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
+        v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)

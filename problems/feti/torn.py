@@ -15,9 +15,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
@@ -49,41 +51,76 @@ class Kind:
         """Apply K⁺ to columns (n_k, k)."""
         return np.asarray(self._factor(b))
 
-    def compliance(self, b: Nodes) -> Dense:
-        """Return (K⁺)_bb."""
-        C = np.empty((b.size, b.size))
-        for columns in _strips(b.size):
-            unit = np.zeros((self.K.shape[0], columns.stop - columns.start))
-            unit[b[columns], np.arange(unit.shape[1])] = 1
-            C[:, columns] = self.inverse(unit)[b]
-        return _symmetric(C)
-
     def block(self, b: Nodes) -> csr_array:
         """Return K_bb."""
         return csr_array(self.K[b][:, b])
 
-    def schur(self, b: Nodes) -> Dense:
-        """Return S_bb of  S = K_gg − K_gi K_ii⁻¹K_ig  on g: boundary and b."""
-        i = np.setdiff1d(np.arange(self.K.shape[0]), np.union1d(self.boundary, b))
-        S = self.block(b).toarray()
-        if i.size:
-            K_ib, inner = (
-                csc_array(self.K[i][:, b]),
-                cholesky(csc_matrix(self.K[i][:, i])),
-            )
-            for columns in _strips(b.size):
-                S[:, columns] -= K_ib.T @ inner(K_ib[:, columns].toarray())
-        return _symmetric(S)
+    def condensed(self, b: Nodes) -> Condensed:
+        """Condense onto components b: what is inside is eliminated once for both.
+
+        ::
+
+            (K⁺)_bb = ((S_h + ρR*R*ᵀ)⁻¹)_bb,    S_h = K_hh − K_hi K_ii⁻¹K_ih
+
+        where h are the boundary, b and the fixing components, and i all others.
+        """
+        g = np.union1d(self.boundary, b)
+        h = np.union1d(g, self.fixing)
+        S, at = self.elimination(h) @ np.eye(h.size), np.searchsorted(h, b)
+        K_rho, fixed = S.copy(), np.searchsorted(h, self.fixing)
+        K_rho[np.ix_(fixed, fixed)] += self._held
+        C = cho_solve(cho_factor(K_rho, lower=True), np.eye(h.size)[:, at])[at]
+        S_bb, inner = S[np.ix_(at, at)], ~np.isin(h, g)
+        if inner.any():
+            S_ib = S[inner][:, at]
+            S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
+        return Condensed(_symmetric(C), _symmetric(S_bb))
+
+    def elimination(self, h: Nodes) -> Elimination:
+        """Eliminate all components but h; S on these multiplies columns."""
+        i = np.setdiff1d(np.arange(self.K.shape[0]), h)
+        order = np.concatenate([h, i])
+        K = csc_array(csc_array(self.K[:, order])[order])
+        K_hh, K_ih = csr_array(K[: h.size, : h.size]), csr_array(K[h.size :, : h.size])
+        factor = cholesky(csc_matrix(K[h.size :, h.size :])) if i.size else None
+        return Elimination(K_hh, K_ih, factor)
+
+    @cached_property
+    def _held(self) -> Dense:
+        """ρR*R*ᵀ at the fixing components, (p, p)."""
+        star = np.linalg.qr(self.R[self.fixing])[0]
+        return np.asarray(self.K.diagonal().max() * (star @ star.T))
 
     @cached_property
     def _factor(self) -> Factor:
-        """Factorise K_ρ, made when it is first needed."""
-        p, n = self.fixing.size, self.K.shape[0]
-        star = np.linalg.qr(self.R[self.fixing])[0]
-        block = self.K.diagonal().max() * (star @ star.T)
+        """Factorise K_ρ, where it is first needed."""
+        p = self.fixing.size
         where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
-        K_rho = self.K + csc_array((block.ravel(), where), shape=(n, n))
-        return cholesky(csc_matrix(K_rho))
+        held = csc_array((self._held.ravel(), where), shape=self.K.shape)
+        return cholesky(csc_matrix(self.K + held))
+
+
+class Condensed(NamedTuple):
+    """Blocks of one kind on components b."""
+
+    compliance: Dense  #: (K⁺)_bb
+    schur: Dense  #: S_bb of S condensed onto the boundary and b
+
+
+class Elimination(NamedTuple):
+    """S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
+
+    K_hh: csr_array
+    K_ih: csr_array
+    factor: Factor | None  #: of K_ii, where there is any i
+
+    def __matmul__(self, X: Dense) -> Dense:
+        SX = np.asarray(self.K_hh @ X)
+        if self.factor is not None:
+            for begin in range(0, X.shape[1], _STRIP):
+                strip = slice(begin, begin + _STRIP)
+                SX[:, strip] -= self.K_ih.T @ self.factor(self.K_ih @ X[:, strip])
+        return SX
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +199,6 @@ class Torn:
     def domains(self) -> Subdomains:
         """The subdomains on their own, with what is factorised once."""
         return Subdomains(self.kinds, self.kind)
-
-
-def _strips(columns: int) -> Iterator[slice]:
-    """Split columns so that few right-hand sides are dense at a time."""
-    for begin in range(0, columns, _STRIP):
-        yield slice(begin, min(begin + _STRIP, columns))
 
 
 def _symmetric(M: Dense) -> Dense:

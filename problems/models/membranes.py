@@ -27,7 +27,7 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from problems.contact.sides import active
 from problems.duality.dualisation import posed
-from problems.duality.torn_dual import torn_dual, torn_matrices
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
 from problems.fem.mesh import Mesh, Nodes, join, prefixed, rectangle
@@ -46,6 +46,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
+    decomposition: Mapping[str, Any] = {}
     seconds, tear = None, None
     if form == "primal":
         new = posed(pair.qp)
@@ -55,11 +56,12 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         new, tear = torn_dual(torn, pair.qp), partial(local_problems, torn, 1)
         seconds = perf_counter() - start
         matrices = torn_matrices(torn, new.qp)
+        decomposition = torn_quantities(torn, new.qp)
     dofs = pair.qp.q.size
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x,
-        quantities=lambda s: pair.quantities(new.recover(s)),
+        quantities=lambda s: {**pair.quantities(new.recover(s)), **decomposition},
         scale=new.sign,
         constant=new.constant,
         matrices=matrices,
@@ -156,8 +158,6 @@ class Membranes:
             "nodes": len(self.mesh.points),
             "elements": len(self.mesh.cells),
             "dofs": self.qp.q.size,
-            "subdomains": 2 * self.S**2,
-            "torn_dofs": 2 * self.S**2 * (self.n + 1) ** 2,
             "equality_rows": self.qp.b.size,
             "contact_rows": self.qp.h.size,
             "active": int(active(s.z).sum()),

@@ -50,7 +50,7 @@ from harness import (
 )
 from problems.contact.sides import ACTIVE
 from problems.duality.dualisation import Transformed, dual_bounds, dualise
-from problems.duality.torn_dual import torn_dual
+from problems.duality.torn_dual import torn_dual, torn_quantities
 from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
 from problems.feti.gluing import glue
@@ -71,11 +71,13 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     p: Any = params
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
     rows, start, tear = problem.qp, perf_counter(), None
+    decomposition: Mapping[str, Any] = {}
     if form == "primal":
         new = with_bounds(rows)
     elif p["feti"]:
         pieces = problem.torn(p["feti"], p["glue"])
         new, tear = torn_dual(pieces, rows), partial(local_problems, pieces, 1)
+        decomposition = torn_quantities(pieces, new.qp)
     elif form == "dual":
         new = dualise(rows, problem.floating())
     else:
@@ -85,7 +87,9 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     return Case(
         qp=new.qp,
         recover=lambda s: problem.lift + new.recover(s).x,
-        quantities=lambda s: obstacle_quantities(problem, new.recover(s)),
+        quantities=lambda s: {
+            **obstacle_quantities(problem, new.recover(s)), **decomposition,
+        },
         scale=new.sign,
         constant=new.constant + datum,
         dualise_seconds=seconds,

@@ -27,7 +27,7 @@ from scipy.sparse import csr_array, eye_array
 from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
 from harness.mechanics import Substructures
 from problems.duality.dualisation import Transformed, posed
-from problems.duality.torn_dual import torn_dual, torn_matrices
+from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
 from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
@@ -193,16 +193,14 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
 
 
 def dual_quantities(plate: Plate) -> dict[str, Any]:
-    """Report the dual: its size, ‖PFP‖, and condition numbers with error bounds.
+    """Report how the plate is torn, ‖PFP‖, and condition numbers with error bounds.
 
     kappa: κ(PFP). kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
     preconditioners, by multiplicity but for the last. Each has an `…_error`.
     """
-    torn, spectra = plate.torn, plate.spectra
+    spectra = plate.spectra
     found: dict[str, Any] = {
-        "subdomains": torn.kind.size,
-        "torn_dofs": torn.f.size,
-        "multipliers": torn.c.size,
+        **torn_quantities(plate.torn, plate.dual.qp),
         "norm_PFP": spectra["none"].largest,
         "norm_PFP_error": spectra["none"].largest_error,
     }

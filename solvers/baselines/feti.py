@@ -36,6 +36,8 @@ Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 TIGHTEST = 1e-4  #: factor of the tolerance at which they have had their chance
+PATIENCE = 100  #: steps in a row that need not halve ‖w‖
+LEFT = "no further progress: rounding, or the cost is unbounded"
 PIVOT = 1e-13  #: of the factor of GQGᵀ, relative to the largest: rows are dependent
 BATCH = 256  #: columns of Gᵀ that the preconditioner is applied to at a time
 
@@ -172,8 +174,8 @@ class _Task:
 
 class _State(NamedTuple):
     x: Vector
-    r: Vector  #: d − Fx
-    w: Vector  #: P_Qᵀr
+    y: Vector  #: (r,) multipliers of Gx = e
+    w: Vector  #: d − Fx − Gᵀy = P_Qᵀ(d − Fx)
 
 
 @dataclass(eq=False)
@@ -201,34 +203,53 @@ class _Directions:
 
 def _certified(task: _Task, tol: float, most: int) -> Solution:
     """Tighten the tolerance until the KKT residuals agree."""
-    qp, tighter, norms = task.qp, 1.0, []
-    x = task.coarse.feasible(qp.b)
-    at = _state(task, x)
-    directions = _Directions(np.empty((16, x.size)), np.empty((16, x.size)))
+    qp, tighter = task.qp, 1.0
+    at = _state(task, task.coarse.feasible(qp.b))
+    directions = _Directions(np.empty((16, qp.q.size)), np.empty((16, qp.q.size)))
     norms = [float(np.linalg.norm(at.w))]
     while True:
-        while norms[-1] > tighter * tol * norms[0]:
-            if directions.count >= most:
-                return _unsolved(_point(task, at, norms), "step limit")
-            step = _step(task, at, directions)
-            if step is None:
-                break
-            at = step
-            norms.append(float(np.linalg.norm(at.w)))
+        at, ended = _iterated(task, at, directions, norms, tighter * tol, most)
         at = _state(task, at.x)
+        norms[-1] = float(np.linalg.norm(at.w))
+        task.counts.setdefault("steps_to_tol", len(norms) - 1)
         point = _point(task, at, norms)
         worst = kkt_residuals(qp, point).worst
         if worst <= CLAIM * tol:
             return point
-        tighter *= min(0.5, CLAIM * tol / worst)
-        if tighter < TIGHTEST or not np.isfinite(worst):
-            message = "no further progress: rounding, or the cost is unbounded"
-            return _unsolved(point, message)
+        tighter *= min(0.5, max(0.1, CLAIM * tol / worst))
+        if ended or tighter < TIGHTEST or not np.isfinite(worst):
+            return replace(point, status=Status.ITERATION_LIMIT, message=ended or LEFT)
+
+
+def _iterated(
+    task: _Task, at: _State, directions: _Directions, norms: list[float],
+    accuracy: float, most: int,
+) -> tuple[_State, str]:  # fmt: skip
+    """Move until ‖w‖ ≤ accuracy ‖w₀‖; say why it ended before, if it did."""
+    least, waited = norms[-1], 0
+    while norms[-1] > accuracy * norms[0]:
+        if directions.count >= most:
+            return at, "step limit"
+        step = _step(task, at, directions)
+        if step is None or waited == PATIENCE:
+            return at, LEFT
+        at = step
+        norms.append(float(np.linalg.norm(at.w)))
+        waited = 0 if norms[-1] < least / 2 else waited + 1
+        least = min(least, norms[-1])
+    return at, ""
 
 
 def _state(task: _Task, x: Vector) -> _State:
-    r = -task.qp.q - task.product(x)
-    return _State(x, r, r - task.qp.A.T @ task.coarse.multipliers(r))
+    """Compute the residual anew; it is projected twice, for y may be large."""
+    once = _projected(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
+    return _projected(task, *once)
+
+
+def _projected(task: _Task, x: Vector, y: Vector, r: Vector) -> _State:
+    """Project the residual r of x and y by multipliers, which are added to y."""
+    change = task.coarse.multipliers(r)
+    return _State(x, y + change, np.asarray(r - task.qp.A.T @ change))
 
 
 def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
@@ -242,20 +263,14 @@ def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
     p, Fp = p / size, Fp / size
     directions.add(p, Fp)
     alpha = float(p @ at.w)
-    r = at.r - alpha * Fp
-    w = r - task.qp.A.T @ task.coarse.multipliers(r)
-    return _State(at.x + alpha * p, r, np.asarray(w))
-
-
-def _unsolved(point: Solution, message: str) -> Solution:
-    return replace(point, status=Status.ITERATION_LIMIT, message=message)
+    return _projected(task, at.x + alpha * p, at.y, at.w - alpha * Fp)
 
 
 def _point(task: _Task, at: _State, norms: list[float]) -> Solution:
     n, m = task.qp.q.size, len(norms)
     task.counts["P_products"] += 1  # of the residuals that follow
     return Solution(
-        status=Status.SOLVED, x=at.x, y=task.coarse.multipliers(at.r), z=np.zeros(0),
+        status=Status.SOLVED, x=at.x, y=at.y, z=np.zeros(0),
         z_box=np.zeros(n), iterations=m - 1, message="converged",
         counts=dict(task.counts),
         history={"step": np.full(m, "c"), "free_gradient": np.array(norms)},

@@ -21,11 +21,11 @@ from harness.mechanics import Extended, Real
 from harness.names import parse
 from harness.verify.certificate import Certificate
 from harness.verify.references import ReferencePoint, reference_point
-from harness.verify.substructured import equilibrated
+from harness.verify.substructured import neighbour
 from problems import PROBLEMS
 from problems.contact.bodies import Bodies
 from problems.feti.elastic import subdivide, torn
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems, local_problems
 from problems.models import beam_ring, hertz, patch
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -224,8 +224,8 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
     u[mechanics.exact.held] = 0
-    torn = equilibrated(mechanics, u, exact.multipliers)
-    b = parts.product(torn.d)
+    near = neighbour(mechanics, u, exact.multipliers)
+    b = parts.product(near.d)
     residual = mechanics.stiffness @ u - mechanics.exact.f
     residual = residual + mechanics.exact.B.T @ exact.multipliers
     free = np.setdiff1d(np.arange(u.size), mechanics.exact.held)
@@ -234,14 +234,13 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
         (parts.spread.T @ b - residual)[free].astype(float), 0, atol=1e-11 * size
     )
     assert np.abs(parts.kernel.T @ b).max() < 1e-11 * size
-    assert torn.left < 1e-9 * np.sqrt(torn.d @ b)
+    assert near.left < 1e-9 * np.sqrt(near.d @ b)
 
 
 def test_local_problems_are_those_of_the_torn_bodies() -> None:
-    mechanics = known(CASES[0]).mechanics
-    parts = mechanics.substructures
-    kinds = parts.domains.kinds  # type: ignore[attr-defined]
-    K = block_diag([kinds[k].K for k in parts.domains.kind])  # type: ignore[attr-defined]
+    parts = known(CASES[0]).mechanics.substructures
+    assert isinstance(parts, LocalProblems)
+    K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)

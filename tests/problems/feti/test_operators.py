@@ -103,6 +103,10 @@ def test_a_block_that_is_not_formed_gives_the_same_product(pair):
     assert arrays["explicit"].all()
     assert_allclose(implicit(x), Fx, atol=1e-11 * abs(Fx).max())
     assert_allclose(implicit(x[:, 0]), Fx[:, 0], atol=1e-11 * abs(Fx).max())
+    for kind in KINDS:
+        Mx = made(arrays).preconditioner(kind, "stiffness")(x)
+        found = implicit.preconditioner(kind, "stiffness")(x)
+        assert_allclose(found, Mx, atol=1e-9 * abs(Mx).max())
 
 
 def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
@@ -115,7 +119,7 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
         ])).size for k in range(len(pair.kinds))
     ]  # fmt: skip
     assert len(set(sizes)) > 1
-    room = 8 * (np.square(sizes).sum() - 1) / 2**20
+    room = 16 * (np.square(sizes).sum() - 1) / 2**20
     monkeypatch.setattr("problems.feti.operators.EXPLICIT_MIB", room)
 
     explicit = operator_of(pair).arrays["explicit"]
@@ -123,6 +127,21 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     assert arrays["explicit"].all()
     assert (np.array(sizes)[~explicit] == max(sizes)).all()
     assert (~explicit).sum() == 1
+
+
+def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
+    """Each of two membranes in one square, of the same kind or of two."""
+    pair = Membranes(1, 4).torn("orthonormal")
+    (kind,) = pair.kinds
+    other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
+    F, apart = operator_of(pair), operator_of(other)
+    x = np.random.default_rng(3).standard_normal((pair.scale.size, 2))
+
+    assert_allclose(apart @ x, F @ x, rtol=1e-11, atol=1e-13)
+    for name in KINDS:
+        M, of_two = (f.build().preconditioner(name, "stiffness") for f in (F, apart))
+        assert_allclose(of_two(x), M(x), rtol=1e-11, atol=1e-12)
+        assert_allclose(of_two(x[:, 1]), M(x)[:, 1], rtol=1e-11, atol=1e-12)
 
 
 def definition(pair, kind, scaling):

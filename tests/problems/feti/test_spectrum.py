@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.sparse import csr_array
 
 from problems.feti.spectrum import dependencies, spectrum
-from tests.problems.feti.test_tearing import torn_pair
+from tests.support.torn_bodies import torn_pair
 
 NO_ROWS = csr_array((0, 40))
 

@@ -1,38 +1,15 @@
 """Bodies torn into subdomains, and the rows that hold these together."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
-from problems.contact.bodies import Bodies
-from problems.contact.linearise import linearisation
-from problems.duality.stepping import primal_qp
-from problems.feti.elastic import subdivide, torn
-from problems.feti.tearing import blocks
-from problems.feti.torn import Torn
-from problems.models.beam_ring import model
+from problems.fem.mesh import rectangle
+from problems.feti.tearing import blocks, decompose, structured_bodies
+from tests.support.torn_bodies import torn_pair
 
 GLUING = ("orthonormal", "chain", "redundant")
-
-
-def beam_and_ring(Nr: int = 4, Nh: int = 3, radial: int = 6) -> Bodies:
-    return model(Nr, Nh, radial, "strain")
-
-
-def labels(bodies: Bodies, Nr: int, Nh: int, radial: int, most: int) -> Any:
-    beam = blocks((8 * Nr, Nr), most)
-    return np.append(beam, beam.max() + 1 + blocks((12 * Nh, radial), most))
-
-
-def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:
-    bodies = beam_and_ring()
-    rough = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
-    primal = primal_qp(bodies, rough)
-    parts = subdivide(bodies, labels(bodies, 4, 3, 6, most))
-    return bodies, primal, torn(parts, primal, rows=rows)
 
 
 def test_blocks_are_as_equal_as_whole_numbers_allow() -> None:
@@ -45,6 +22,35 @@ def test_blocks_are_as_equal_as_whole_numbers_allow() -> None:
 
 def test_one_block_holds_what_is_not_larger_than_it() -> None:
     assert not blocks((8, 5), 8).any()
+
+
+def test_blocks_of_several_bodies_are_numbered_one_body_after_another() -> None:
+    label = structured_bodies([(4, 2), (3, 3), (1, 1)], 2)
+    assert label[:8].tolist() == [0, 0, 1, 1] * 2
+    assert label[8:17].reshape(3, 3)[0].tolist() == [2, 2, 3]
+    assert label[8:17].reshape(3, 3)[2].tolist() == [4, 4, 5]
+    assert label[17:].tolist() == [6]
+
+
+def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
+    mesh = rectangle((0.3, 0.1), (2.1, 0.7), (6, 2))
+    cells, of_one = mesh.cells, np.zeros(12, dtype=np.int64)
+    label = blocks((6, 2), 2)
+    assert decompose(mesh.points, cells, label, of_one).kind.tolist() == [0, 0, 0]
+    moved = mesh.points.copy()
+    moved[6] += 1e-7  # the upper right corner of the last one, in the first row
+    assert decompose(moved, cells, label, of_one).kind.tolist() == [0, 0, 1]
+    of_two = np.where(label == 1, 1, 0)
+    assert decompose(mesh.points, cells, label, of_two).kind.tolist() == [0, 1, 0]
+
+
+def test_a_mirror_image_is_of_another_kind() -> None:
+    points = np.array([[0, 0], [3, 0], [2, 1], [0, 1]], dtype=float)
+    mirrored = points * [-1, 1] + [10, 0]
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
+    of_one = np.zeros(2, dtype=np.int64)
+    both = decompose(np.vstack([points, mirrored]), cells, np.arange(2), of_one)
+    assert both.kind.tolist() == [0, 1]
 
 
 def test_rectangles_are_of_one_kind_and_each_layer_of_the_ring_is_of_one() -> None:
