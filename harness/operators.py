@@ -50,6 +50,21 @@ class Preconditioned(Protocol):
         """
 
 
+@runtime_checkable
+class WithDiagonal(Protocol):
+    """A product x ↦ Px that also knows the diagonal of P; a maker may return one.
+
+    The size of Pᵢᵢ tells how much a residual matters: without it an operator is held
+    to a stricter measure than a matrix (`harness.verify.kkt`).
+    """
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Multiply (n,) or (n, k) with P."""
+
+    def diagonal(self) -> NDArray[np.float64]:
+        """Give Pᵢᵢ (n,)."""
+
+
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
@@ -82,6 +97,11 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         if self._product is None:
             self._product = self._make(self.arrays)
         return self._product
+
+    def diagonal(self) -> NDArray[np.float64] | None:
+        """Give Pᵢᵢ (n,); None where what was put together does not tell."""
+        product = self.build()
+        return product.diagonal() if isinstance(product, WithDiagonal) else None
 
     def forget(self) -> None:
         """Drop what was built, so that the next one is charged with it again."""

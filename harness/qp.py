@@ -81,6 +81,15 @@ class QP:
         """Whether P is a matrix (dense or sparse), not an operator."""
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
+    def diagonal(self) -> Vector | None:
+        """Give Pᵢᵢ (n,); None where P is an operator that does not tell it."""
+        if self.is_explicit:
+            return np.asarray(self.P.diagonal(), dtype=float)
+        if not hasattr(self.P, "diagonal"):
+            return None
+        told: Vector | None = self.P.diagonal()
+        return told
+
     @property
     def sizes(self) -> dict[str, int]:
         """Variables, equality rows, inequality rows, finite bounds."""

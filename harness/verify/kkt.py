@@ -59,7 +59,8 @@ class _Terms:
     x: Vector  #: |x|
     Px: Vector
     Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
-    curvature: Vector  #: Pᵢᵢ, zero where P is an operator
+    curvature: Vector  #: Pᵢᵢ, zero where P does not tell
+    told: bool  #: whether P tells its diagonal
     forces: Vector  #: Aᵀy + Gᵀz + z_box
     forces_size: Vector
     residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, without what no bound can bear
@@ -103,9 +104,9 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
 def _terms(qp: QP, s: Solution) -> _Terms:
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
     x, z_lb, z_ub = np.abs(s.x), np.maximum(-s.z_box, 0), np.maximum(s.z_box, 0)
-    d = _curvature(qp)
+    d, told = _curvature(qp)
     Px = qp.P @ s.x
-    Px_size = np.sqrt(d) * (np.sqrt(d) @ x) if qp.is_explicit else 0 * x + _sup(Px)
+    Px_size = np.sqrt(d) * (np.sqrt(d) @ x) if told else 0 * x + _sup(Px)
     rows = qp.A.T @ s.y + qp.G.T @ np.maximum(s.z, 0)
     borne = np.where(upper, z_ub, 0) - np.where(lower, z_lb, 0)
     held = qp.b @ s.y + qp.h @ s.z
@@ -116,7 +117,7 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         np.abs(qp.lb[lower]) @ z_lb[lower],
     )  # fmt: skip
     return _Terms(
-        x=x, Px=Px, Px_size=Px_size, curvature=d,
+        x=x, Px=Px, Px_size=Px_size, curvature=d, told=told,
         forces=rows + qp.G.T @ np.minimum(s.z, 0) + s.z_box,
         forces_size=_abs(qp.A).T @ np.abs(s.y) + _abs(qp.G).T @ np.abs(s.z)
         + np.abs(s.z_box),
@@ -166,9 +167,9 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
     own_r = np.maximum(r - ROUNDING * size, 0)
-    # an operator tells no Pᵢᵢ, and what neither bends nor costs is as long as it is
+    # an operator may not tell Pᵢᵢ; what neither bends nor costs is as long as it is
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    step = _over(r, t.curvature) if qp.is_explicit else t.x
+    step = _over(r, t.curvature) if t.told else t.x
     step = np.where(is_idle, np.maximum(t.x, X), step)
     way = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
@@ -310,13 +311,14 @@ def scales_at(qp: QP, x: Vector, E: float, d: Vector | None = None) -> Scales:
     an answer could make x as long as it likes. A variable without curvature and cost is
     as long as its active rows know from the others.
     """
-    d = _curvature(qp) if d is None else d
+    known, told = _curvature(qp)
+    d = known if d is None else d
     x, E = x.astype(float), float(E)
     size = np.abs(x)
     length = np.minimum(np.sqrt(_over(E + 0 * d, d)), _over(E + 0 * d, np.abs(qp.q)))
     felt = np.isfinite(length)
     X = np.where(felt, np.maximum(np.minimum(size, INFLATED * length), length), 0)
-    if not qp.is_explicit:
+    if not told:
         X = np.minimum(X, np.maximum(size, _sup(x)))
     if not felt.all():
         X = _told_by_rows(qp, x, X, felt)
@@ -400,11 +402,12 @@ def rejudged(record: Record, factor: float) -> Verdict:
     return verdict(claimed, residuals, tol, factor, error=error)
 
 
-def _curvature(qp: QP) -> Vector:
-    """Give Pᵢᵢ; of an operator nothing is known."""
-    if not qp.is_explicit:
-        return np.zeros(qp.q.size)
-    return np.asarray(np.maximum(qp.P.diagonal(), 0), dtype=float)
+def _curvature(qp: QP) -> tuple[Vector, bool]:
+    """Give Pᵢᵢ, and whether P tells it; zeros where it does not."""
+    diagonal = qp.diagonal()
+    if diagonal is None:
+        return np.zeros(qp.q.size), False
+    return np.maximum(diagonal, 0), True
 
 
 def _sup(v: Vector) -> float:

@@ -83,6 +83,31 @@ class Packed:
             Y[begin:end] = (block @ part.reshape(n, -1)).reshape(part.shape)
         return Y
 
+    def diagonal(self) -> Vector:
+        """Give the diagonal of B_b diag((K⁺)_bb) B_bᵀ.
+
+        Sums B_ri (K⁺)_ij B_rj over pairs of entries of a row in one subdomain.
+        """
+        B, first = self.B, 0
+        of_row = np.diff(B.indptr)
+        row = np.repeat(np.arange(of_row.size), of_row)
+        partners = of_row[row]
+        left = np.repeat(np.arange(B.nnz), partners)
+        begun = np.repeat(np.cumsum(partners) - partners, partners)
+        right = B.indptr[row[left]] + np.arange(left.size) - begun
+        total = np.zeros(of_row.size)
+        for group in self.groups:
+            S = group.members.size
+            last = first + group.touched.size * S
+            i, j = B.indices[left] - first, B.indices[right] - first
+            at = (0 <= np.minimum(i, j)) & (np.maximum(i, j) < last - first)
+            at &= i % S == j % S
+            K = group.kind.compliance(group.touched)[i[at] // S, j[at] // S]
+            pair = B.data[left[at]] * K * B.data[right[at]]
+            total += np.bincount(row[left[at]], pair, total.size)
+            first = last
+        return total
+
 
 def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
     """Pack the columns of B (m, N)."""
@@ -125,6 +150,10 @@ class DualOperator:
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
         return self.packed.congruence([inverse for inverse, _ in self._blocks], x)
+
+    def diagonal(self) -> Vector:
+        """Give the diagonal of F."""
+        return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
@@ -178,6 +207,10 @@ class DualOperator:
     def packed(self) -> Packed:
         """Its rows on what they touch."""
         return packed(self.B, self.domains, self.explicit)
+
+    @cached_property
+    def _diagonal(self) -> Vector:
+        return self.packed.diagonal()
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:

@@ -42,6 +42,10 @@ STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
+RHO = 1e4  #: penalty where none is given
+#: where P offers a preconditioner: the face preconditioner knows what ρ does there, and
+#: fewer outer iterations interrupt CG
+TORN_RHO = 1e6
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -76,6 +80,8 @@ def prepared(
     qp: QP, tol: float, options: Options, carry: Carry | None, *, eliminate: bool
 ) -> Solve:
     """Eliminate the free variables where asked and possible; project; look at F."""
+    if options.rho == 0:
+        options = replace(options, rho=TORN_RHO if offered(qp) else RHO)
     history = History() if options.history else None
     eliminated = None
     if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
@@ -161,15 +167,15 @@ def _start(
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
         x = np.where(np.isfinite(x), x, carry.x)
         mu = C @ carry.force / problem.spectrum.norm
-    rho = _penalty(options, tol)
+    rho = _penalty(options.rho, tol)
     if solver is None:
         return first_iterate(problem, x, mu, M=options.M, rho=rho)
     return Iterate(*solver.begin(x, mu, rho), mu, options.M, rho)
 
 
-def _penalty(options: Options, tol: float) -> float:
+def _penalty(rho: float, tol: float) -> float:
     """Keep ρ, but below where the rounding of ρQν is seen in the gradient."""
-    return min(options.rho, max(1.0, tol / (10 * EPS)))
+    return min(rho, max(1.0, tol / (10 * EPS)))
 
 
 def outer_loop(
@@ -257,7 +263,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         if at.status is not Status.SOLVED or waited == PATIENCE:
             break
         tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
-        at = _refreshed(problem, at, _penalty(options, tighter * tol))
+        at = _refreshed(problem, at, _penalty(options.rho, tighter * tol))
     message = "no further progress: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"

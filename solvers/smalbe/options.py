@@ -22,7 +22,8 @@ class Options:
     expansion: Expansion = "model"  #: see `solvers.smalbe.mprgp`
     proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
-    rho: float = 1e4  #: penalty ρ, relative to ‖𝒫F𝒫‖
+    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, and 1e6 where P offers a preconditioner
+    rho: float = 0.0
     rho_growth: float = 1.0  #: factor of ρ where the Lagrangian grew too little
     M: float = 1.0  #: precision of the inner runs at the start, relative to ‖𝒫F𝒫‖
     beta: float = 0.5  #: factor of M where the Lagrangian grew too little
@@ -40,15 +41,14 @@ class Options:
 
     def __post_init__(self) -> None:
         positive(
-            rho=self.rho, M=self.M, eta=self.eta, Gamma=self.Gamma, alpha=self.alpha,
+            M=self.M, eta=self.eta, Gamma=self.Gamma, alpha=self.alpha,
             lanczos_steps=self.lanczos_steps, max_steps=self.max_steps,
         )  # fmt: skip
         if not 0 < self.beta < 1:
             raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
-        if not 0 <= self.energy < np.inf:
-            raise ValueError(
-                f"energy = {self.energy}; expected 0, or a positive number"
-            )
+        for name, value in (("rho", self.rho), ("energy", self.energy)):
+            if not 0 <= value < np.inf:
+                raise ValueError(f"{name} = {value}; expected 0, or a positive number")
         if not self.rho_growth >= 1:
             raise ValueError(f"rho_growth = {self.rho_growth}; expected at least 1")
         if not self.alpha <= 2:

@@ -60,8 +60,8 @@ def chosen(qp: QP, kind: Preconditioner) -> Preconditioner:
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:
     """Say what `qp` lacks for this preconditioner, or None."""
-    if kind == "diagonal" and not qp.is_explicit:
-        return "preconditioner 'diagonal' needs an explicit P"
+    if kind == "diagonal" and qp.diagonal() is None:
+        return "preconditioner 'diagonal' needs a P that tells its diagonal"
     if kind in ("lumped", "dirichlet") and qp.structure is None and not offered(qp):
         return f"preconditioner {kind!r} needs a QP with structure; 'diagonal' does not"
     return None
@@ -92,8 +92,8 @@ def face_preconditioner(
 
 def _whole(qp: QP, kind: Preconditioner) -> Operator:
     """Return M as a function."""
-    if kind == "diagonal":
-        diagonal = qp.P.diagonal()
+    diagonal = qp.diagonal()
+    if kind == "diagonal" and diagonal is not None:
         inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
         return lambda v: inverse * v
     if (operator := offered(qp)) is not None:

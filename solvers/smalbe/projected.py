@@ -48,7 +48,7 @@ class Projected:
     b: Vector
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
     q: Vector  #: as given
-    diagonal: Vector  #: of F; empty for an operator
+    diagonal: Vector  #: of F; empty where an operator does not tell
     counts: Counter[str] = field(default_factory=Counter)  #: besides products with F
 
     def energy_error(self, nu: Vector, gradient: Vector) -> float:
@@ -150,8 +150,9 @@ def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected
 
 
 def _diagonal(qp: QP) -> Vector:
-    """Copy the diagonal of an explicit P; empty for an operator."""
-    return np.array(qp.P.diagonal()) if qp.is_explicit else np.zeros(0)
+    """Copy the diagonal of P; empty where that is an operator that does not tell."""
+    diagonal = qp.diagonal()
+    return np.zeros(0) if diagonal is None else np.array(diagonal)
 
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:

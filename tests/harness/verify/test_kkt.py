@@ -18,6 +18,7 @@ from harness import (
     verdict,
 )
 from harness.conformance.manufactured import manufactured
+from harness.operators import SerialisableOperator
 from problems.families.beam_ring import BeamRing
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP
@@ -246,7 +247,7 @@ def test_an_operator_is_judged_alike_in_all_units(manufactured, unit):
 
 
 def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufactured):
-    """Lengths come from Pᵢᵢ, which no operator tells: they may differ by a factor."""
+    """Lengths come from Pᵢᵢ, which this one does not tell: they differ by a factor."""
     qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
     one = kkt_residuals(qp, moved)
@@ -255,6 +256,28 @@ def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufa
     assert (other.complementarity, other.gap) == (one.complementarity, one.gap)
     assert other.primal == pytest.approx(one.primal, rel=10)
     assert 0.1 <= other.dual / one.dual <= 10
+
+
+def test_an_operator_that_tells_its_diagonal_is_judged_as_its_matrix(manufactured):
+    qp, s = manufactured("everything", seed=314159, dense=True)
+
+    class Telling:
+        def __call__(self, x):
+            return qp.P @ x
+
+        def diagonal(self):
+            return qp.P.diagonal()
+
+    P = SerialisableOperator(qp.q.size, "telling", {}, {"telling": lambda _: Telling()})
+    silent = SerialisableOperator(
+        qp.q.size, "silent", {}, {"silent": lambda _: Telling().__call__}
+    )
+    moved = replace(s, x=s.x + 1e-3)
+    found = kkt_residuals(replace(qp, P=P), moved)
+
+    assert found == pytest.approx(kkt_residuals(qp, moved), rel=1e-12)
+    assert replace(qp, P=silent).diagonal() is None
+    assert replace(qp, P=aslinearoperator(qp.P)).diagonal() is None
 
 
 def test_a_row_without_entries_does_not_inflate_the_scale_of_x():

@@ -109,6 +109,15 @@ def test_a_block_that_is_not_formed_gives_the_same_product(pair):
         assert_allclose(found, Mx, atol=1e-9 * abs(Mx).max())
 
 
+def test_the_diagonal_is_that_of_the_matrix(pair):
+    P = operator_of(pair)
+    implicit = made({**P.arrays, "explicit": np.zeros_like(P.arrays["explicit"])})
+    diagonal = np.diag(P @ np.eye(P.shape[0]))
+
+    assert_allclose(P.diagonal(), diagonal, rtol=1e-10)
+    assert_allclose(implicit.diagonal(), diagonal, rtol=1e-10)
+
+
 def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     pair = beam_and_ring()
     arrays = operator_of(pair).arrays

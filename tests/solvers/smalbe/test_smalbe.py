@@ -196,7 +196,7 @@ def test_the_model_knows_what_the_lanczos_process_and_the_rows_tell(dual):
 
 @pytest.mark.parametrize(
     "wrong",
-    [dict(rho=0.0), dict(rho=-1.0), dict(M=0.0), dict(beta=1.0), dict(beta=2.0),
+    [dict(rho=-1.0), dict(rho=np.inf), dict(M=0.0), dict(beta=1.0), dict(beta=2.0),
      dict(Gamma=-1.0), dict(lanczos_steps=0), dict(max_steps=-1), dict(alpha=2.1),
      dict(rho_growth=0.5), dict(expansion="gp"), dict(preconditioner="ilu"),
      dict(norm="power"), dict(eliminate="yes")],
