@@ -207,9 +207,8 @@ class DistributedColumns:
         """Multiply row i with s[i]."""
         return DistributedColumns(csr_array(diags_array(s) @ self.part), self.ranks)
 
-    def squares(self) -> NDArray[np.float64]:
-        """Return ‖gᵢ‖² of each row (r,)."""
-        return self.ranks.total(self.part.multiply(self.part).sum(axis=1))
+    def __getitem__(self, rows: NDArray[np.int64]) -> DistributedColumns:
+        return DistributedColumns(csr_array(self.part[rows]), self.ranks)
 
     def gram(self, columns: NDArray[np.bool_] | None = None) -> csc_array:
         """Return G_F G_Fᵀ (r, r) of some columns F, or of all."""

@@ -184,6 +184,12 @@ class RankOperator:
     def __matmul__(self, x: Dense) -> DistributedVector:
         return self(x)
 
+    def diagonal(self) -> DistributedVector:
+        """Give the diagonal of F."""
+        return distributed(
+            self.exchange.added(self.local.diagonal()), self.exchange.ranks
+        )
+
     def _over(self, x: Dense, local: Product) -> DistributedVector:
         ranks = self.exchange.ranks
         touched_x = self.exchange.gathered(np.asarray(x))
