@@ -42,6 +42,7 @@ from problems.feti.torn import Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
+COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
 #: of the diagonal of B W Bᵀ, added where rows are redundant
 SHIFT = 1e-8
 ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
@@ -83,29 +84,29 @@ class Packed:
             Y[begin:end] = (block @ part.reshape(n, -1)).reshape(part.shape)
         return Y
 
-    def diagonal(self) -> Vector:
-        """Give the diagonal of B_b diag((K⁺)_bb) B_bᵀ.
+    def diagonal(self, blocks: Sequence[Any]) -> Vector:
+        """Return the diagonal of  B_b diag(blocks) B_bᵀ.
 
-        Sums B_ri (K⁺)_ij B_rj over pairs of entries of a row in one subdomain.
+        Row r has the sum of B_ri M_ij B_rj over pairs of its entries that are in one
+        subdomain, with the block M of that.
         """
-        B, first = self.B, 0
-        of_row = np.diff(B.indptr)
-        row = np.repeat(np.arange(of_row.size), of_row)
-        partners = of_row[row]
-        left = np.repeat(np.arange(B.nnz), partners)
-        begun = np.repeat(np.cumsum(partners) - partners, partners)
-        right = B.indptr[row[left]] + np.arange(left.size) - begun
-        total = np.zeros(of_row.size)
-        for group in self.groups:
+        B, begin = self.B, 0
+        entries = np.diff(B.indptr)
+        row = np.repeat(np.arange(entries.size), entries)
+        left = np.repeat(np.arange(B.nnz), entries[row])
+        before = np.cumsum(entries[row]) - entries[row]
+        right = B.indptr[row[left]] + np.arange(left.size) - before[left]
+        total = np.zeros(entries.size)
+        for block, group in zip(blocks, self.groups, strict=True):
             S = group.members.size
-            last = first + group.touched.size * S
-            i, j = B.indices[left] - first, B.indices[right] - first
-            at = (0 <= np.minimum(i, j)) & (np.maximum(i, j) < last - first)
-            at &= i % S == j % S
-            K = group.kind.compliance(group.touched)[i[at] // S, j[at] // S]
-            pair = B.data[left[at]] * K * B.data[right[at]]
-            total += np.bincount(row[left[at]], pair, total.size)
-            first = last
+            end = begin + group.touched.size * S
+            i, j = B.indices[left] - begin, B.indices[right] - begin
+            one = (np.minimum(i, j) >= 0) & (np.maximum(i, j) < end - begin)
+            one &= i % S == j % S
+            pairs = _entries(block, i[one] // S, j[one] // S)
+            pairs *= B.data[left[one]] * B.data[right[one]]
+            total += np.bincount(row[left[one]], pairs, total.size)
+            begin = end
         return total
 
 
@@ -210,7 +211,7 @@ class DualOperator:
 
     @cached_property
     def _diagonal(self) -> Vector:
-        return self.packed.diagonal()
+        return self.packed.diagonal([inverse for inverse, _ in self._blocks])
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:
@@ -261,6 +262,21 @@ class _Part(NamedTuple):
         whole = np.zeros((self.n, X.shape[1]))
         whole[self.b] = X
         return self.product(whole)[self.b]
+
+
+def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
+    """Read entries of a block; one that only multiplies is multiplied out in parts."""
+    if isinstance(block, _Triangle):
+        i, j = np.minimum(i, j), np.maximum(i, j)
+        return np.asarray(block.entries[j * (j + 1) // 2 + i])
+    if not isinstance(block, _Part):
+        return np.asarray(block[i, j])
+    found, n = np.empty(i.size), block.b.size
+    for first in range(0, n, COLUMNS):
+        part = (first <= j) & (j < first + COLUMNS)
+        unit = np.eye(n, min(COLUMNS, n - first), -first)
+        found[part] = (block @ unit)[i[part], j[part] - first]
+    return found
 
 
 def _scaled(of: Packed, blocks: Sequence[Any], weights: Vector) -> Product:

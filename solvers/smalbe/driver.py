@@ -364,7 +364,8 @@ def _residual_bound(qp: QP, s: Solution, Fx: Vector) -> float:
     nothing excused as rounding.
     """
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    d, z, x = np.maximum(qp.diagonal(), 0), s.z_box, s.x
+    told, z, x = qp.diagonal(), s.z_box, s.x
+    d = np.zeros_like(x) if told is None else np.maximum(told, 0)
     forces = qp.A.T @ s.y + z
     r = np.abs(Fx + qp.q + forces)
     at = np.where(z < 0, np.where(lower, qp.lb, 0), np.where(upper, qp.ub, 0))
