@@ -242,6 +242,10 @@ class Distributable(Protocol):
     What puts an operator together may return one (`harness.operators`).
     """
 
+    @property
+    def parts(self) -> int:
+        """How many parts there are, the most ranks that can share them."""
+
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Take this rank's share of a `qp` with this P; called by all ranks.
 

@@ -198,6 +198,11 @@ class DualOperator:
             weights = np.ones_like(weights)
         return blocks, weights
 
+    @property
+    def parts(self) -> int:
+        """How many subdomains there are."""
+        return int(self.domains.kind.size)
+
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Take this rank's share of a dual with this F."""
         from problems.feti.distributed import shared  # late: one process needs none
