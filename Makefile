@@ -38,9 +38,13 @@ site: setup .venv/.site  ## the documentation as a site, in out/site; runs its n
 demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
-test: setup browser check  ## check, then run the tests on all CPUs
-	$(BIN)/pytest -q -n auto --dist loadgroup -m 'not slow and not alone'
+test: setup browser  ## check, and run the tests on all CPUs
+	@$(MAKE) --no-print-directory -j2 check tests
 	$(BIN)/pytest -q -m 'alone and not slow' $$(grep -rl 'mark\.alone' tests --include='*.py')
+
+.PHONY: tests
+tests:  # those that may run side by side
+	$(BIN)/pytest -q -n auto --dist loadgroup -m 'not slow and not alone'
 
 mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
 	@$(BIN)/python tools/mutants.py

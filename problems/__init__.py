@@ -18,6 +18,7 @@ PROBLEMS: Registry[Family] = Registry(
         "hertz-cylinder": entry("problems.families.hertz", "HertzCylinder"),
         "half-plane": entry("problems.families.half_plane", "HalfPlane"),
         "greco": entry("problems.families.greco", "Greco"),
+        "cantilever": entry("problems.families.cantilever", "Cantilever"),
         "obstacle": entry("problems.families.obstacle", "Obstacle"),
         "membranes": entry("problems.families.membranes", "Membranes"),
         "string": entry("problems.families.variational", "String"),

@@ -150,14 +150,23 @@ def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) 
         )
 
 
-def torn_by(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError unless the keys of subdomains fit together."""
-    at_least(0, family, params, ("feti",))
+def torn_by(
+    family: str,
+    params: Mapping[str, Value],
+    *,
+    key: str = "feti",
+    what: str = "the most cells along a subdomain's side",
+) -> None:
+    """Raise InputError unless the keys of subdomains fit together.
+
+    key, what : that asks for subdomains, and what it is the number of
+    """
+    at_least(0, family, params, (key,))
     one_of(family, params, GLUES)
-    if not params["feti"] and params["glue"] != DECOMPOSITION["glue"]:
+    if not params[key] and params["glue"] != DECOMPOSITION["glue"]:
         raise InputError(
-            f"{family}: glue={params['glue']} is not used by feti=0, one piece per "
-            "body; expected no glue, or feti, the most cells along a subdomain's side"
+            f"{family}: glue={params['glue']} is not used by {key}=0, one piece per "
+            f"body; expected no glue, or {key}, {what}"
         )
 
 

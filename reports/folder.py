@@ -13,7 +13,7 @@ from reports.data.comparison_groups import ComparisonGroup, all_groups
 from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
 from reports.data.fastest import answers_of, fastest_solvers
-from reports.data.size_series import SizeSeries, size_series
+from reports.data.size_series import SizeSeries, size_series, sweeps
 from reports.document.formatting import TIMED, clean
 from reports.document.layout import Page, Picture, Section
 from reports.export.csv_tables import csv_tables
@@ -29,7 +29,7 @@ from reports.sections.performance import profiles
 from reports.sections.physics import agreement, deformed, physics, tractions
 from reports.sections.ranking import left_out, means, ranking
 from reports.sections.results import claim_counts, claims, errors, iterations
-from reports.sections.scaling import growth, scaling
+from reports.sections.scaling import growth, scaling, steps
 from reports.sections.settings import definitions, environment
 from reports.sections.summary import summary
 from reports.sections.sweeps import accuracy, certified_sweeps
@@ -66,6 +66,9 @@ _SCALING = (
     "suites/scaling.toml)."
 )
 _GROWTH = "Do iterations grow?: cases of four sizes or more are needed."
+_STEPS = (
+    "Steps of each kind against size: no solver counts anything on three sizes or more."
+)
 _PHYSICS = "Physical results: no verified answer has physical quantities."
 _DEFORMED = "Deformed bodies: no verified answer has bodies to draw."
 _TRACTIONS = "Tractions along the contact: no verified answer has a contact side."
@@ -168,6 +171,7 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         (agreement(evidence), _AGREEMENT),
         (_grown(found, evidence), _SCALING),
         (growth(found), _GROWTH),
+        (steps(found, sweeps(evidence, "feti")), _STEPS),
         (physics(evidence), _PHYSICS),
         (deformed(evidence), _DEFORMED),
         (tractions(evidence), _TRACTIONS),

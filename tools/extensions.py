@@ -6,6 +6,7 @@ Hatchling runs it when the package is built or installed, for `pip install -e` t
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -41,6 +42,7 @@ def compiled() -> list[Path]:
         )
         command = build_ext(Distribution({"ext_modules": extensions}))
         command.build_temp, command.build_lib = folder, folder
+        command.parallel = os.cpu_count()
         command.ensure_finalized()
         command.run()
         made = []

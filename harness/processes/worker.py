@@ -32,7 +32,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from harness.distributed import Ranks
 from harness.files.qpfile import load_qp
@@ -228,8 +228,9 @@ def _aligned(count: int) -> Vector:
 
 def _one_thread() -> int:
     """Return the most threads of any library, after setting those that can be set."""
-    threadpool_limits(limits=1)
-    return max((pool["num_threads"] for pool in threadpool_info()), default=1)
+    libraries = ThreadpoolController()
+    libraries.limit(limits=1)
+    return max((pool["num_threads"] for pool in libraries.info()), default=1)
 
 
 def _limit_memory(mib: float | None) -> None:

@@ -16,28 +16,41 @@ from problems.contact.friction import FrictionLaw
 from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import (
     ContactRows,
+    closest_points,
     geometric_stiffness,
     node_to_segment,
 )
+from problems.contact.polyline import current_polyline, current_positions
 from problems.fem.mesh import Nodes
 
 
 def linearisation(
-    bodies: Bodies, contact: str, basis: Any, laws: Sequence[FrictionLaw] = ()
+    bodies: Bodies,
+    contact: str,
+    basis: Any,
+    laws: Sequence[FrictionLaw] = (),
+    kept: Nodes | None = None,
 ) -> Callable[[Vector], ContactRows]:
     """Return the map from a displacement (n,) in m to the rows of all pairs.
 
     It raises InputError where at u = 0 there is no row at all.
 
     laws : of friction, one per pair; none for no friction at all
+    kept : of node-to-segment contact: see `closest_segments`; −1 for the closest one
     """
-    rows = node_to_segment if contact == "nts" else partial(mortar, basis=basis)
-    rough = [law.acts for law in laws] or [False] * len(bodies.pairs)
+    pairs = len(bodies.pairs)
+    methods: list[Callable[..., ContactRows]] = [
+        node_to_segment if contact == "nts" else partial(mortar, basis=basis)
+    ] * pairs
+    if kept is not None:
+        parts = _of_pairs(bodies, kept)
+        methods = [partial(node_to_segment, kept=part) for part in parts]
+    rough = [law.acts for law in laws] or [False] * pairs
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
             rows(bodies.mesh.points, u, *pair, tangential=tangential)
-            for pair, tangential in zip(bodies.pairs, rough, strict=True)
+            for rows, pair, tangential in zip(methods, bodies.pairs, rough, strict=True)
         ]
         B = csr_array(vstack([part.B for part in parts]))
         if not B.shape[0] and not u.any():
@@ -64,21 +77,48 @@ def linearisation(
 
 
 def contact_stiffness(
-    bodies: Bodies,
+    bodies: Bodies, kept: Nodes | None = None
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return the map from u (n,) in m and λ (m,) in N/m to the blocks −λ_i g_i''(u).
 
     The rows are those of node-to-segment contact, one for every slave node, see
     `problems.contact.node_to_segment.geometric_stiffness`.
+
+    kept : as of `linearisation`
     """
-    ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]
+    segments = [None] * len(bodies.pairs) if kept is None else _of_pairs(bodies, kept)
 
     def blocks(u: Vector, multipliers: Vector) -> tuple[NDArray[np.float64], Nodes]:
+        forces = _of_pairs(bodies, multipliers)
         found = [
-            geometric_stiffness(bodies.mesh.points, u, *pair, own)
-            for pair, own in zip(bodies.pairs, np.split(multipliers, ends), strict=True)
+            geometric_stiffness(bodies.mesh.points, u, *pair, force, own)
+            for pair, force, own in zip(bodies.pairs, forces, segments, strict=True)
         ]
         values, components = zip(*found, strict=True)
         return np.concatenate(values), np.concatenate(components)
 
     return blocks
+
+
+def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
+    """Find for each slave node of all pairs the closest segment of its master.
+
+    u : (n,) displacement, m
+
+    Returns
+    -------
+    (places,) first nodes of the segments, as places in the chains of the masters
+
+    """
+    found = []
+    for pair in bodies.pairs:
+        x = current_positions(bodies.mesh.points, u, pair.slave, "slave")
+        line = current_polyline(bodies.mesh.points, u, pair.master, "master")
+        found.append(closest_points(x, line).segment)
+    return np.concatenate(found)
+
+
+def _of_pairs(bodies: Bodies, values: NDArray[Any]) -> list[NDArray[Any]]:
+    """Split what there is one of per slave node by the pairs."""
+    ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]
+    return np.split(values, ends)

@@ -24,6 +24,10 @@ so that −Tᵀλ_t are the forces of friction where −Bᵀλ are those of the 
 
 Beyond the end of the master its last node is the closest point, with the normal of the
 last segment.
+
+A slave node may be told to keep a segment: it is kept on the outer side of its whole
+line, wherever the closest point is. At a vertex where the master bends inwards, a node
+may find no rest otherwise: the force of either segment pushes it onto the other one.
 """
 
 from __future__ import annotations
@@ -79,6 +83,7 @@ def node_to_segment(
     normals: Normals = "segment",
     reach: Reach | None = None,
     tangential: bool = False,
+    kept: Nodes | None = None,
 ) -> ContactRows:
     """Linearise the non-penetration of the slave nodes into the master boundary at u.
 
@@ -92,6 +97,8 @@ def node_to_segment(
     reach : drops the nodes that do not face their closest point or are too far from
         it; None keeps a row for every slave node
     tangential : whether friction needs tangential rows
+    kept : (s,) first node, in the master chain, of the segment that a slave node keeps;
+        −1 where it is the closest one
 
     Raises
     ------
@@ -101,7 +108,7 @@ def node_to_segment(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_polyline(points, u, master, "master")
-    at = closest_points(x, line, normals)
+    at = _opposite(x, line, normals, kept)
     N = np.stack([1 - at.xi, at.xi], axis=1)
     ends = np.stack([at.segment, at.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
@@ -121,7 +128,12 @@ def node_to_segment(
 
 
 def geometric_stiffness(
-    points: Points, u: Vector, slave: Nodes, master: Nodes, multipliers: Vector
+    points: Points,
+    u: Vector,
+    slave: Nodes,
+    master: Nodes,
+    multipliers: Vector,
+    kept: Nodes | None = None,
 ) -> tuple[NDArray[np.float64], Nodes]:
     """Differentiate the forces Bᵀλ of the slave nodes, λ held: −λ g''(u), per node.
 
@@ -135,7 +147,7 @@ def geometric_stiffness(
 
     Parameters
     ----------
-    points, u, slave, master : as of `node_to_segment`, with the normals of segments
+    points, u, slave, master, kept : as of `node_to_segment`; normals are of segments
     multipliers : (s,) λ, N/m
 
     Returns
@@ -146,7 +158,7 @@ def geometric_stiffness(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_polyline(points, u, master, "master")
-    at = closest_points(x, line)
+    at = _opposite(x, line, "segment", kept)
     x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
@@ -166,6 +178,8 @@ def geometric_stiffness(
     gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
     gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
     inside = (at.xi > 0) & (at.xi < 1)
+    if kept is not None:
+        inside |= kept >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
     nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
     return blocks, dofs_of(nodes.ravel()).reshape(-1, 6)
@@ -187,6 +201,27 @@ def closest_points(
         normal = np.where(at_first[:, None], n_1, normal)
         normal = np.where(at_second[:, None], n_2, normal)
     return ClosestPoints(first, xi, normal)
+
+
+def _opposite(
+    x: Points, line: Polyline, normals: Normals, kept: Nodes | None
+) -> ClosestPoints:
+    """Find what the slave nodes x (s, 2) stand against: the closest, or what is kept.
+
+    On the line of a segment that is kept, ξ may be outside of [0, 1].
+    """
+    at = closest_points(x, line, normals)
+    if kept is None or not (own := kept >= 0).any():
+        return at
+    segment = np.where(own, kept, at.segment)
+    start = line.x[segment]
+    edge = line.x[segment + 1] - start
+    xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
+    length = np.linalg.norm(edge, axis=1)[:, None]
+    across = np.column_stack([edge[:, 1], -edge[:, 0]]) / length
+    return ClosestPoints(
+        segment, np.where(own, xi, at.xi), np.where(own[:, None], across, at.normal)
+    )
 
 
 def tangent(normal: Points) -> Points:

@@ -30,6 +30,10 @@ and the step is the first of 1, ½, ¼, … that decreases it enough (Armijo). A
 that halves the least residual so far is taken without, as curved constraints may make φ
 grow near the solution (Maratos effect); that can happen a finite number of times only.
 
+*Vertices*: where the master bends inwards, a slave node may be pushed to and fro
+between two segments. When the iteration comes to no end, nodes that press keep the
+segments that are the closest there, and may leave them by a little on their lines.
+
 *Convergence*: equilibrium and gaps at the new u, with the multipliers of the QP, to
 SETTLED; see `NewtonPath.residual`. *Load*: where that is not reached, the load step is
 halved and what is left of it follows, down to its part 2^−HALVINGS.
@@ -50,6 +54,7 @@ from scipy.sparse import csc_array
 from harness import QP, InputError, Reference, Solution, Status, Vector, kkt_residuals
 from problems.contact.bodies import Bodies, clamped
 from problems.contact.node_to_segment import ContactRows
+from problems.contact.sides import ACTIVE
 from problems.duality.dualisation import dual_bounds, dualise
 from problems.duality.stepping import REFERENCE, Linearise, primal_qp
 from problems.fem.finite_strain import (
@@ -65,9 +70,10 @@ from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import GeneralisedInverse, Interface, floating_inverse
 from problems.fem.mesh import dofs_of
 
-SETTLED = 1e-10  #: residual of equilibrium and gaps at the end of a step
-ROUNDING = 64 * float(np.finfo(float).eps)  #: of the forces, relative to the stiffness
+SETTLED = 1e-9  #: residual of equilibrium and gaps at the end of a step
+ROUNDING = 2 * float(np.finfo(float).eps)  #: of the forces |K||u| within cells
 MOST_ITERATIONS = 60  #: of Newton's method at one load
+KEEP_AFTER = 20  #: of them after which nodes that press keep their segments
 HALVINGS = 8  #: of a load step
 SHORTEST = 2.0**-16  #: step of the line search
 NOISE = 8 * float(np.finfo(float).eps)  #: of the merit function, relative to energies
@@ -78,6 +84,16 @@ TURNING = 1e-8  #: part of a rigid motion that is a rotation, beyond rounding
 #: displacement (n,) in m, multipliers (m,) in N/m → blocks (m, k, k) in Pa of
 #: −Σ λ_i g_i''(u), and the components (m, k) that they are of
 Curvature = Callable[[Vector, Vector], tuple[NDArray[np.float64], NDArray[np.int64]]]
+
+
+class Gaps(NamedTuple):
+    """The gaps of the contact rows as functions of the displacement."""
+
+    linearise: Linearise
+    curvature: Curvature | None = None  #: left out where there is none
+    #: at a displacement (n,) in m, the gaps for which the slave nodes (places,) named
+    #: keep the segments that are the closest there; none where there is no such choice
+    keeping: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
 class NoEquilibriumError(ArithmeticError):
@@ -92,6 +108,7 @@ class Iteration:
     tangent: Bodies
     primal: QP
     rows: ContactRows
+    gaps: Gaps
     u: Vector  #: u^j (n,), without dimensions
     load_factor: float  #: κ
     constant: float  #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, what (1) lacks of Π's model
@@ -126,10 +143,9 @@ class NewtonPath:
 
     bodies: Bodies  #: K is that of the undeformed bodies
     cells: Cells  #: without dimensions, as K is
-    linearise: Linearise
+    gaps: Gaps
     reference: Reference
     steps: int = 1
-    curvature: Curvature | None = None  #: of the contact rows; none: left out
     _steps: list[list[Iteration]] = field(default_factory=list, init=False)
     _parts: list[int] = field(default_factory=list, init=False)
 
@@ -159,7 +175,8 @@ class NewtonPath:
     def state(self, at: Iteration, s: Solution) -> tuple[float, float, float]:
         """Evaluate Π, the residual and the largest penetration at a solution of a QP.
 
-        Without dimensions; s is of `at.primal`.
+        Without dimensions; s is of `at.primal`. The penetration is that of the closest
+        segments, whichever are kept.
 
         Raises
         ------
@@ -168,14 +185,15 @@ class NewtonPath:
 
         """
         lam = self._at_places(replace(at, answer=s))
-        reached = self._configuration(s.x, at.load_factor)
-        penetration = float((-reached.gap).max(initial=0.0))
+        reached = self._configuration(s.x, at.load_factor, at.gaps)
+        gap = self._configuration(s.x, at.load_factor, self.gaps).gap
+        penetration = float((-gap).max(initial=0.0))
         return reached.energy, self.residual(reached, lam, at.load_factor), penetration
 
     def _stepped(self, k: int) -> tuple[list[Iteration], int]:
         """Go from step k − 1 to step k, in halves of what is left where it fails."""
-        if self._turning:
-            raise InputError(self._turning)
+        if self._unfit:
+            raise InputError(self._unfit)
         reached, target = (k - 1) / self.steps, k / self.steps
         least = (target - reached) / 2**HALVINGS
         size, parts = target - reached, 0
@@ -220,32 +238,50 @@ class NewtonPath:
         return force
 
     def _solved(self, load_factor: float, u: Vector, lam: Vector) -> list[Iteration]:
-        """Iterate at one load, from u and the multipliers (places,)."""
-        at = self._configuration(u, load_factor)
+        """Iterate at one load, from u and the multipliers (places,).
+
+        Where that does not settle, nodes that press keep their segments from there on.
+        """
+        gaps = self.gaps
+        at = self._configuration(u, load_factor, gaps)
         best, weight = self.residual(at, lam, load_factor), 0.0
         found: list[Iteration] = []
         while len(found) < MOST_ITERATIONS:
-            posed = self._posed(at, lam, load_factor)
-            lam = self._at_places(posed)
-            weight = max(weight, ABOVE * lam.max(initial=0.0))
-            try:
-                at, length, residual = self._moved(at, posed, lam, weight, best)
-            except NoEquilibriumError as e:
+            stuck = ""
+            if len(found) < KEEP_AFTER or gaps.keeping is None:
+                posed = self._posed(at, lam, load_factor, gaps)
+                lam = self._at_places(posed)
+                weight = max(weight, ABOVE * lam.max(initial=0.0))
+                try:
+                    at, length, residual = self._moved(at, posed, lam, weight, best)
+                except NoEquilibriumError as e:
+                    stuck = str(e)
+                else:
+                    best = min(best, residual)
+                    found.append(replace(posed, length=length, residual=residual))
+                    if length == 1 and residual <= SETTLED + self._rounding(
+                        at, lam, posed
+                    ):
+                        return found
+                    continue
+            if gaps.keeping is None:
                 raise NoEquilibriumError(
                     f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
-                    f"residual of {best:.1e}: {e}"
-                ) from None
-            best = min(best, residual)
-            found.append(replace(posed, length=length, residual=residual))
-            if length == 1 and residual <= SETTLED + self._rounding(posed):
-                return found
+                    f"residual of {best:.1e}: {stuck}"
+                )
+            pressing = lam > ACTIVE * lam.max(initial=0.0)
+            gaps = gaps.keeping(at.u * self.bodies.length, pressing)
+            at = self._configuration(at.u, load_factor, gaps)
+            best = self.residual(at, lam, load_factor)
         raise NoEquilibriumError(
             f"at {load_factor:.6g}, {MOST_ITERATIONS} iterations left a residual of "
             f"{best:.1e}"
         )
 
-    def _configuration(self, u: Vector, load_factor: float) -> Configuration:
-        rows = self.linearise(u * self.bodies.length)
+    def _configuration(
+        self, u: Vector, load_factor: float, gaps: Gaps
+    ) -> Configuration:
+        rows = gaps.linearise(u * self.bodies.length)
         gap = rows.c / self.bodies.length - rows.B @ u
         cells, f = evaluate(self.cells, u), load_factor * self.bodies.f
         return Configuration(
@@ -261,37 +297,49 @@ class NewtonPath:
         """
         pressing = lam[at.rows.place]
         contact = at.rows.B.T @ pressing
-        free = np.ones(at.u.size, dtype=bool)
-        free[self.bodies.B_D.indices] = False
-        scale = max(
-            float(np.linalg.norm(v[free]))
-            for v in (load_factor * self.bodies.f, contact)
-        )
-        left = float(np.linalg.norm((at.r + contact)[free])) / (scale or 1.0)
+        left = self._free_norm(at.r + contact) / self._forces(at, lam, load_factor)
         most = pressing.max(initial=0.0) or 1.0
         penetration = float((-at.gap).max(initial=0.0))
         apart = float((pressing / most * np.abs(at.gap)).max(initial=0.0))
         return max(left, penetration, apart)
 
-    def _rounding(self, posed: Iteration) -> float:
-        """Bound what rounding leaves of the forces: strains are known to 1e-16."""
-        stiffest = float(posed.tangent.K.diagonal().max())
-        return ROUNDING * stiffest / max(1.0, float(np.abs(self.bodies.f).max()))
+    def _forces(self, at: Configuration, lam: Vector, load_factor: float) -> float:
+        """Return the larger norm of the load and of Bᵀλ; 1 where there is neither."""
+        contact = at.rows.B.T @ lam[at.rows.place]
+        load = self._free_norm(load_factor * self.bodies.f)
+        return max(load, self._free_norm(contact)) or 1.0
 
-    def _posed(self, at: Configuration, lam: Vector, load_factor: float) -> Iteration:
+    def _free_norm(self, force: Vector) -> float:
+        """Return the norm of a force (n,) on the components that no support holds."""
+        free = np.ones(force.size, dtype=bool)
+        free[self.bodies.B_D.indices] = False
+        return float(np.linalg.norm(force[free]))
+
+    def _rounding(self, at: Configuration, lam: Vector, posed: Iteration) -> float:
+        """Bound what rounding leaves of `residual`.
+
+        The strains of a cell are differences of displacements, which are known to their
+        own rounding: of forces Ku it leaves a part of |K||u|.
+        """
+        rounded = self._free_norm(abs(posed.tangent.K) @ np.abs(at.u))
+        return ROUNDING * rounded / self._forces(at, lam, posed.load_factor)
+
+    def _posed(
+        self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps
+    ) -> Iteration:
         """Pose (1) and solve it."""
-        K, inverse, clipped = self._convex(at, lam)
+        K, inverse, clipped = self._convex(at, lam, gaps.curvature)
         tangent = replace(self.bodies, K=K, f=K @ at.u - at.r)
         primal = primal_qp(tangent, at.rows)
         answer = self._solve(primal, inverse)
         return Iteration(
-            tangent=tangent, primal=primal, rows=at.rows, u=at.u,
+            tangent=tangent, primal=primal, rows=at.rows, gaps=gaps, u=at.u,
             load_factor=load_factor, clipped=clipped, answer=answer,
             constant=float(at.energy - at.r @ at.u + 0.5 * at.u @ (K @ at.u)),
         )  # fmt: skip
 
     def _convex(
-        self, at: Configuration, lam: Vector
+        self, at: Configuration, lam: Vector, curvature: Curvature | None
     ) -> tuple[csc_array, GeneralisedInverse, int]:
         """Make the tangent positive definite where it is not, and factorise it.
 
@@ -299,7 +347,7 @@ class NewtonPath:
         """
         held = self.bodies.B_D
         found: list[tuple[csc_array, GeneralisedInverse]] = []
-        contact = self._contact_stiffness(at, lam)
+        contact = self._contact_stiffness(at, lam, curvature)
 
         def positive(K: csc_array) -> bool:
             K = csc_array(K + contact)
@@ -312,7 +360,7 @@ class NewtonPath:
 
         tangents = at.cells.tangents
         if contact.nnz and not positive(assemble(self.cells, tangents)):
-            contact = self._contact_stiffness(at, lam, convex=True)
+            contact = self._contact_stiffness(at, lam, curvature, convex=True)
         clipped = 0
         if not found:
             try:
@@ -322,14 +370,19 @@ class NewtonPath:
         return *found[-1], clipped
 
     def _contact_stiffness(
-        self, at: Configuration, lam: Vector, *, convex: bool = False
+        self,
+        at: Configuration,
+        lam: Vector,
+        curvature: Curvature | None,
+        *,
+        convex: bool = False,
     ) -> csc_array:
         """Assemble −Σ λ_i g_i'', without dimensions; empty where it is left out."""
         n = at.u.size
-        if self.curvature is None:
+        if curvature is None:
             return csc_array((n, n))
         l, F = self.bodies.length, self.bodies.force
-        blocks, dofs = self.curvature(at.u * l, lam[at.rows.place] * F)
+        blocks, dofs = curvature(at.u * l, lam[at.rows.place] * F)
         if convex:
             blocks, _ = clip(blocks)
         i, j = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
@@ -345,12 +398,18 @@ class NewtonPath:
         return not motions_left(self.bodies).shape[1]
 
     @cached_property
-    def _turning(self) -> str:
-        """Say which body the supports leave to rotate; empty if there is none."""
+    def _unfit(self) -> str:
+        """Say why the tangent's kernel is not translations; empty where it is."""
         try:
             translations_left(self.bodies)
         except InputError as e:
             return str(e)
+        if self.gaps.curvature is not None and not self._held:
+            return (
+                "contact_stiffness=geometric where contact alone holds a body is not "
+                "built: its translations change the contact forces; expected "
+                "contact_stiffness=none, or supports that hold every body"
+            )
         return ""
 
     def _solve(self, primal: QP, inverse: GeneralisedInverse) -> Solution:
@@ -385,7 +444,7 @@ class NewtonPath:
         length, inverted = 1.0, None
         while length >= SHORTEST:
             try:
-                new = self._configuration(at.u + length * d, load_factor)
+                new = self._configuration(at.u + length * d, load_factor, posed.gaps)
             except InvertedCellError as e:
                 inverted = e
             else:

@@ -7,14 +7,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from harness import Case, Fields, Reference, Solution, Vector
 from problems.contact.bodies import Bodies, clamped, supported
-from problems.contact.linearise import contact_stiffness
+from problems.contact.linearise import (
+    closest_segments,
+    contact_stiffness,
+    linearisation,
+)
 from problems.contact.results import fields, quantities
 from problems.duality.case_forms import contact_case
-from problems.duality.newton import Iteration, NewtonPath, guided
+from problems.duality.newton import Gaps, Iteration, NewtonPath, guided
 from problems.duality.stepping import Linearise
 from problems.fem.finite_strain import (
     Cells,
@@ -33,13 +38,29 @@ def newton_path(
 ) -> NewtonPath:  # fmt: skip
     """Prepare the load steps of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
-    params : material, and contact_stiffness where the gaps are not linear
+    linearise : of the contact rows, by the method that params name, if there is any
+    params : material; of contact, contact_stiffness where they choose the method
     """
-    geometric = params.get("contact_stiffness") == "geometric"
-    return NewtonPath(
-        bodies, cells_without_units(bodies, params["material"]), linearise, reference,
-        steps, curvature=contact_stiffness(bodies) if geometric else None,
-    )  # fmt: skip
+    gaps = Gaps(linearise)
+    if params.get("contact") == "nts":
+        stiffness = params.get("contact_stiffness", "none")
+        gaps = _node_to_segment(bodies, linearise, stiffness)
+    cells = cells_without_units(bodies, params["material"])
+    return NewtonPath(bodies, cells, gaps, reference, steps)
+
+
+def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Gaps:
+    """Collect the gaps of slave nodes to segments, which have second derivatives."""
+    geometric = stiffness == "geometric"
+
+    def keeping(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
+        kept = np.where(pressing, closest_segments(bodies, u), -1)
+        return Gaps(
+            linearisation(bodies, "nts", None, kept=kept),
+            contact_stiffness(bodies, kept) if geometric else None,
+        )
+
+    return Gaps(linearise, contact_stiffness(bodies) if geometric else None, keeping)
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
@@ -77,6 +98,7 @@ def newton_case(
         "newton": newton or len(iterations),
         "newton_iterations": len(iterations),
         "load_parts": path.parts(step),
+        "kept_segments": at.gaps is not path.gaps,
         "clipped": at.clipped,
         "clipped_in_step": sum(i.clipped for i in iterations),
         "residuals": [i.residual for i in iterations],

@@ -44,7 +44,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
     m_I = primal.h.size
     bound = friction.bound / scale[m_E + m_I :]
     qp = QP(
-        P=dual_operator(B, domains), q=torn.c - B @ free,
+        P=dual_operator(B, domains, m_E), q=torn.c - B @ free,
         A=csr_array((B @ R).T), b=R.T @ f,
         G=no_rows(scale.size), h=np.zeros(0),
         lb=np.concatenate([np.full(m_E, -np.inf), np.zeros(m_I), -bound]),

@@ -13,6 +13,7 @@ from harness.checked import located
 from problems.files.file_digest import check_digest, digest
 from problems.ranges import (
     CONTACT_FORMS,
+    DECOMPOSITION,
     LAW,
     METHODS,
     MOST_STEPS,
@@ -23,6 +24,7 @@ from problems.ranges import (
     deformed,
     one_of,
     rough,
+    torn_by,
 )
 
 if TYPE_CHECKING:
@@ -40,11 +42,12 @@ class GmshBodies(Family):
     name: str = "bodies"
     path_suffix: str = ".toml"
     defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType(
-            {"path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0}
-        ),
+        default_factory=lambda: MappingProxyType({
+            "path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0,
+            "parts": 0, "glue": DECOMPOSITION["glue"],
+        }),
         hash=False,
-    )
+    )  # fmt: skip
     forms: tuple[str, ...] = CONTACT_FORMS
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
@@ -78,6 +81,7 @@ class GmshBodies(Family):
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
             )
         one_of(self.name, params, METHODS | PLANES)
+        torn_by(self.name, params, key="parts", what="the number of subdomains")
         path = Path(p["path"])
         table = read_description(path)
         own = any(key in entry for entry in table["contacts"] for key in LAW)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from harness import Family, InputError
 from problems.ranges import (
-    CONTACT_STIFFNESS,
     DECOMPOSITION,
     FRICTION,
     KINEMATICS,
@@ -39,8 +38,7 @@ class ContactPatch(Family):
         default_factory=lambda: MappingProxyType({
             "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
             "contact": "mortar", "basis": "dual", "plane": "strain",
-            **FRICTION, **DECOMPOSITION,
-            **KINEMATICS, **CONTACT_STIFFNESS, "stretch": 1.0,
+            **FRICTION, **DECOMPOSITION, **KINEMATICS, "stretch": 1.0,
         }),
         hash=False,
     )  # fmt: skip

@@ -36,8 +36,7 @@ Weights = Callable[[int], NDArray[np.float64]]
 
 
 def _orthonormal(m: int) -> NDArray[np.float64]:
-    ones_first = np.column_stack([np.ones(m), np.eye(m)[:, : m - 1]])
-    return np.asarray(np.linalg.qr(ones_first)[0][:, 1:].T)
+    return np.asarray(np.linalg.qr(np.ones((m, 1)), mode="complete")[0][:, 1:].T)
 
 
 def _chain(m: int) -> NDArray[np.float64]:

@@ -144,7 +144,7 @@ def spectrum(
         Wv = metric(v)
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)
-        if over or k % CHECKED == CHECKED - 1:
+        if over or k % CHECKED == CHECKED - 1 or k == n - 1:
             found = _extreme(np.array(alpha), np.array(beta), length)
             if over or found.within(tol):
                 break
@@ -167,7 +167,7 @@ def spectra_of_equations(
 
     """
     B_E = torn.B[: torn.equalities]
-    F = made(dual_operator(B_E, torn.domains).arrays)
+    F = made(dual_operator(B_E, torn.domains, torn.equalities).arrays)
     G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
     inverses = [p and F.preconditioner(*p) for p in preconditioners]
     return [spectrum(F, G, M, tol) for M in inverses]

@@ -137,5 +137,8 @@ def _newton_path(
     reference: Reference,
 ) -> NewtonPath:
     bodies = model(*geometry)
-    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    keys = {
+        "material": material, "contact": method[0],
+        "contact_stiffness": contact_stiffness,
+    }  # fmt: skip
     return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)

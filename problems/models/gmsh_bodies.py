@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from problems.duality.newton import NewtonPath
 from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, single_load
 from problems.fem.inverse import GeneralisedInverse
+from problems.feti.elastic import SubdividedBodies, subdivide, torn
+from problems.feti.partition import graph_partition
 from problems.models.description import (
     described_bodies,
     pair_laws,
@@ -41,9 +43,18 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     bodies = model(*source)
     if p["kinematics"] == "finite":
         return _finite(form, source, p, reference)
+    if p["parts"] and form != "dual":
+        raise InputError(
+            f"parts with form {form} is not built; expected form dual, or no parts"
+        )
     primal, friction = _posed(source, p, reference)
+    pieces = None
+    if p["parts"]:
+        with located(source[0]):
+            parts = _subdivided(*source, p["parts"])
+        pieces = partial(torn, parts, primal, friction, p["glue"])
     case = contact_case(
-        bodies, primal, form,
+        bodies, primal, form, torn=pieces,
         floating=lambda: _floating(*source), clamped=lambda: _clamped(*source),
         supported=lambda: _supported(*source),
         quantities=lambda s: quantities(bodies, primal, s, friction),
@@ -102,6 +113,13 @@ def model(path: str, sha256: str, plane: Any) -> Bodies:
 
 
 @lru_cache(maxsize=4)
+def _subdivided(path: str, sha256: str, plane: Any, parts: int) -> SubdividedBodies:
+    bodies = model(path, sha256, plane)
+    label = graph_partition(bodies.mesh.cells, bodies.body, parts)
+    return subdivide(bodies, label)
+
+
+@lru_cache(maxsize=4)
 def _floating(*source: Any) -> GeneralisedInverse:
     return floating(model(*source))
 
@@ -141,5 +159,8 @@ def _newton_path(
     contact_stiffness: str, reference: Reference,
 ) -> NewtonPath:  # fmt: skip
     bodies = model(*source)
-    keys = {"material": material, "contact_stiffness": contact_stiffness}
+    keys = {
+        "material": material, "contact": method[0],
+        "contact_stiffness": contact_stiffness,
+    }  # fmt: skip
     return newton_path(bodies, linearisation(bodies, *method), keys, reference, steps)

@@ -42,6 +42,7 @@ from harness import (
     QP,
     Case,
     Grid,
+    InputError,
     Mechanics,
     Solution,
     Value,
@@ -69,6 +70,10 @@ SLOPE = LIFT_OFF**2 / np.sqrt(1 - LIFT_OFF**2)  #: A, m
 def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     p: Any = params
+    if p["feti"] and form != "dual":
+        raise InputError(
+            f"feti with form {form} is not built; expected form dual, or no feti"
+        )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
     rows, start, tear = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}

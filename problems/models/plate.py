@@ -1,10 +1,10 @@
 """An elastic plate in square subdomains: a linear problem to measure FETI on.
 
-A plate of `width` × `height` is held at its left edge and pulled down by 1 N per m of
-thickness. It consists of Sx × Sy subdomains of n × ny cells, with E = 1 Pa, and
-E = `jump` in some of them: every other one (``checkerboard``) or those at the held edge
-(``column``). Nothing touches it, so that the dual has equations only, and its condition
-numbers say how well the method scales, without load, stopping test or units.
+A plate of `width` × `height` is held at its left edge and pulled down by 1 MN per m of
+thickness. It consists of Sx × Sy subdomains of n × ny cells, of steel, with `jump`
+times its modulus in some of them: every other one (``checkerboard``) or those at the
+held edge (``column``). Nothing touches it, so that the dual has equations only, and its
+condition numbers say how well the method scales, without load, stopping test or units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
@@ -38,7 +38,9 @@ from problems.feti.substructures import local_problems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
-NU = 0.3
+LENGTH = 1.0  #: l, m
+LOAD = 1e6  #: F₀, N/m
+STEEL = Material(E=210e9, nu=0.3)
 #: preconditioner and scaling, by the names under which their spectra are reported
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
     "none": None,
@@ -63,19 +65,20 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 
     return Case(
         qp=new.qp,
-        recover=lambda s: new.recover(s).x,
+        recover=lambda s: new.recover(s).x * LENGTH,
         quantities=results,
         fields=lambda s: Fields(
             points=mesh.points, cells=mesh.cells, bodies=plate.material,
-            displacement=as_vectors(new.recover(s).x),
+            displacement=as_vectors(new.recover(s).x * LENGTH),
         ),
-        scale=new.sign,
-        constant=new.constant,
+        scale=new.sign * LOAD * LENGTH,
+        constant=new.constant * LOAD * LENGTH,
         matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal, back=new.recover, factorise=plate.factorise,
-            mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells))),
-            rigid=rigid_modes(mesh.points), names=("plate",), grid=Grid(
+            mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
+            rigid=rigid_modes(mesh.points), names=("plate",),
+            scale=LOAD * LENGTH, grid=Grid(
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
@@ -86,27 +89,28 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plate:
-    """The plate of one set of keys: E = 1 Pa, lengths in m, forces in N/m."""
+    """The plate of one set of keys; K, f and moduli have no dimension, by l and F₀."""
 
     size: tuple[float, float]  #: width and height, m
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) of each cell
     material: NDArray[np.int64]  #: (E,) of each cell, a place in `moduli`
-    moduli: Vector  #: Pa
-    D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials, Pa
+    moduli: Vector  #: of the materials; the first is that of steel
+    D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials
     primal: QP
     glue: str
     eliminated: bool  #: whether the supports are no rows of the dual
 
     @cached_property
     def torn(self) -> Torn:
-        """The plate in its subdomains; it is one body, so that no row is scaled."""
+        """The plate in its subdomains; it is one body, all rows are scaled alike."""
         points, primal = self.mesh.points, self.primal
         parts = decompose(points, self.mesh.cells, self.subdomain, self.material)
         torn = glue(
             parts, tuple(elastic_kind(p, self.D, self.moduli) for p in parts.parts),
             load=-primal.q, supports=csr_array(primal.A), supported=primal.b,
-            contact=csr_array(primal.G), c=primal.h, E=np.ones(len(points)),
+            contact=csr_array(primal.G), c=primal.h,
+            E=np.full(len(points), self.moduli[0]),
             rows=self.glue,
         )  # fmt: skip
         return without_supports(torn, self.held) if self.eliminated else torn
@@ -149,8 +153,9 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
         "checkerboard": (column + row) % 2,
         "column": (column == 0).astype(np.int64),
     }[p["pattern"]]
-    moduli = np.array([1.0, p["jump"]])
-    D = np.stack([elasticity_matrix(Material(E, NU), p["plane"]) for E in moduli])
+    moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
+    materials = [Material(E, STEEL.nu) for E in moduli]
+    D = np.stack([elasticity_matrix(material, p["plane"]) for material in materials])
     n = mesh.dofs
     one = csr_array(eye_array(n, format="csr"))
     held = dofs_of(mesh.boundaries["left"])
@@ -166,7 +171,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
 
 
 def load(mesh: Mesh, kind: str) -> Vector:
-    """Return nodal forces (2N,) that pull down with 1 N/m in all."""
+    """Return nodal forces (2N,) that pull down with F₀ in all, without dimension."""
     right = mesh.boundaries["right"]
     share = {
         "point": (right == np.intersect1d(right, mesh.boundaries["top"])).astype(float),
@@ -187,15 +192,16 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
         "elements": len(mesh.cells),
         "dofs": mesh.dofs,
         "equality_rows": plate.primal.b.size,
-        "energy": plate.primal.objective(s.x),
-        "tip": s.x[tip].tolist(),
+        "energy": plate.primal.objective(s.x) * LOAD * LENGTH,
+        "tip": (s.x[tip] * LENGTH).tolist(),
     }
 
 
 def dual_quantities(plate: Plate) -> dict[str, Any]:
     """Report how the plate is torn, ‖PFP‖, and condition numbers with error bounds.
 
-    kappa: κ(PFP). kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
+    norm_PFP: that for E = 1, as all rows are scaled by √E. kappa: κ(PFP).
+    kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
     preconditioners, by multiplicity but for the last. Each has an `…_error`.
     """
     spectra = plate.spectra

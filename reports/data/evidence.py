@@ -155,6 +155,13 @@ class Outcome:
         its = [r.iterations for r in self.records if r.iterations is not None]
         return (min(its), max(its)) if its else None
 
+    def counted(self, name: str) -> float | None:
+        """Mean of one of the solver's counts over the repeats; None if one lacks it."""
+        values = [r.counts.get(name) for r in self.records]
+        if not values or None in values:
+            return None
+        return float(sum(v for v in values if v is not None) / len(values))
+
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
         """Physical results of the first repeat that has any."""

@@ -40,6 +40,15 @@ class SizeSeries:
         counted = [(s, o.iterations) for s, o in self._sized(solver, against)]
         return _law([(s, sum(i) / 2) for s, i in counted if i is not None])
 
+    def counts(self, solver: str) -> tuple[str, ...]:
+        """Name what one solver counts on every size that it is verified on."""
+        named = [list(o.first.counts) for _, o in self.curve(solver)]
+        return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
+
+    def count_law(self, solver: str, name: str) -> PowerLaw | None:
+        """Fit one count ~ nᵖ, repeats averaged; None below three sizes."""
+        return _law([(n, o.counted(name) or 0.0) for n, o in self.curve(solver)])
+
     def _sized(self, solver: str, against: str) -> list[tuple[int, Outcome]]:
         """Sizes n or m and the answers of one solver; those without are left out."""
         return [
@@ -75,6 +84,39 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
         for key, sizes in groups.items()
         if len(sizes) >= SIZES
     ]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sweep:
+    """Cases that differ in one key only, and one solver's verified answers on each."""
+
+    title: str  #: family, other parameters, form, tolerance
+    solver: str
+    answers: tuple[tuple[int, Outcome], ...]  #: by the value of the key
+
+
+def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
+    """Find where one key alone takes at least three positive values."""
+    groups: dict[tuple[Any, ...], dict[int, Outcome]] = {}
+    for o in evidence.flat:
+        params = dict(o.first.params)
+        value = params.pop(key, 0)
+        if o.verified and isinstance(value, int) and value > 0:
+            case = "/".join(
+                part
+                for part in o.first.case.split("/")
+                if not part.startswith(f"{key}=")
+            )
+            same = (case, tuple(sorted(params.items())), o.tol, o.solver)
+            groups.setdefault(same, {})[value] = o
+    return [
+        Sweep(
+            title=f"{clean(case)}, tol {tolerance(tol)}", solver=solver,
+            answers=tuple(sorted(found.items())),
+        )
+        for (case, _, tol, solver), found in groups.items()
+        if len(found) >= SIZES
+    ]  # fmt: skip
 
 
 def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:

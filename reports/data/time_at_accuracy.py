@@ -19,12 +19,10 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from harness import Verdict
 from harness.digest import hex_digest
@@ -77,30 +75,59 @@ def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccurac
         np.array([r.total_seconds for r in o.records if r.total_seconds])
         for o in points
     ]
-    value = time_at(error, errors, np.array([np.median(t) for t in samples]))
+    value = float(times_at(error, errors, np.array([np.median(t) for t in samples])))
     drawn = [_medians(t, o) for t, o in zip(samples, points, strict=True)]
-    times = [time_at(error, errors, t) for t in np.transpose(drawn)]
+    times = times_at(error, errors, np.transpose(drawn))
     fewest = min(t.size for t in samples)
-    low, high = limits(np.array(times), fewest) if fewest > 1 else (value, value)
+    low, high = limits(times, fewest) if fewest > 1 else (value, value)
     return TimeAtAccuracy(
         "between", Interval(value, float(low), float(high), COVERAGE, fewest)
     )
 
 
-def time_at(error: float, errors: Floats, times: Floats) -> float:
+def times_at(error: float, errors: Floats, times: Floats) -> Floats:
     """Interpolate monotone in logarithms, between the smallest and the largest error.
 
-    errors, times : (k,) positive; equal errors are one point, their times' mean
+    Parameters
+    ----------
+    errors : (k,) positive; equal errors are one point, their times' geometric mean
+    times : (…, k) s, positive: any number of curves
+
+    Returns
+    -------
+    (…,) s, of each curve at `error`
+
     """
-    points = sorted(zip(-np.log(errors), np.log(times), strict=True))
-    x, y, weights = [], [], []
-    for place, group in groupby(points, key=lambda p: p[0]):
-        logs = [t for _, t in group]
-        x.append(place)
-        y.append(np.mean(logs))
-        weights.append(len(logs))
-    fit = isotonic_regression(y, weights=weights)
-    return float(np.exp(np.interp(-np.log(error), x, fit.x)))
+    places, point, weights = np.unique(
+        -np.log(errors), return_inverse=True, return_counts=True
+    )
+    logs = np.log(times)
+    y = [logs[..., point == i].mean(axis=-1) for i in range(places.size)]
+    hats = [np.interp(-np.log(error), places, hat) for hat in np.eye(places.size)]
+    times_there: Floats = np.exp(isotonic(np.stack(y, axis=-1), weights) @ hats)
+    return times_there
+
+
+def isotonic(y: Floats, weights: NDArray[np.integer]) -> Floats:
+    """Fit what does not fall, by weighted least squares: the max-min formula of [1]_.
+
+    The fit at i is the largest, over where a stretch that holds i begins, of the
+    smallest mean of such stretches, over where they end.
+
+    y : (…, k); each (k,) is fitted by itself
+    weights : (k,) positive
+    """
+    before = np.cumsum([0, *weights])
+    start = np.zeros((*y.shape[:-1], 1))
+    sums = np.concatenate([start, np.cumsum(weights * y, axis=-1)], axis=-1)
+    fit = np.empty_like(y)
+    for i in range(y.shape[-1]):
+        begin, end = slice(i + 1), slice(i + 1, None)
+        means = (sums[..., None, end] - sums[..., begin, None]) / (
+            before[end] - before[begin, None]
+        )
+        fit[..., i] = means.min(axis=-1).max(axis=-1)
+    return fit
 
 
 def _medians(times: Floats, outcome: Outcome) -> Floats:

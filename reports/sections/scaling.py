@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from reports.data.cells import source
 from reports.data.evidence import Outcome
-from reports.data.size_series import SizeSeries
+from reports.data.size_series import SIZES as SERIES
+from reports.data.size_series import SizeSeries, Sweep
 from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
 from reports.document.layout import Cell, Section, Table
 from reports.statistics.growth import LEVEL, SIZES, Growth, growth_of
@@ -180,3 +181,94 @@ def _predicted(fit: Growth | None, n: int) -> Cell:
     except ValueError as e:
         return Cell(text="refused", kind="quiet", title=f"{e}")
     return Cell(text=seconds(time), value=time.value)
+
+
+#: what is read before other counts; the rest in a solver's own order
+FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
+
+
+def steps(found: Sequence[SizeSeries], torn: Sequence[Sweep]) -> Section | None:
+    """Tabulate what solvers count, each kind apart; None where nothing is counted.
+
+    torn : cases that differ in how finely they are torn into subdomains
+    """
+    tables = [t for series in found for t in _step_tables(series)]
+    tables += [_torn_table(sweep) for sweep in torn]
+    if not tables:
+        return None
+    return Section(
+        name="steps",
+        title="Steps of each kind against size",
+        prose=(
+            "What a solver says it counted: products with P, the start included, "
+            "applications of a preconditioner, and for active-set methods conjugate "
+            "gradient (cg), expansion and proportioning steps apart. Conditioning "
+            "shows in cg; the search for the active set shows in the other two. "
+            "Verified answers only, the mean of the repeats. p is the exponent of "
+            "c·nᵖ with Student's 95 % interval, p at most its one-sided 95 % bound; "
+            "the test is that of iterations.",
+            "H/h is the largest number of cells along a side of a subdomain, m the "
+            "number of multipliers.",
+        ),
+        tables=tuple(tables),
+    )
+
+
+def _step_tables(series: SizeSeries) -> list[Table]:
+    found = []
+    for solver in series.solvers:
+        names = series.counts(solver)
+        curve = series.curve(solver)
+        if not names or len(curve) < SERIES:
+            continue
+        ordered = [name for name in FIRST if name in names]
+        ordered += [name for name in names if name not in FIRST]
+        found.append(Table(
+            caption=f"Counts of {clean(solver, 40)} against size: {series.title}.",
+            columns=(
+                "count", *(f"n = {n}" for n, _ in curve), "p [95 %]", "p at most",
+                "p-value", "growth",
+            ),
+            rows=tuple(_step_row(series, solver, name) for name in ordered),
+        ))  # fmt: skip
+    return found
+
+
+def _torn_table(sweep: Sweep) -> Table:
+    """Tabulate the counts of one solver against H/h."""
+    answers = sweep.answers
+    named = [name for name in FIRST if answers[0][1].counted(name) is not None]
+    sizes = ("subdomains", "multipliers")
+    return Table(
+        caption=f"Counts of {clean(sweep.solver, 40)} against H/h: {sweep.title}.",
+        columns=("H/h", "subdomains", "m", *named, "total time"),
+        rows=tuple(
+            (
+                Cell(text=str(value), value=value),
+                *(Cell(text=_rows(o.size(s)), value=o.size(s)) for s in sizes),
+                *(_count(o, name) for name in named),
+                _time(o),
+            )
+            for value, o in answers
+        ),
+        notes=(TIMED,),
+        text_columns=0,
+    )
+
+
+def _count(o: Outcome, name: str) -> Cell:
+    value = o.counted(name)
+    text = ABSENT if value is None else f"{value:.4g}"
+    return Cell(text=text, value=value, title=source(o))
+
+
+def _step_row(series: SizeSeries, solver: str, name: str) -> tuple[Cell, ...]:
+    curve = series.curve(solver)
+    counted = [(n, o.counted(name) or 0.0) for n, o in curve]
+    fit = _fit(counted)
+    return (
+        Cell(text=clean(name, 40)),
+        *(_count(o, name) for _, o in curve),
+        _exponent(series.count_law(solver, name), source(*(o for _, o in curve))),
+        *_tested(fit)[1:],
+    )

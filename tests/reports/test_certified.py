@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import isotonic_regression
 
 from harness import InputError, Record, Verdict
 from harness.crossval.discretisation import FILE, Discretisation, Level
 from reports.data.evidence import Evidence, arrange
-from reports.data.time_at_accuracy import time_at, time_at_accuracy
+from reports.data.time_at_accuracy import isotonic, time_at_accuracy, times_at
 from reports.folder import compose
 from reports.render.markdown import markdown
 from reports.sections.sweeps import certified_picture, certified_sweeps
@@ -88,18 +89,18 @@ def test_a_better_answer_never_takes_less_time():
     """The noise of two tolerances is pooled, not followed."""
     errors = np.array([1e-2, 1e-4, 1e-6, 1e-8])
     times = np.array([1.0, 4.0, 1.0, 8.0])
-    at = [time_at(e, errors, times) for e in np.geomspace(1e-2, 1e-8, 40)]
+    at = [times_at(e, errors, times) for e in np.geomspace(1e-2, 1e-8, 40)]
 
     assert (np.diff(at) >= -1e-12).all()
-    assert time_at(1e-4, errors, times) == pytest.approx(2)  # √(4·1)
-    assert time_at(1e-8, errors, times) == pytest.approx(8)
+    assert times_at(1e-4, errors, times) == pytest.approx(2)  # √(4·1)
+    assert times_at(1e-8, errors, times) == pytest.approx(8)
 
 
 def test_two_tolerances_with_one_answer_are_one_point():
     errors, times = np.array([1e-2, 1e-4, 1e-4]), np.array([1.0, 2.0, 8.0])
 
-    assert time_at(1e-4, errors, times) == pytest.approx(4)
-    assert time_at(1e-3, errors, times) == pytest.approx(2)
+    assert times_at(1e-4, errors, times) == pytest.approx(4)
+    assert times_at(1e-3, errors, times) == pytest.approx(2)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +133,14 @@ def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
     refuted = [r.but(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
     assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
+
+
+def test_many_curves_at_once_are_fitted_as_one_by_one():
+    rng = np.random.default_rng(141421)
+    for k in (1, 2, 5, 9):
+        y, weights = rng.standard_normal((20, k)), rng.integers(1, 4, k)
+        expected = [isotonic_regression(row, weights=weights).x for row in y]
+        assert isotonic(y, weights) == pytest.approx(np.array(expected), abs=1e-14)
 
 
 def test_the_largest_error_of_the_repeats_is_the_error():

@@ -72,32 +72,52 @@ def records():
     return list(synthetic(SOLVERS, CASES, REPEATS))
 
 
+@pytest.fixture(scope="session")
+def tabs(browser):
+    """A tab for each set of options, in which the next page opens in half the time."""
+    tabs, said, asked = {}, [], []
+
+    def tab(**options):
+        key = frozenset(options.items())
+        if key not in tabs:
+            page = tabs[key] = browser.new_context(**options).new_page()
+            page.set_default_timeout(60_000)
+            page.on("console", lambda message: said.append(message.text))
+            page.on("pageerror", lambda error: said.append(str(error)))
+            page.on("request", lambda request: asked.append(request.url))
+        return tabs[key]
+
+    yield tab, said, asked
+    for page in tabs.values():
+        page.context.close()
+
+
 @pytest.fixture
-def visit(browser):
+def visit(tabs):
     """Open a page; at the end it has said nothing and asked for nothing."""
-    contexts, said, asked = [], [], []
+    tab, said, asked = tabs
+    said.clear()
+    asked.clear()
+    visits = []
 
     def open_(path, fragment="", width=1400, **options):
-        context = browser.new_context(
-            viewport={"width": width, "height": 900}, **options
-        )
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on("request", lambda request: asked.append(request.url))
+        page = tab(**options)
+        scripts = options.get("java_script_enabled", True)
+        visits.append((page, scripts))
+        page.goto("about:blank")  # another fragment alone would load nothing
+        page.set_viewport_size({"width": width, "height": 900})
         page.goto((path / "report" / "index.html").as_uri() + fragment)
-        if options.get("java_script_enabled", True):
+        if scripts:
             page.add_style_tag(content=ALL_LAID_OUT)
         return page
 
     yield open_
-    for context in contexts:
-        context.close()
+    for page, scripts in visits:
+        if scripts:
+            page.evaluate("localStorage.clear()")
     assert said == []
     assert all(url.startswith("file:") for url in asked)
-    assert len(asked) == len(contexts)  # the pages themselves, nothing else
+    assert len(asked) == len(visits)  # the pages themselves, nothing else
 
 
 def table(page, section, number=0):

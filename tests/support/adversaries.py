@@ -157,8 +157,7 @@ class AlwaysSegfaults(Honest):
 class Hangs(Honest):
     def act(self, qp):
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        while True:
-            pass
+        time.sleep(3600)
 
 
 class AlwaysHangs(Honest):

@@ -11,6 +11,7 @@ an interpreter does before it runs a program is left out. Where that is tested, 
 Run as a program with a socket and modules to import, it is the server.
 """
 
+import atexit
 import gc
 import json
 import os
@@ -189,7 +190,18 @@ def run(_, command):
     except OSError:  # would be taken for one of execvp
         traceback.print_exc()
         sys.exit(1)
-    sys.exit(0)
+    except SystemExit as end:
+        if end.code:
+            raise
+    end_well()
+
+
+def end_well():
+    """End without taking apart what the libraries made, which would be copied first."""
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 if __name__ == "__main__":

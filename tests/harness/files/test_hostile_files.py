@@ -177,7 +177,7 @@ def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
 def mat_element(declared, content):
     """Write the one variable of a version 5 file, compressed."""
     text = b"MATLAB 5.0".ljust(124) + struct.pack("<H", 0x100) + b"IM"
-    body = zlib.compress(struct.pack("<II", 14, declared) + content, 9)
+    body = zlib.compress(struct.pack("<II", 14, declared) + content, 1)
     return text + struct.pack("<II", 15, len(body)) + body
 
 

@@ -19,7 +19,7 @@ from harness.names import assemble
 from harness.processes import supervisor
 from harness.processes.measurement import _believed, measured, scratch_folder
 from harness.processes.protocol import ForeignReplyError, checked_answer, event_of
-from harness.processes.reaper import lives
+from harness.processes.reaper import lives, state
 from harness.processes.supervisor import REPLACED, Clock, Reply, WorkerProcess
 from harness.registry import SolverSpec, load_plugin, resolve
 from harness.results.journal import read_journal
@@ -475,10 +475,12 @@ def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, attacked):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], cwd=ROOT)
     try:
         # run, sub-reaper, worker, daemon
-        assert soon(lambda: len(left(attacked)) == 4), [
-            (process, Path(f"/proc/{process}/cmdline").read_bytes())
+        assert soon(lambda: len(left(attacked)) == 4), "\n".join(
+            f"{process} {state(process)} waits in "
+            + Path(f"/proc/{process}/wchan").read_text()
+            + f": {Path(f'/proc/{process}/cmdline').read_bytes()[-60:]!r}"
             for process in left(attacked)
-        ]
+        )
     finally:
         parent.kill()
         parent.wait()

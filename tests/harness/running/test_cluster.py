@@ -253,6 +253,15 @@ def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeyp
     assert measured("d") == before
 
 
+@pytest.fixture
+def heeded():
+    """Ctrl-C interrupts, although what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeded")
 def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
     from harness.running.cluster import _interrupted_later
 

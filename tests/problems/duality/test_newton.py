@@ -160,7 +160,7 @@ def test_the_line_search_decreases_the_penalty_function():
     path = ring_path(steps=1, size=4)
     steps = path.iterations(1)
     weight = 2 * max(i.answer.z.max() for i in steps)
-    merit = [newton._merit(path._configuration(i.u, 1.0), weight) for i in steps]
+    merit = [newton._merit(path._configuration(i.u, 1.0, i.gaps), weight) for i in steps]
     short = [j for j, i in enumerate(steps[:-1]) if i.length < 1]
 
     assert short
@@ -209,3 +209,25 @@ def test_paths_are_those_of_the_keys():
     found = ring_path().iteration(1, 2)
 
     np.testing.assert_array_equal(case.mechanics.primal.q, found.primal.q)
+
+
+def test_a_node_between_two_segments_keeps_one_of_them():
+    """In step 6 a node of this ring is pushed to and fro at a vertex of the beam."""
+    path = beam_ring._newton_path(
+        (6, 4, 8, "strain"), ("nts", "dual"), 10, "neo-hooke", "geometric",
+        reference_solution,
+    )  # fmt: skip
+    kept = [path.iterations(k)[-1].gaps is not path.gaps for k in (5, 6)]
+    last = path.iteration(6)
+    _, residual, penetration = path.state(last, last.answer)
+
+    assert kept == [False, True]
+    assert residual <= 1e-9
+    assert 0 < penetration <= 1e-5
+
+
+def test_contact_stiffness_needs_bodies_that_supports_hold():
+    path = patch_path(contact="nts", contact_stiffness="geometric")
+
+    with pytest.raises(InputError, match="contact alone holds a body is not built"):
+        path.iterations(1)

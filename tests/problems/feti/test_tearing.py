@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import block_diag
+from scipy.sparse import block_diag, csr_array, eye_array
 
+from problems.fem.elasticity import Material, elasticity_matrix
 from problems.fem.mesh import rectangle
+from problems.feti.elastic import elastic_kind
+from problems.feti.gluing import glue, without_supports
 from problems.feti.tearing import blocks, decompose, structured_bodies
 from tests.support.torn_bodies import torn_pair
 
@@ -116,3 +119,30 @@ def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
     assert beam.boundary.size == 2 * 16
     assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
     assert np.unique(np.concatenate([k.stiffness for k in pair.kinds])).size == 2
+
+
+def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
+    mesh = rectangle((0.0, 0.0), (2.0, 1.0), (4, 2))
+    label, n = blocks((4, 2), 2), mesh.dofs
+    parts = decompose(mesh.points, mesh.cells, label, np.zeros_like(label))
+    D, E = elasticity_matrix(Material(1.0, 0.3), "strain")[None], np.ones(1)
+    kinds = tuple(elastic_kind(part, D, E) for part in parts.parts)
+    held = 2 * mesh.boundaries["left"]
+    pair = glue(
+        parts, kinds, load=np.arange(1.0, n + 1), contact=csr_array((0, n)),
+        supports=csr_array(eye_array(n, format="csr")[held]),
+        supported=np.zeros(held.size), c=np.zeros(0), E=np.ones(len(mesh.points)),
+    )  # fmt: skip
+    found = without_supports(pair, held)
+    first, second = (found.kinds[k] for k in found.kind)
+    assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
+    assert abs(first.K @ first.R).max() < 1e-13
+    assert_allclose(first.R.T @ first.R, [[1.0]])
+    assert abs(first.R[first.fixing]).min() > 0.1
+    assert found.equalities == pair.equalities - held.size == found.B.shape[0]
+    u = np.arange(n) ** 0.5
+    u[held] = 0
+    assert_allclose(found.spread @ u, (pair.spread @ u)[pair.spread @ u != 0])
+    assert_allclose(found.B @ (found.spread @ u), 0, atol=1e-12)
+    free = ~np.isin(np.arange(n), held)
+    assert_allclose(found.spread.T @ found.f, free * np.arange(1.0, n + 1))

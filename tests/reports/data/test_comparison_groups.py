@@ -475,6 +475,49 @@ def test_three_sizes_have_no_section_on_growth(record, evidence):
     assert section(page, "growth") is None
 
 
+def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
+    def counts(n):
+        return {
+            "outer": 3,
+            "expansion": 2 * n,
+            "P_products": 40,
+            "cg": round(9 * n**0.5),
+        }
+
+    sizes = (1, 4, 16, 64)
+    records = [record("s", c - 1, 1.0, counts=counts(c)) for c in sizes]
+    records += [record("silent", c - 1, 1.0) for c in sizes]
+    (table,) = section(compose(evidence(records)), "steps").tables
+    found = rows(table)
+    assert list(found) == ["P_products", "cg", "expansion", "outer"]
+    exponents = [row["p [95 %]"].value for row in found.values()]
+    assert exponents == pytest.approx([0, 0.5, 1, 0], abs=1e-9)
+    grown = [row["growth"].text for row in found.values()]
+    assert grown == ["no growth detected", "grow", "grow", "no growth detected"]
+    assert found["cg"]["n = 6400"].value == 72
+
+
+def test_one_mesh_torn_more_or_less_finely_has_a_table_of_its_own(record, evidence):
+    records = [
+        record("s", cells, 1.0, counts={"P_products": 10 + cells}).but(
+            case=f"toy/Nr=3/feti={cells}/dual", params={"Nr": 3, "feti": cells},
+            quantities={"dofs": 100, "subdomains": 64 // cells},
+        )
+        for cells in (8, 4, 16)
+    ]  # fmt: skip
+    (table,) = section(compose(evidence(records)), "steps").tables
+    assert "toy/Nr=3/dual" in table.caption
+    found = rows(table)
+    assert list(found) == ["4", "8", "16"]
+    assert [row["P_products"].value for row in found.values()] == [14, 18, 26]
+    assert [row["subdomains"].value for row in found.values()] == [16, 8, 4]
+
+
+def test_without_counts_there_is_no_section_on_steps(record, evidence):
+    page = compose(evidence(some_records(record, 2, cases=3)))
+    assert section(page, "steps") is None
+
+
 # ---- claims
 
 

@@ -1,0 +1,120 @@
+"""Bodies of any mesh cut into connected parts, by a partition of the graph of cells.
+
+Two cells are neighbours if they share an edge. METIS (Karypis and Kumar 1998, SIAM J.
+Sci. Comput. 20) parts the graph of each body so that parts are about equal and few
+edges lie between them. Cells that hang together in a node only would turn against each
+other: a part must be connected by edges, or it has more motions than a rigid body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from harness import InputError
+from problems.fem.mesh import Nodes
+
+Labels = NDArray[np.int64]
+
+
+def graph_partition(cells: Nodes, body: Labels, parts: int) -> Labels:
+    """Label the cells of bodies by parts, each connected and of one body.
+
+    Every body has a number of parts in proportion to its cells, one at least.
+
+    Parameters
+    ----------
+    cells : (E, 4) corners; a triangle repeats its last one
+    body : (E,) of each cell, 0, 1, …
+    parts : of all bodies together
+
+    Returns
+    -------
+    (E,) part of each cell, 0 … parts − 1, those of one body after those of another
+
+    Raises
+    ------
+    InputError
+        When there are more bodies than parts, less than two cells for each part, or a
+        body is not connected.
+
+    """
+    counts = np.bincount(body)
+    if not counts.size <= parts <= max(counts.size, len(cells) // 2):
+        raise InputError(
+            f"parts={parts} of {counts.size} bodies with {len(cells)} cells; expected "
+            f"{counts.size} to {len(cells) // 2}, or 0 for one piece per body"
+        )
+    label, first = np.empty(len(cells), dtype=np.int64), 0
+    for b, of_body in enumerate(_shares(counts, parts)):
+        own = np.flatnonzero(body == b)
+        label[own] = first + _parted(_neighbours(cells[own]), int(of_body))
+        first += int(of_body)
+    return label
+
+
+def _shares(counts: Labels, parts: int) -> Labels:
+    """Share out the parts in proportion to the cells of each body, one at least."""
+    shares = np.ones_like(counts)
+    for _ in range(parts - counts.size):
+        shares[np.argmax(counts / shares)] += 1
+    return shares
+
+
+def _neighbours(cells: Nodes) -> csr_array:
+    """Return the graph of cells (E, E): an entry for each edge that two share."""
+    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    cell = np.repeat(np.arange(len(cells)), cells.shape[1])
+    is_edge = edges[:, 0] != edges[:, 1]
+    _, number = np.unique(np.sort(edges[is_edge]), axis=0, return_inverse=True)
+    ones = np.ones(number.size, dtype=np.int64)
+    incident = csr_array((ones, (cell[is_edge], number.ravel())))
+    graph = csr_array(incident @ incident.T)
+    graph.setdiag(0)
+    graph.eliminate_zeros()
+    return graph
+
+
+def _parted(graph: csr_array, parts: int) -> Labels:
+    """Part the cells of one body."""
+    if connected_components(graph)[0] > 1:
+        raise InputError(
+            "the cells of a body do not all hang together by edges; expected a body "
+            "for each of its pieces"
+        )
+    if parts == 1:
+        return np.zeros(graph.shape[0], dtype=np.int64)
+    from pymetis import CSRAdjacency, Options, part_graph  # here: few cases are parted
+
+    adjacency = CSRAdjacency(graph.indptr, graph.indices)
+    # k-way parts are better, but some may be empty where parts have few cells
+    for recursive, options in ((False, Options(contig=1)), (True, Options())):
+        _, found = part_graph(parts, adjacency, recursive=recursive, options=options)
+        label = _connected(graph, np.array(found, dtype=np.int64))
+        if np.unique(label).size == parts:
+            return label
+    raise InputError(
+        f"METIS finds no {parts} connected parts in a body of {label.size} cells; "
+        "expected fewer parts"
+    )
+
+
+def _connected(graph: csr_array, label: Labels) -> Labels:
+    """Give the smaller pieces of a part to the neighbours that they touch most."""
+    cell, other = graph.nonzero()
+    while True:
+        same = label[cell] == label[other]
+        inside = csr_array((same.astype(np.int8), (cell, other)), shape=graph.shape)
+        inside.eliminate_zeros()
+        count, piece = connected_components(inside)
+        if count == np.unique(label).size:
+            return label
+        sizes, of_part = np.bincount(piece), np.empty(count, dtype=np.int64)
+        of_part[piece] = label
+        order = np.lexsort((sizes, of_part))
+        largest = np.append(of_part[order][1:] != of_part[order][:-1], True)
+        loose = order[~largest][0]
+        touched = label[other[(piece[cell] == loose) & ~same]]
+        label = np.where(piece == loose, np.bincount(touched).argmax(), label)

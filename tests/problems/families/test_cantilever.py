@@ -1,0 +1,173 @@
+"""The cantilever at finite strain: the elastica, convergence, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import mortarbench as mb
+from harness import InputError, no_rows
+from problems.contact.bodies import assemble, clamped
+from problems.contact.node_to_segment import ContactRows
+from problems.duality.newton_case import newton_path
+from problems.fem.elasticity import Material
+from problems.fem.mesh import dofs_of, rectangle
+from problems.models.cantilever import beam, elastica
+
+
+@pytest.mark.parametrize(
+    ("load", "deflection", "shortening"),
+    [(1, 0.30172077, 0.05643324), (10, 0.81060902, 0.55499560)],
+)
+def test_the_elastica_has_the_known_digits(load, deflection, shortening):
+    assert elastica(load) == pytest.approx((deflection, shortening), abs=6e-9)
+
+
+@pytest.mark.parametrize("load", [0.01, 3.0, 80.0])
+def test_the_elastica_solves_its_differential_equation(load):
+    """EIθ″ = −P cos θ by a Runge-Kutta method: θ′ at the clamp makes θ′(L) vanish."""
+
+    def along(moment):
+        return solve_ivp(
+            lambda s, y: [y[1], -load * np.cos(y[0]), np.sin(y[0]), np.cos(y[0])],
+            (0, 1), [0, moment, 0, 0], rtol=1e-10, atol=1e-12,
+        ).y[:, -1]  # fmt: skip
+
+    moment = brentq(lambda m: along(m)[1], 0, min(1.001 * load, np.sqrt(2 * load)))
+    _, _, down, forwards = along(moment)
+
+    assert elastica(load) == pytest.approx((down, 1 - forwards), rel=1e-6)
+
+
+def emitted(name):
+    case = mb.build(name)
+    return case, mb.solve(case, "smalbe" if "dual" in name else "clarabel", tol=1e-9)
+
+
+@pytest.mark.parametrize("load", [1, 10])
+def test_a_slender_beam_ends_where_the_elastica_does(load):
+    case, answer = emitted(f"cantilever/load={load}/ny=8/dual")
+
+    assert answer.verdict == "verified"
+    found = answer.quantities
+    assert abs(found["deflection_error"]) < 0.01
+    assert abs(found["shortening_error"]) < 0.01
+    assert found["clipped_in_step"] == 0
+    assert found["load_parts"] == 1
+    assert found["residual"] < 1e-8
+    # quadratic: the last steps are whole, each residual below its square
+    *_, before, last = found["residuals"]
+    assert last < max(100 * before**2, 1e-8)
+    # at the end of Newton's method the model of the QP is the potential itself
+    s = answer.solution
+    objective = case.made.scale * case.qp.objective(s.x) + case.made.constant
+    assert objective == pytest.approx(found["energy"], rel=1e-9)
+
+
+def test_deflections_converge_with_the_square_of_the_size_of_cells():
+    ends = [
+        emitted(f"cantilever/slenderness=8/load=3/ny={n}/nx={12 * n}/dual")[1]
+        .quantities["deflection"]
+        for n in (2, 4, 8)
+    ]  # fmt: skip
+
+    coarse, fine = np.diff(ends)
+
+    assert 1.8 < np.log2(coarse / fine) < 2.2
+
+
+def test_nearly_incompressible_beams_do_not_lock():
+    """Four points a cell would make it stiffer by ν²/(1 − 2ν)/ny², more than twice."""
+    _, answer = emitted("cantilever/nu=0.49/ny=3/slenderness=10/load=1/dual")
+
+    assert abs(answer.quantities["deflection_error"]) < 0.06
+
+
+def test_every_iteration_is_a_convex_qp_in_the_total_displacement():
+    """Its Hessian is positive definite; each begins where the line search ended."""
+    bodies = beam(6.0, 5.0, (24, 2), 0.3)
+    path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
+
+    found = path.iterations(1)
+
+    assert len(found) > 3
+    for at, following in zip(found, found[1:] + found[-1:], strict=True):
+        P = at.primal.P.toarray()
+        assert (P == P.T).all()
+        assert np.linalg.eigvalsh(P)[0] > 0
+        step = at.length * (at.answer.x - at.u)
+        assert following is at or np.allclose(following.u, at.u + step, atol=1e-14)
+
+
+def test_forms_pose_the_same_iteration():
+    name = "cantilever/slenderness=4/ny=2/load=2/newton=2"
+    primal, dual = (emitted(f"{name}/{form}") for form in ("primal", "dual"))
+
+    u, v = (case.made.recover(answer.solution) for case, answer in (primal, dual))
+
+    assert np.abs(u - v).max() < 1e-6 * np.abs(u).max()
+    assert primal[1].quantities["newton"] == 2
+    with pytest.raises(
+        InputError, match=r"newton=99: step 1 has \d+ Newton iterations"
+    ):
+        mb.build("cantilever/slenderness=4/ny=2/load=2/newton=99/primal")
+
+
+def test_for_small_loads_finite_and_linear_displacements_differ_by_their_square():
+    differences = []
+    for load in (0.02, 0.01):
+        bodies = beam(6.0, load, (12, 2), 0.3)
+        path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
+        linear = clamped(bodies)(bodies.f)
+        differences.append(np.abs(path.iteration(1).answer.x - linear).max())
+
+    assert np.log2(differences[0] / differences[1]) == pytest.approx(2, abs=0.01)
+
+
+def no_contact(bodies):
+    n, none = bodies.mesh.dofs, np.zeros(0, dtype=np.int64)
+    rows = ContactRows(no_rows(n), np.zeros(0), no_rows(n), none, np.zeros(0), none)
+    return lambda u: rows
+
+
+@pytest.mark.parametrize("material", ["neo-hooke", "svk"])
+def test_a_rotated_problem_has_the_rotated_answer(material):
+    Q = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    answers = []
+    for turn in (np.eye(2), Q):
+        mesh = rectangle((0.0, -0.1), (1.0, 0.2), (10, 2))
+        mesh = replace(mesh, points=mesh.points @ turn.T)
+        load = np.zeros((len(mesh.points), 2))
+        load[mesh.boundaries["right"]] = turn @ [0.002, -0.003]
+        bodies = assemble(
+            mesh, np.zeros(20, dtype=np.int64), names=("beam",),
+            materials=(Material(1.0, 0.3),), plane="strain", units=(1.0, 0.01),
+            fixed=dofs_of(mesh.boundaries["left"]), load=load.ravel(), pairs=(),
+        )  # fmt: skip
+        path = newton_path(bodies, no_contact(bodies), {"material": material}, None)
+        answers.append(path.iteration(1).answer.x.reshape(-1, 2))
+
+    straight, turned = answers
+
+    assert np.abs(straight).max() > 0.3
+    assert np.abs(turned - straight @ Q.T).max() < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        ("load=0", "cantilever: load=0.0 must be positive"),
+        ("load=1e4", "cantilever: load=10000 must be between 0.001 and 1000"),
+        ("slenderness=1", "cantilever: slenderness=1 must be at least 2"),
+        ("nu=0.5", "cantilever: nu=0.5 must be between 0 and 0.4999"),
+        ("nx=0", "cantilever: nx=0 must be at least 1"),
+        ("steps=2/step=3", "cantilever: step=3 must be in 1..steps=2"),
+        ("material=steel", "cantilever: material='steel' is unknown, expected 'neo"),
+        ("newton=-1", "cantilever: newton=-1 must be at least 0"),
+    ],
+)
+def test_keys_out_of_range_are_refused_in_one_line(keys, line):
+    with pytest.raises(InputError, match=line):
+        mb.build(f"cantilever/{keys}/primal")

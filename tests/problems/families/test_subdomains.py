@@ -1,0 +1,160 @@
+"""Every family in subdomains has the displacement that it has in one piece."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from harness import InputError, Status, kkt_residuals
+from harness.names import parse
+from harness.verify.verdicts import certified
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support import ROOT
+
+TOL = 1e-8
+GLUES = ("orthonormal", "chain", "redundant")
+DISC = """\
+mesh = "press.msh"
+length_unit = "mm"
+contact = "mortar"
+steps = 1
+[[bodies]]
+name = "disc"
+E = 210e9
+nu = 0.3
+[[bodies]]
+name = "lower"
+E = 210e9
+nu = 0.3
+[[bodies]]
+name = "upper"
+E = 210e9
+nu = 0.3
+[[supports]]
+boundary = "base"
+fix = ["x", "y"]
+[[supports]]
+boundary = "guides"
+fix = ["x"]
+[[supports]]
+point = "axis"
+fix = ["x"]
+[[loads]]
+boundary = "press"
+force = [0, -2e6]
+[[contacts]]
+slave = "disc below"
+master = "lower top"
+[[contacts]]
+slave = "disc above"
+master = "upper bottom"
+"""
+COULOMB = "friction=coulomb/mu=0.3"
+CASES = [
+    ("beam-ring/Nr=2/Nh=2/steps=1", "feti=2"),
+    ("contact-patch/lower=4/upper=6", "feti=2"),
+    (f"contact-patch/lower=4/upper=6/{COULOMB}", "feti=2"),
+    ("hertz-plane/n=2", "feti=5"),
+    ("greco/n=6", "feti=3"),
+    ("obstacle/n=8", "feti=3"),
+    ("obstacle/dim=1/n=12", "feti=4"),
+]
+
+
+def built(name):
+    return parse(name, PROBLEMS).build(reference_solution)
+
+
+@cache
+def in_one_piece(name):
+    whole = built(f"{name}/dual")
+    u = whole.mechanics.back(reference_solution(whole.qp)).x
+    return u, whole.mechanics.primal.P
+
+
+def check(name, cut, glue):
+    u, K = in_one_piece(name)
+    case = built(f"{name}/{cut}/glue={glue}/dual")
+    s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
+    error = case.mechanics.back(s).x - u
+    bound = certified(case, s)[0]["energy_bound"]
+    relative = np.sqrt(max(error @ (K @ error), 0.0) / (u @ (K @ u)))
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
+    assert abs(error).max() <= 10 * TOL * abs(u).max()
+    assert relative <= 10 * TOL
+    assert relative <= bound * (1 + 1e-6) + 1e-10
+    assert bound <= 1e-5
+
+
+@pytest.mark.parametrize("glue", GLUES)
+@pytest.mark.parametrize(("name", "cut"), CASES)
+def test_the_displacement_is_that_of_the_bodies_in_one_piece(name, cut, glue):
+    check(name, cut, glue)
+
+
+@pytest.fixture
+def press(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "press.toml").write_text(DISC)
+    mesh = (ROOT / "tests" / "data" / "press.msh").read_bytes()
+    (tmp_path / "press.msh").write_bytes(mesh)
+    return "bodies:press.toml"
+
+
+@pytest.mark.parametrize("glue", GLUES)
+def test_bodies_of_any_mesh_are_cut_into_parts(press, glue):
+    check(press, "parts=8", glue)
+
+
+def test_bodies_with_friction_are_cut_into_parts(press):
+    check(f"{press}/friction=tresca/bound=1e7", "parts=8", "orthonormal")
+
+
+@pytest.mark.parametrize("name", ["obstacle/n=8", "obstacle/dim=1/n=9"])
+def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
+    """One with the form that eliminates them."""
+    u, _ = in_one_piece(name)
+    eliminated = built(f"{name}/dual-bounds")
+    exact = eliminated.mechanics.back(reference_solution(eliminated.qp)).x
+
+    assert u == pytest.approx(exact, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("obstacle/feti=4/primal", "feti with form primal is not built"),
+        ("obstacle/feti=4/dual-bounds", "feti with form dual-bounds is not built"),
+        ("hertz-plane/feti=4/primal", "feti with form primal is not built"),
+        ("bodies:press.toml/parts=8/primal", "parts with form primal is not built"),
+        (
+            "bodies:press.toml/parts=2/dual",
+            r"parts=2 of 3 bodies .* expected 3 to 1044",
+        ),
+    ],
+)
+def test_what_is_not_built_is_refused_by_name(press, name, message):
+    with pytest.raises(InputError, match=message):
+        built(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("obstacle/feti=-1/dual", "feti=-1 must be at least 0"),
+        ("obstacle/glue=chain/dual", "glue=chain is not used by feti=0"),
+        ("contact-patch/feti=2/glue=tape/dual", "glue='tape' is unknown"),
+        ("bodies:press.toml/parts=-1/dual", "parts=-1 must be at least 0"),
+        ("bodies:press.toml/glue=chain/dual", "glue=chain is not used by parts=0"),
+        ("bodies:press.toml/feti=4/dual", "unknown key 'feti'"),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused_before_anything_is_built(
+    press, name, message
+):
+    with pytest.raises(InputError, match=message):
+        parse(name, PROBLEMS)
