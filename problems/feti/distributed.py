@@ -33,10 +33,10 @@ from harness.distributed import (
 from harness.operators import Product
 from problems.fem.mesh import Nodes
 from problems.feti.operators import (
-    ROUNDING,
     SHIFT,
     DualOperator,
     touched,
+    uncoupled,
 )
 from problems.feti.torn import Dense, Subdomains
 
@@ -222,28 +222,25 @@ class RankOperator:
         at, ranks = self.exchange, self.exchange.ranks
         diagonal = at.added(part.diagonal())
         entries = part.tocoo()
+        told = at.rows[entries.row], at.rows[entries.col], entries.data
         beside = (entries.row != entries.col) & (entries.data != 0)
-        told = (
-            at.rows[entries.row[beside]], at.rows[entries.col[beside]],
-            entries.data[beside],
-        )  # fmt: skip
-        rows, columns, data = map(
-            np.concatenate, zip(*ranks.comm.allgather(told), strict=True)
+        known = np.unique(
+            np.concatenate(ranks.comm.allgather(np.unique(told[0][beside])))
         )
-        known = np.unique(np.concatenate([rows, columns]))
-        mine = np.intersect1d(known, at.rows[at.own], return_indices=True)[1:]
-        total = np.zeros(known.size)
-        total[mine[0]] = diagonal[mine[1]]
-        total = ranks.total(total)
+        of_known = np.isin(told[0], known) & np.isin(told[1], known)
+        rows, columns, data = map(
+            np.concatenate,
+            zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
+        )
         places = np.searchsorted(known, rows), np.searchsorted(known, columns)
         gram = csr_array((data, places), shape=(known.size,) * 2)
         gram.sum_duplicates()
-        i = np.repeat(np.arange(known.size), np.diff(gram.indptr))
-        size = np.sqrt(total[i] * total[gram.indices])
-        coupled = np.unique(i[np.abs(gram.data) > ROUNDING * size])
+        equalities = int(np.searchsorted(known, self.local.equalities))
+        gram = uncoupled(gram, equalities)
+        coupled = np.flatnonzero(np.diff(gram.indptr) > 1)
         if not coupled.size:
             return lambda x: np.asarray(x / diagonal)
-        shift = diags_array((1 + SHIFT) * total[coupled])
+        shift = diags_array(SHIFT * gram.diagonal()[coupled])
         factor = cholesky(csc_matrix(gram[coupled][:, coupled] + shift))
         place, own = np.intersect1d(
             known[coupled], at.rows[at.own], return_indices=True
@@ -281,6 +278,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         csr_array(B[at.rows][:, columns]),
         Subdomains(tuple(domains.kinds[k] for k in kinds), kind),
         operator.explicit[kinds],
+        operator.equalities,
     )
     own = at.rows[at.own]
     q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))
