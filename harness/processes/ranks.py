@@ -39,7 +39,10 @@ from harness.verify.measure import memory_mib
 _ORDER = 7  #: tag of what rank 0 tells the others to do
 _IDLE_SECONDS = 2e-4  #: between two looks for an order
 _ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others to fail, too
-_DEATH = re.compile(r"EXIT STRING: (.*?)(?: \(signal (\d+)\))?$")
+#: how a rank tells `launch` its process, and how mpiexec tells which one ended, and why
+_STARTED = re.compile(r"rank (\d+) is process (\d+)$")
+_ENDED = re.compile(r"PID (\d+) RUNNING")
+_WHY = re.compile(r"EXIT STRING: (.*)$")
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
@@ -62,18 +65,26 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     )  # fmt: skip
     for fd in fds:
         os.close(fd)
-    said, ended = "", ""
+    said, which, why = "", "", ""
+    rank_of: dict[str, str] = {}
     assert process.stdout is not None
     for line in process.stdout:
+        if match := _STARTED.match(line):
+            rank_of[match[2]] = match[1]
+            continue
         if line.startswith("rank "):
             said = line.strip()
-        elif match := _DEATH.search(line):
-            ended = f"a rank ended: {match[1].strip()}"
+        elif match := _ENDED.search(line):
+            which = rank_of.get(match[1], "")
+        elif match := _WHY.search(line):
+            why = match[1].strip()
         sys.stderr.write(line)
         sys.stderr.flush()
     code = process.wait()
     if code:
-        print(said or ended or f"mpiexec ended with {code}", file=sys.stderr)
+        one = f"rank {which}" if which else "one"
+        ended = f"{one} of {ranks} ranks ended: {why or f'mpiexec says {code}'}"
+        print(said or ended, file=sys.stderr)
     return 1 if code else 0
 
 
@@ -84,6 +95,7 @@ def this_rank() -> Ranks:
     ranks = Ranks(MPI.COMM_WORLD)
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[ranks.rank % len(cpus)]})
+    print(f"rank {ranks.rank} is process {os.getpid()}", file=sys.stderr, flush=True)
     return ranks
 
 
