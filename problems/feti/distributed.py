@@ -19,8 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_array, diags_array
-from sksparse.cholmod import cholesky
+from scipy.sparse import csr_array, diags_array
 
 from harness import QP, InputError, Solution, Vector, no_rows
 from harness.distributed import (
@@ -33,8 +32,8 @@ from harness.distributed import (
 from harness.operators import Product
 from problems.fem.mesh import Nodes
 from problems.feti.operators import (
-    SHIFT,
     DualOperator,
+    gram_inverse,
     touched,
     uncoupled,
 )
@@ -216,17 +215,17 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Make x ↦ (B W Bᵀ)⁻¹x of the sum of all ranks' parts, on owned rows.
 
-        Rows that are coupled with others, those of contact if gluing is orthonormal,
-        are solved for by all ranks alike.
+        Contact rows, and those that are coupled with others (none if gluing is
+        orthonormal), are solved for by all ranks alike.
         """
         at, ranks = self.exchange, self.exchange.ranks
         diagonal = at.added(part.diagonal())
         entries = part.tocoo()
         told = at.rows[entries.row], at.rows[entries.col], entries.data
         beside = (entries.row != entries.col) & (entries.data != 0)
-        known = np.unique(
-            np.concatenate(ranks.comm.allgather(np.unique(told[0][beside])))
-        )
+        contact = at.rows[at.rows >= self.local.equalities]
+        mine = np.union1d(told[0][beside], contact)
+        known = np.unique(np.concatenate(ranks.comm.allgather(mine)))
         of_known = np.isin(told[0], known) & np.isin(told[1], known)
         rows, columns, data = map(
             np.concatenate,
@@ -236,22 +235,15 @@ class RankOperator:
         gram = csr_array((data, places), shape=(known.size,) * 2)
         gram.sum_duplicates()
         equalities = int(np.searchsorted(known, self.local.equalities))
-        gram = uncoupled(gram, equalities)
-        coupled = np.flatnonzero(np.diff(gram.indptr) > 1)
-        if not coupled.size:
-            return lambda x: np.asarray(x / diagonal)
-        shift = diags_array(SHIFT * gram.diagonal()[coupled])
-        factor = cholesky(csc_matrix(gram[coupled][:, coupled] + shift))
-        place, own = np.intersect1d(
-            known[coupled], at.rows[at.own], return_indices=True
-        )[1:]
+        inverse = gram_inverse(uncoupled(gram, equalities), equalities)
+        place, own = np.intersect1d(known, at.rows[at.own], return_indices=True)[1:]
 
         def solve(x: Dense) -> Dense:
             x = np.asarray(x)
             y = x / diagonal
-            whole = np.zeros(coupled.size)
+            whole = np.zeros(known.size)
             whole[place] = x[own]
-            y[own] = factor(ranks.total(whole))[place]
+            y[own] = inverse(ranks.total(whole))[place]
             return np.asarray(y)
 
         return solve

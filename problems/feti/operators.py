@@ -184,7 +184,7 @@ class DualOperator:
         blocks, weights = self.weighted_blocks(kind, scaling)
         BW = csr_array(self.packed.B @ diags_array(weights))
         gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
-        WB, solve = csr_array(BW.T), _gram_inverse(gram, self.equalities)
+        WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
         def product(x: Dense) -> Dense:
             return solve(BW @ self.packed.multiplied(blocks, WB @ solve(x)))
@@ -317,7 +317,7 @@ def uncoupled(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def _gram_inverse(gram: csr_array, equalities: int) -> Product:
+def gram_inverse(gram: csr_array, equalities: int) -> Product:
     """Make x ↦ (B W Bᵀ)⁺x of what `uncoupled` leaves."""
     m = gram.shape[0]
     inverse = inverted_blocks(csr_array(gram[:equalities, :equalities]))
@@ -337,6 +337,8 @@ def _gram_inverse(gram: csr_array, equalities: int) -> Product:
 
 def inverted_blocks(M: csr_array) -> csr_array:
     """Return M⁺ of a symmetric M with many small blocks, in whatever order of rows."""
+    if not M.nnz:
+        return M
     _, block = connected_components(M, directed=False)
     size = np.bincount(block)
     order = np.argsort(block, kind="stable")
