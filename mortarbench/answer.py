@@ -13,9 +13,9 @@ from sys import stderr
 from typing import TYPE_CHECKING, Any
 
 from harness import Fields, Record, Residuals, Solution, Verdict
+from harness.distributed.mpi import ranks_asked
 from harness.environment.environment import digest
 from harness.errors import InputError
-from harness.mpi import ranks_asked
 from harness.names import assemble
 from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite

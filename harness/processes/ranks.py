@@ -7,8 +7,8 @@ has a CPU to itself while there are enough. What all of them hold together count
 the limit of memory, and all of them end with any of them.
 
 A solver that can run so says `on_ranks = True`: its `prepare` is called on every rank
-with that rank's share of the QP (`harness.distributed.Share`), and every rank comes to
-the same solution, in slices.
+with that rank's share of the QP (`harness.distributed.vectors.Share`), and every rank
+comes to the same solution, in slices.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.distributed import Distributable, Ranks, Share
+from harness.distributed.mpi import MISSING, mpiexec
+from harness.distributed.vectors import Distributable, Ranks, Share
 from harness.files.qpfile import load_qp
-from harness.mpi import MISSING, mpiexec
 from harness.operators import Maker, SerialisableOperator
 from harness.plugin import Solver
 from harness.qp import QP
@@ -166,10 +166,10 @@ class OnRanks:
     def declines(self, qp: QP) -> str | None:
         """Decline what cannot be shared, besides what the solver declines."""
         if not getattr(self._solver, "on_ranks", False):
-            return "runs in one process only; expected --mpi 1, or smalbe"
+            return "runs in one process only; expected one rank"
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
-            return "P cannot be shared by ranks; expected a case with feti, form dual"
+            return "P cannot be shared by ranks; expected a case in subdomains"
         if product.parts < self._ranks.size:
             return (
                 f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "

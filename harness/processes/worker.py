@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from harness.distributed import Ranks
+from harness.distributed.vectors import Ranks
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays
 from harness.operators import NO_MAKERS, Maker

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from harness import checked
+from harness.distributed.mpi import ranks_asked
 from harness.errors import InputError, shown, unknown
 from harness.files.reading import MOST_TOML, read_text, toml
-from harness.mpi import ranks_asked
 from harness.names import CaseId
 from harness.plugin import Family, Solver
 from harness.record import TIGHTENING
@@ -198,7 +198,7 @@ def _on_ranks(
     if counts != [1] and not any(able.values()):
         raise InputError(
             f"ranks = {shown(counts)}: none of the solvers runs on several; expected "
-            "smalbe among them, or no ranks"
+            "one that does, or no ranks"
         )
     return tuple(
         spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])

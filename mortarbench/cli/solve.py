@@ -8,8 +8,8 @@ import sys
 from argparse import Namespace
 from typing import TYPE_CHECKING
 
+from harness.distributed.mpi import ranks_asked
 from harness.errors import InputError, say
-from harness.mpi import ranks_asked
 from harness.names import parse
 from harness.registry import check_name
 from harness.suite.solver_options import options_for

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 
 from harness import QP, InputError, Solution, Vector, no_rows
-from harness.distributed import (
+from harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
     Ranks,
@@ -105,7 +105,7 @@ def _balanced(
 
 
 @dataclass(frozen=True, eq=False)
-class Exchange:
+class Halo:
     """Rows that a rank touches, those it owns among them, and its neighbours' others.
 
     Multipliers of rows of a neighbour come in the order of the rows, and what is added
@@ -139,7 +139,7 @@ class Exchange:
         return found
 
 
-def exchange(parts: Parts, ranks: Ranks) -> Exchange:
+def halo_of(parts: Parts, ranks: Ranks) -> Halo:
     """Find what this rank exchanges with the others."""
     me = ranks.rank
     reach, owner = parts.reach.tocsc(), parts.owner
@@ -157,7 +157,7 @@ def exchange(parts: Parts, ranks: Ranks) -> Exchange:
         np.flatnonzero(owner[rows] == r) if r != me else rows[:0]
         for r in range(ranks.size)
     ]
-    return Exchange(
+    return Halo(
         ranks=ranks, rows=rows, own=np.searchsorted(rows, mine),
         lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
         lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
@@ -169,12 +169,12 @@ class RankOperator:
     """F over ranks: takes and gives this rank's slice of vectors of multipliers."""
 
     local: DualOperator  #: rows that this rank touches, its own subdomains
-    exchange: Exchange
+    halo: Halo
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows that this rank owns, twice."""
-        return (self.exchange.own.size,) * 2
+        return (self.halo.own.size,) * 2
 
     def __call__(self, x: Dense) -> DistributedVector:
         """Multiply with F."""
@@ -185,20 +185,18 @@ class RankOperator:
 
     def diagonal(self) -> DistributedVector:
         """Give the diagonal of F."""
-        return distributed(
-            self.exchange.added(self.local.diagonal()), self.exchange.ranks
-        )
+        return distributed(self.halo.added(self.local.diagonal()), self.halo.ranks)
 
     def _over(self, x: Dense, local: Product) -> DistributedVector:
-        ranks = self.exchange.ranks
-        touched_x = self.exchange.gathered(np.asarray(x))
+        ranks = self.halo.ranks
+        touched_x = self.halo.gathered(np.asarray(x))
         with ranks.clocked("product"):
             y = local(touched_x)
-        return distributed(self.exchange.added(y), ranks)
+        return distributed(self.halo.added(y), ranks)
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
-        of, ranks = self.local.packed, self.exchange.ranks
+        of, ranks = self.local.packed, self.halo.ranks
         blocks, weights = self.local.weighted_blocks(kind, scaling)
         BW = csr_array(of.B @ diags_array(weights))
         WB = csr_array(BW.T)
@@ -218,7 +216,7 @@ class RankOperator:
         Contact rows, and those that are coupled with others (none if gluing is
         orthonormal), are solved for by all ranks alike.
         """
-        at, ranks = self.exchange, self.exchange.ranks
+        at, ranks = self.halo, self.halo.ranks
         diagonal = at.added(part.diagonal())
         entries = part.tocoo()
         told = at.rows[entries.row], at.rows[entries.col], entries.data
@@ -260,7 +258,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     """
     B, domains = operator.B, operator.domains
     parts = partition(B, domains, ranks.size)
-    at = exchange(parts, ranks)
+    at = halo_of(parts, ranks)
     mine = np.flatnonzero(parts.rank == ranks.rank)
     kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
     columns = np.concatenate(

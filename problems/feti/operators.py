@@ -42,7 +42,7 @@ from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
 from harness import QP, Vector
-from harness.distributed import Ranks, Share
+from harness.distributed.vectors import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
 from problems.feti.torn import Dense, Kind, Subdomains

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
-from harness.distributed import DistributedVector
+from harness.distributed.vectors import DistributedVector
 from solvers.smalbe import compiled
 from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
 from solvers.smalbe.mprgp import Face, Point, Rules, Watch, split

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Matrix, Vector
-from harness.distributed import DistributedVector
+from harness.distributed.vectors import DistributedVector
 from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product

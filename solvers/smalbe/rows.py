@@ -29,7 +29,7 @@ from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
 from harness import Matrix, Vector, too_large
-from harness.distributed import DistributedColumns
+from harness.distributed.vectors import DistributedColumns
 from solvers.smalbe import compiled
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 import mortarbench as mb
-from harness.distributed import DistributedVector, Ranks, distributed
+from harness.distributed.vectors import DistributedVector, Ranks, distributed
 from solvers.smalbe.solver import SMALBE
 
 TOL = 1e-8
@@ -69,7 +69,7 @@ def operator(name, ranks):
     whole = qp.P.build()
     share = whole.share(qp, ranks)
     P, x = share.qp.P, np.random.default_rng(1).standard_normal(qp.q.size)
-    own = P.exchange.rows[P.exchange.own]
+    own = P.halo.rows[P.halo.own]
     errors = {
         "product": (P @ x[own], whole(x)[own]),
         "diagonal": (P.diagonal(), whole.diagonal()[own]),

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness import mpi
+from harness.distributed import mpi
 from harness.errors import InputError
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries

@@ -1,0 +1,1 @@
+"""One solve on several processes: vectors spread over them, and what starts them."""
