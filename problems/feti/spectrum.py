@@ -153,7 +153,11 @@ def spectra_of_equations(
 
 
 def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:
-    """Bound the extreme Ritz values, the next vector being of this length."""
+    """Bound the extreme Ritz values.
+
+    alpha, beta, length : diagonal (k,) and off-diagonal (k − 1,) of the tridiagonal
+        matrix, and the length of the next vector
+    """
     last = alpha.size - 1
     (smallest, s), (largest, t) = (
         eigh_tridiagonal(alpha, beta, select="i", select_range=(i, i))
