@@ -160,7 +160,9 @@ def test_the_line_search_decreases_the_penalty_function():
     path = ring_path(steps=1, size=4)
     steps = path.iterations(1)
     weight = 2 * max(i.answer.z.max() for i in steps)
-    merit = [newton._merit(path._configuration(i.u, 1.0, i.gaps), weight) for i in steps]
+    merit = [
+        newton._merit(path._configuration(i.u, 1.0, i.gaps), weight) for i in steps
+    ]
     short = [j for j, i in enumerate(steps[:-1]) if i.length < 1]
 
     assert short
