@@ -40,7 +40,11 @@ from problems.fem.mesh import (
     prefixed,
     rectangle,
 )
+from problems.feti.elastic import subdivide, torn
+from problems.feti.partition import graph_partition
+from problems.feti.torn import Torn
 from problems.ranges import (
+    GLUES,
     LAWS,
     NEEDED,
     at_least,
@@ -81,6 +85,8 @@ def one_step(
     basis: Literal["dual", "standard"] = "dual",
     friction: FrictionLaw | None = None,
     reference: Reference | None = None,
+    parts: int = 0,
+    glue: Literal["orthonormal", "chain", "redundant"] = "orthonormal",
 ) -> Case:
     """Emit the QP of bodies under their full load, contact linearised where they lie.
 
@@ -92,17 +98,24 @@ def one_step(
     friction : between the sides of every pair: FrictionLaw("tresca", bound=1e6), in Pa,
         or FrictionLaw("coulomb", mu=0.3), the last of its fixed point
     reference : what `Family.build` is given; Coulomb's law needs its solutions
+    parts : subdomains of all bodies together, for "dual" alone: Total FETI; 0: none
+    glue : the rows that hold copies of a node together
 
     Raises
     ------
     InputError
         When the form is none of these, no slave node faces its master, nothing balances
-        the load of some body, the law of friction is unknown or its value negative, or
-        the fixed point does not settle.
+        the load of some body, the law of friction is unknown or its value negative, the
+        fixed point does not settle, or the bodies have no such parts or no such glue.
 
     """
     if form not in FORMS:
         raise InputError(f"form {form!r}; expected one of {', '.join(FORMS)}")
+    one_of("one_step", {"glue": glue}, GLUES)
+    if parts and form != "dual":
+        raise InputError(
+            f"parts with form {form} is not built; expected form dual, or parts=0"
+        )
     law = FrictionLaw() if friction is None else _checked(friction, reference)
     laws = (law,) * len(bodies.pairs)
     linearise = linearisation(bodies, contact, basis, laws)
@@ -118,8 +131,13 @@ def one_step(
     def results(s: Solution) -> Mapping[str, Any]:
         return quantities(bodies, primal, s, tangential)
 
+    def torn_bodies() -> Torn:
+        mesh = bodies.mesh
+        label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
+        return torn(subdivide(bodies, label), primal, tangential, glue)
+
     return contact_case(
-        bodies, primal, form,
+        bodies, primal, form, torn=torn_bodies if parts else None,
         floating=factorised, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=tangential,
     )  # fmt: skip

@@ -307,6 +307,7 @@ def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q,
 
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
 cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
+cdef double NO_SHIFT = 1e-13  # x̃ of this size relative to ν is rounding of e = 0
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
@@ -895,8 +896,8 @@ cdef class Solver:
         """Whether the equality rows are met, as `Rows.met` says."""
         cdef double error = self.infeasibility(&self.x[0]), square = 0.0, part
         cdef Py_ssize_t i
-        if self.e_size == 0:
-            part = sqrt(dot(&self.x[0], &self.x[0], self.n))
+        part = sqrt(dot(&self.x[0], &self.x[0], self.n))
+        if self.e_size == 0 or self.x_tilde_size <= NO_SHIFT * part:
             return error <= tol * fmax(part, b_size)
         for i in range(self.m):
             part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0

@@ -37,6 +37,7 @@ from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
+NO_SHIFT = 1e-13  #: x̃ of this size relative to ν is rounding of e = 0
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 MOST_BORDER = 2000  #: rows that bounded components touch, whose block is dense
 MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
@@ -72,13 +73,12 @@ class Rows(ABC):
     def met(self, nu: Vector, tol: float, least: float) -> bool:
         """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
 
-        For e = 0, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
+        For e = 0, or x̃ no more than rounding of ν, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
         """
-        Cnu = self.C @ nu
-        if self.e_size == 0:
-            size = max(float(np.linalg.norm(nu)), least)
-            return bool(np.linalg.norm(Cnu) <= tol * size)
+        Cnu, nu_size = self.C @ nu, float(np.linalg.norm(nu))
         size = float(np.linalg.norm(self.x_tilde))
+        if self.e_size == 0 or size <= NO_SHIFT * nu_size:
+            return bool(np.linalg.norm(Cnu) <= tol * max(nu_size, least))
         return bool(
             np.linalg.norm(Cnu) <= tol * size
             and np.linalg.norm(self.error(nu, Cnu)) <= tol * self.e_size

@@ -10,6 +10,7 @@ from problems import PROBLEMS
 from problems.elastic import FrictionLaw, one_step
 from problems.models.patch import model
 from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
 
 PATCH = PROBLEMS["contact-patch"]
 STRETCHED = dict(lower=3, upper=2, ratio=3.0)
@@ -68,3 +69,28 @@ def test_friction_may_hold_a_load_along_the_side():
     case = one_step(pushed, "dual", friction=law)
     found = case.quantities(reference_solution(case.qp))
     assert found["contact_force"][0] == pytest.approx(0.01e6, rel=1e-6)
+
+
+@pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
+def test_bodies_in_parts_are_those_in_one_piece(glue):
+    bodies = model(PATCH.complete(STRETCHED | {"lower": 5, "upper": 4}))
+    law = FrictionLaw("tresca", bound=1e5)
+    whole = one_step(bodies, "dual", friction=law)
+    parts = one_step(bodies, "dual", friction=law, parts=5, glue=glue)
+    assert parts.qp.A.shape[0] == 3 * 5
+
+    exact = whole.quantities(reference_solution(whole.qp))
+    found = parts.quantities(SMALBE().prepare(parts.qp, 1e-9)())
+    for name in ("energy", "multiplier_sum", "dissipation"):
+        assert found[name] == pytest.approx(exact[name], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("form", "keys", "told"),
+    [("primal", {"parts": 5}, "parts with form primal is not built"),
+     ("dual", {"parts": 1}, "parts=1 of 2 bodies"),
+     ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
+)  # fmt: skip
+def test_parts_that_there_cannot_be_are_refused(form, keys, told):
+    with pytest.raises(InputError, match=told):
+        one_step(model(PATCH.complete({})), form, **keys)

@@ -124,7 +124,7 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
         assert (solver is None) == written
         start = first_iterate(
             problem, problem.rows.x_tilde * 0, np.zeros(len(problem.rows.C)),
-            M=options.M, rho=options.rho,
+            M=options.M, rho=options.rho or 1e4,
         )  # fmt: skip
         end = solve(1e-6, start)
         runs.append((end, problem.F.count))

@@ -134,3 +134,16 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
     assert dense.status is sparse.status is Status.SOLVED
     assert kkt_residuals(qp, sparse).worst <= 1e-7
     assert sparse.x == pytest.approx(dense.x, abs=1e-6)
+
+
+def test_a_right_hand_side_of_rounding_is_none(G):
+    """Of rows that should say Gx = 0, nothing is met relative to 1e-18."""
+    e = 1e-18 * (-1.0) ** np.arange(9)
+    size, nu = np.linalg.norm(G.toarray()), np.full(40, 1e-9)
+    nu[0] = 1e3
+
+    for rows in (sparse_rows(G, e, ALL), orthonormal_rows(G, e)):
+        inside = rows.project(nu) + 1e-9 * nu
+        assert np.linalg.norm(G @ inside) < size
+        assert rows.met(inside, 1e-8, 0.0)
+        assert not rows.met(nu, 1e-8, 0.0)
