@@ -52,6 +52,7 @@ from scipy.linalg import null_space
 from scipy.sparse import csc_array
 
 from harness import QP, InputError, Reference, Solution, Status, Vector, kkt_residuals
+from harness.errors import PastEndError
 from problems.contact.bodies import Bodies, clamped
 from problems.contact.node_to_segment import ContactRows
 from problems.contact.sides import ACTIVE
@@ -153,7 +154,7 @@ class NewtonPath:
         """Pose step k (1 … steps): its iteration 1, 2, …, or the last one for 0."""
         found = self.iterations(k)
         if newton > len(found):
-            raise InputError(
+            raise PastEndError(
                 f"newton={newton}: step {k} has {len(found)} Newton iterations; "
                 "expected at most that, or 0 for the last"
             )

@@ -41,7 +41,8 @@ from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_arr
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import Vector
+from harness import QP, Vector
+from harness.distributed import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
 from problems.feti.torn import Dense, Kind, Subdomains
@@ -183,7 +184,7 @@ class DualOperator:
         blocks, weights = self.weighted_blocks(kind, scaling)
         BW = csr_array(self.packed.B @ diags_array(weights))
         gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
-        WB, solve = csr_array(BW.T), _gram_inverse(gram, self.equalities)
+        WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
         def product(x: Dense) -> Dense:
             return solve(BW @ self.packed.multiplied(blocks, WB @ solve(x)))
@@ -217,6 +218,17 @@ class DualOperator:
         if scaling == "multiplicity":
             weights = np.ones_like(weights)
         return blocks, weights
+
+    @property
+    def parts(self) -> int:
+        """How many subdomains there are."""
+        return int(self.domains.kind.size)
+
+    def share(self, qp: QP, ranks: Ranks) -> Share:
+        """Take this rank's share of a dual with this F."""
+        from problems.feti.distributed import shared  # late: one process needs none
+
+        return shared(qp, self, ranks)
 
     @cached_property
     def packed(self) -> Packed:
@@ -305,7 +317,7 @@ def uncoupled(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def _gram_inverse(gram: csr_array, equalities: int) -> Product:
+def gram_inverse(gram: csr_array, equalities: int) -> Product:
     """Make x ↦ (B W Bᵀ)⁺x of what `uncoupled` leaves."""
     m = gram.shape[0]
     inverse = inverted_blocks(csr_array(gram[:equalities, :equalities]))
@@ -325,6 +337,8 @@ def _gram_inverse(gram: csr_array, equalities: int) -> Product:
 
 def inverted_blocks(M: csr_array) -> csr_array:
     """Return M⁺ of a symmetric M with many small blocks, in whatever order of rows."""
+    if not M.nnz:
+        return M
     _, block = connected_components(M, directed=False)
     size = np.bincount(block)
     order = np.argsort(block, kind="stable")

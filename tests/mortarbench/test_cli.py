@@ -812,8 +812,9 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     )
 
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        "accuracy", "crossval", "demo", "fixed-point", "fleet", "friction", "large",
-        "paper", "paper-accuracy", "paper-fleet", "path", "scaling", "smoke",
+        "accuracy", "crossval", "demo", "finite-strain", "fixed-point", "fleet",
+        "friction", "large", "paper", "paper-accuracy", "paper-fleet", "path",
+        "scaling", "smoke",
     ]  # fmt: skip
 
 

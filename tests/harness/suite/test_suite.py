@@ -479,6 +479,15 @@ def test_the_suite_of_the_load_path_is_one_sequence_per_form():
     assert [{c.form for c in s} for s in path.sequences] == [{"dual"}, {"dual-bounds"}]
 
 
+def test_a_sequence_may_run_along_zipped_keys():
+    paths = shipped("finite-strain")
+
+    assert len(paths.cases) == 80
+    assert [
+        [(c.params["step"], c.params["newton"]) for c in s] for s in paths.sequences
+    ] == [[(step, newton) for step in range(1, 11) for newton in range(1, 5)]] * 2
+
+
 @pytest.mark.parametrize("name", BEYOND)
 def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
     """Six repeats are the fewest whose median has a 95 % interval."""

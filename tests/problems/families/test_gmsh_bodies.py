@@ -196,8 +196,12 @@ def read_mesh_of_quads(tmp_path, *contents):
 
 
 @pytest.mark.parametrize(
-    "keys", ["", "/step=1", "/contact=mortar", "/relin=2/plane=stress"]
-)
+    "keys",
+    [
+        "", "/step=1", "/contact=mortar", "/relin=2/plane=stress", "/kinematics=finite",
+        "/kinematics=finite/material=svk/contact_stiffness=geometric/newton=2/step=1",
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("form", ["primal", "dual-bounds"])
 def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
     if "mortar" in keys and "basis" not in PROBLEMS["beam-ring"].defaults:
@@ -233,6 +237,32 @@ def test_settings_come_from_the_file_unless_the_name_has_them(described):
     assert str(other) == "bodies:a.toml/plane=stress/steps=4/dual"
     again = parse(str(other), PROBLEMS)
     assert again == other
+
+
+def test_the_file_may_ask_for_finite_strain(described):
+    name = described(toml='kinematics = "finite"\nmaterial = "svk"\n' + TOML)
+    params = parse(f"{name}/dual", PROBLEMS).params
+
+    assert (params["kinematics"], params["material"]) == ("finite", "svk")
+    described(toml='kinematics = "large"\n' + TOML)
+    with pytest.raises(InputError, match=r"a\.toml: .*value of kinematics"):
+        parse("bodies:a.toml/dual", PROBLEMS)
+
+
+def test_friction_of_a_pair_at_finite_strain_is_refused(described):
+    name = described(toml=TOML + 'friction = "coulomb"\nmu = 0.3\n')
+
+    with pytest.raises(InputError, match=r"a\.toml: friction of a contact with kine"):
+        build(f"{name}/kinematics=finite/dual")
+
+
+def test_a_body_that_may_turn_is_refused_at_finite_strain(described):
+    name = described(
+        toml=FLOATING.replace('"corner"\nforce = [0, -1e8]', f'"corner"\n{TOP}')
+    )
+
+    with pytest.raises(InputError, match="the supports leave body 'beam' to rotate"):
+        build(f"{name}/kinematics=finite/dual")
 
 
 @pytest.mark.parametrize("which", ["two.msh", "a.toml"])
