@@ -63,7 +63,7 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
 def _points(outcomes: Sequence[Outcome], style: Look) -> Series:
     """Median time, and worst residual over tolerance, of a solver's answers."""
     points = [
-        (t.value, max((o.worst or 0.0) / o.tol, _LEAST), run_ids(o.records))
+        (t.value, max((o.worst or 0.0) / o.first.asked_tol, _LEAST), run_ids(o.records))
         for o in outcomes
         if (t := o.seconds("total")) is not None
     ]

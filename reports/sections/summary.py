@@ -237,11 +237,18 @@ def sentences(evidence: Evidence, solver: str) -> list[str]:
             worst = max((o.worst or 0.0 for o in tried), default=0.0)
             missed = [
                 f"verified on {_all(len(tried))} at tol "
-                f"{tolerance(tol)}; worst residual {power(worst)}{_certified(tried)}"
+                f"{tolerance(tol)}{_early(tried)}; worst residual {power(worst)}"
+                f"{_certified(tried)}"
             ]
         missed += _unclaimed(tried) + _declined(at_tol)
         said.append(f"{name}: {'; '.join(missed)}.")
     return said
+
+
+def _early(tried: Sequence[Outcome]) -> str:
+    """Say that early steps of a sequence had looser tolerances, where they had."""
+    loosest = max((o.first.step_tol or 0.0 for o in tried), default=0.0)
+    return f", early steps at up to {tolerance(loosest)}" if loosest else ""
 
 
 def _certified(tried: Sequence[Outcome]) -> str:
