@@ -4,8 +4,8 @@
 
 The beam on its half ring in one load step, Nh = Nr/2. `feti` tears it into subdomains,
 `whole` is the dual of the whole; both go from the mesh to an answer with a certified
-error below 1e-6, for which the dual of the whole needs smaller residuals. Each runs in
-a process of its own, so that peaks are its own.
+error below 1e-6, for which their tolerances differ. Each runs in a process of its own,
+so that peaks are its own; `cpu` is what a busy machine can compare.
 
 Of `feti`, what theory speaks of is measured apart from the search for the active set:
 
@@ -22,7 +22,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 
 import numpy as np
 from scipy.stats import linregress, t
@@ -36,13 +36,13 @@ from problems.duality.torn_dual import torn_dual
 from problems.feti.elastic import subdivide, torn
 from problems.feti.operators import dual_operator
 from problems.feti.spectrum import spectra_of_equations
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import structured_bodies
 from problems.models.beam_ring import model
 from solvers.baselines.feti import FETI
 from solvers.smalbe.solver import SMALBE
 
-TOL = {"feti": 1e-6, "whole": 1e-8}  #: with which errors are certified to 1e-6
+TOL = {"feti": 1e-7, "whole": 1e-8}  #: with which errors are certified to 1e-6
 REDUCTION = 1e-6
 STAGES = ("mesh", "dual", "prepare", "solve", "recover", "certify")
 
@@ -50,7 +50,7 @@ STAGES = ("mesh", "dual", "prepare", "solve", "recover", "certify")
 def one(way, Nr, cells):
     """Measure one size in this process; compiled loops are loaded before."""
     model(1, 1, 2, "strain")
-    marks = [perf_counter()]
+    begun, marks = process_time(), [perf_counter()]
 
     def lap():
         marks.append(perf_counter())
@@ -63,7 +63,7 @@ def one(way, Nr, cells):
     if way == "feti":
         pieces = torn(subdivide(bodies, labels(Nr, cells)), primal)
         dual = torn_dual(pieces, primal)
-        tear = lambda: local_problems(pieces)  # noqa: E731
+        tear = lambda: LocalProblems(pieces)  # noqa: E731
     else:
         dual = dualise(primal, floating(bodies))
     lap()
@@ -79,12 +79,14 @@ def one(way, Nr, cells):
     )  # fmt: skip
     bound = certify(mechanics, back).bound
     lap()
+    cpu = process_time() - begun
     status = Path("/proc/self/status").read_text().splitlines()
     peak_kib = next(line.split()[1] for line in status if line.startswith("VmHWM"))
     found = {
         "way": way, "n": bodies.mesh.dofs, "m": dual.qp.q.size, "status": s.status,
         "bound": bound, **dict(zip(STAGES, np.diff(marks).tolist(), strict=True)),
-        "total": marks[-1] - marks[0], "peak_mib": int(peak_kib) / 1024, **s.counts,
+        "total": marks[-1] - marks[0], "cpu": cpu, "peak_mib": int(peak_kib) / 1024,
+        **s.counts,
     }  # fmt: skip
     return found | (known_face(pieces, dual.qp, s) if pieces is not None else {})
 

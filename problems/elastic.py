@@ -132,7 +132,8 @@ def one_step(
         return quantities(bodies, primal, s, tangential)
 
     def torn_bodies() -> Torn:
-        label = graph_partition(bodies.mesh.cells, bodies.body, parts)
+        mesh = bodies.mesh
+        label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
         return torn(subdivide(bodies, label), primal, tangential, glue)
 
     return contact_case(

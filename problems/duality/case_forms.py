@@ -17,7 +17,7 @@ from problems.contact.results import fields
 from problems.duality.dualisation import dual_bounds, dualise, posed
 from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.inverse import GeneralisedInverse
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems
 from problems.feti.torn import Torn
 
 FORMS = ("primal", "dual", "dual-bounds")
@@ -67,7 +67,7 @@ def contact_case(
             )
         start = perf_counter()
         pieces = torn()
-        new, tear = torn_dual(pieces, primal, friction), partial(local_problems, pieces)
+        new, tear = torn_dual(pieces, primal, friction), partial(LocalProblems, pieces)
         seconds = perf_counter() - start
         matrices = torn_matrices(pieces, new.qp)
         decomposition = torn_quantities(pieces, new.qp)

@@ -124,7 +124,7 @@ def spectrum(
         length = float(np.sqrt(max(float(v @ Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)
         if over or k % CHECKED == CHECKED - 1 or k == n - 1:
-            found = _extreme(np.array(alpha), np.array(beta), length)
+            found = ritz_bounds(np.array(alpha), np.array(beta), length)
             if over or found.within(tol):
                 break
         beta.append(length)
@@ -152,8 +152,12 @@ def spectra_of_equations(
     return [spectrum(F, P, m, M, tol) for M in inverses]
 
 
-def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:
-    """Bound the extreme Ritz values, the next vector being of this length."""
+def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:
+    """Bound the extreme Ritz values.
+
+    alpha, beta, length : diagonal (k,) and off-diagonal (k − 1,) of the tridiagonal
+        matrix, and the length of the next vector
+    """
     last = alpha.size - 1
     (smallest, s), (largest, t) = (
         eigh_tridiagonal(alpha, beta, select="i", select_range=(i, i))

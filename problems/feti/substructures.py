@@ -19,10 +19,13 @@ Columns = NDArray[Any]  #: (n_k, …) of the subdomains of one kind
 
 @dataclass(frozen=True, eq=False)
 class LocalProblems:
-    """The local problems of torn bodies; see `harness.mechanics.Substructures`."""
+    """The local problems of torn bodies; see `harness.mechanics.Substructures`.
+
+    Factors are made when they are needed.
+    """
 
     torn: Torn
-    components: int  #: of a node
+    components: int = 2  #: of a node; torn unknowns are numbered node by node
 
     @property
     def spread(self) -> csr_array:
@@ -71,11 +74,3 @@ class LocalProblems:
     def _kinds(self) -> zip[tuple[Kind, NDArray[np.int64]]]:
         """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
         return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
-
-
-def local_problems(torn: Torn, components: int = 2) -> LocalProblems:
-    """Take the local problems of torn bodies; factors are made when needed.
-
-    components : of a node; torn unknowns are numbered node by node
-    """
-    return LocalProblems(torn, components)

@@ -33,7 +33,7 @@ from problems.fem.laplacian import grid_stiffness
 from problems.fem.mesh import Mesh, Nodes, join, prefixed, rectangle
 from problems.feti.gluing import glue
 from problems.feti.membrane import membrane_kind
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
@@ -53,7 +53,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     else:
         start = perf_counter()
         torn = pair.torn(p["glue"])
-        new, tear = torn_dual(torn, pair.qp), partial(local_problems, torn, 1)
+        new, tear = torn_dual(torn, pair.qp), partial(LocalProblems, torn, 1)
         seconds = perf_counter() - start
         matrices = torn_matrices(torn, new.qp)
         decomposition = torn_quantities(torn, new.qp)

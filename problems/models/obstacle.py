@@ -56,7 +56,7 @@ from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_
 from problems.fem.laplacian import grid_stiffness
 from problems.feti.gluing import glue
 from problems.feti.membrane import membrane_kind
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
@@ -81,7 +81,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         new = with_bounds(rows)
     elif p["feti"]:
         pieces = problem.torn(p["feti"], p["glue"])
-        new, tear = torn_dual(pieces, rows), partial(local_problems, pieces, 1)
+        new, tear = torn_dual(pieces, rows), partial(LocalProblems, pieces, 1)
         decomposition = torn_quantities(pieces, new.qp)
     elif form == "dual":
         new = dualise(rows, problem.floating())

@@ -34,7 +34,7 @@ from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangl
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
 from problems.feti.spectrum import Spectrum, spectra_of_equations
-from problems.feti.substructures import local_problems
+from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
 
@@ -61,7 +61,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         return counts | (dual_quantities(plate) if form == "dual" else {})
 
     def torn() -> Substructures:
-        return local_problems(plate.torn)
+        return LocalProblems(plate.torn)
 
     return Case(
         qp=new.qp,

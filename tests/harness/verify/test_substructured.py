@@ -25,7 +25,7 @@ from harness.verify.substructured import neighbour
 from problems import PROBLEMS
 from problems.contact.bodies import Bodies
 from problems.feti.elastic import subdivide, torn
-from problems.feti.substructures import LocalProblems, local_problems
+from problems.feti.substructures import LocalProblems
 from problems.models import beam_ring, hertz, patch
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -106,7 +106,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
 
     mechanics = replace(
         whole, factorise=never,
-        tear=lambda: local_problems(torn(domains, whole.primal, whole.friction)),
+        tear=lambda: LocalProblems(torn(domains, whole.primal, whole.friction)),
     )  # fmt: skip
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution))
@@ -237,7 +237,7 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     assert near.left < 1e-9 * np.sqrt(near.d @ b)
 
 
-def test_local_problems_are_those_of_the_torn_bodies() -> None:
+def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
     parts = known(CASES[0]).mechanics.substructures
     assert isinstance(parts, LocalProblems)
     K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, eye_array
 
 from harness import Vector
-from problems.feti.spectrum import projector, spectrum
+from problems.feti.spectrum import projector, ritz_bounds, spectrum
 from tests.support.torn_bodies import torn_pair
 
 
@@ -49,6 +49,15 @@ def test_the_error_bounds_hold_and_are_as_small_as_asked(crowded: str) -> None:
     slow = "smallest_error" if crowded == "below" else "largest_error"
     assert getattr(found, slow) > 1e-8  # the other end is found long before
     assert abs(found.condition - 10.0) <= 1.001 * found.condition_error
+
+
+def test_errors_of_ritz_values_come_from_the_last_entries_of_their_vectors() -> None:
+    """Of [[2, 2], [2, 5]]: 1 with (2, −1)/√5 and 6 with (1, 2)/√5."""
+    found = ritz_bounds(np.array([2.0, 5.0]), np.array([2.0]), 0.5)
+    assert [found.smallest, found.largest] == pytest.approx([1.0, 6.0])
+    errors = [found.smallest_error, found.largest_error]
+    assert errors == pytest.approx([0.5 / 5**0.5, 1 / 5**0.5])
+    assert found.condition_error == pytest.approx(6 * (errors[0] + errors[1] / 6))
 
 
 @pytest.mark.parametrize("rows", ["orthonormal", "chain", "redundant"])
