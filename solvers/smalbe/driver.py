@@ -86,7 +86,7 @@ def prepared(
     history = History() if options.history else None
     eliminated = None
     if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
-        eliminated = eliminate_free(qp, carry and carry.block)
+        eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
     inner = qp if eliminated is None else eliminated.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
@@ -105,6 +105,18 @@ def prepared(
         start=_start(problem, options, carry, tol, solver),
     )  # fmt: skip
     return lambda: _certified(task, tol)
+
+
+def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | None:
+    """Eliminate the free variables of a sequence while one factor serves all.
+
+    Where the block of the problem before is not that of this one, as in Newton's
+    method, a factor for each problem would cost more than it saves.
+    """
+    if always or carry is None:
+        return eliminate_free(qp, carry and carry.block)
+    found = None if carry.block is None else eliminate_free(qp, carry.block)
+    return None if found is None or found.columns else found
 
 
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:

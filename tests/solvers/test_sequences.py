@@ -155,3 +155,18 @@ def test_a_failure_leaves_nothing_to_the_next(load_steps):
     counts = [prepare(q)().counts for q in (qp, broken, qp)]
 
     assert counts[2] == counts[0]
+
+
+def test_a_block_that_changes_is_not_factorised_again(load_steps):
+    """As in Newton's method, where every problem has another matrix."""
+    scaled = [
+        replace(qp, P=(1 + 0.01 * k) * qp.P)
+        for k, qp in enumerate(load_steps["dual"][:4])
+    ]
+    prepare = SMALBE().chain(1e-8)
+    warm = [prepare(qp)() for qp in scaled]
+
+    assert [s.counts.get("factorised_columns", 0) for s in warm] == [38, 0, 0, 0]
+    for qp, s in zip(scaled, warm, strict=True):
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 1e-7

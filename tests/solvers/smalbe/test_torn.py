@@ -1,0 +1,74 @@
+"""SMALBE on duals of torn bodies: counts that do not grow, answers of the whole."""
+
+import numpy as np
+import pytest
+
+from harness import Status, kkt_residuals
+from problems import PROBLEMS
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.rows import SparseRows, equality_rows
+from solvers.smalbe.solver import SMALBE
+
+
+def case(**keys):
+    family = PROBLEMS["beam-ring"]
+    return family.build("dual", family.complete(keys), reference_solution)
+
+
+def torn(Nr, **keys):
+    return case(Nr=Nr, Nh=Nr // 2, steps=1, feti=8, **keys)
+
+
+@pytest.fixture(scope="module", params=[1e-6, 1e-8])
+def answers(request):
+    """Of three meshes at H/h = 8, from 500 to 30 000 degrees of freedom."""
+    qps = [torn(Nr).qp for Nr in (8, 16, 32)]
+    return request.param, [(qp, SMALBE().prepare(qp, request.param)()) for qp in qps]
+
+
+def test_products_do_not_grow_with_the_mesh(answers):
+    tol, solved = answers
+    products = [s.counts["P_products"] for _, s in solved]
+
+    assert max(products) <= (42 if tol == 1e-6 else 50)
+    assert products[2] <= products[1] + 5
+    assert all(s.counts["outer"] <= 3 for _, s in solved)
+
+
+def test_they_are_solved_and_the_preconditioner_is_counted(answers):
+    tol, solved = answers
+
+    for qp, s in solved:
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 10 * tol
+        assert s.counts["preconditioner_applies"] <= s.counts["P_products"]
+
+
+def test_their_rows_are_sparse_and_their_spectrum_flat(answers):
+    _, solved = answers
+    qp, s = solved[-1]
+
+    assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
+    assert s.counts["P_products"] <= s.iterations + s.counts["expansion"] + 12
+
+
+@pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
+def test_the_displacement_is_that_of_the_whole(glue):
+    pieces, whole = torn(8, glue=glue), case(Nr=8, Nh=4, steps=1)
+    u = pieces.recover(SMALBE().prepare(pieces.qp, 1e-9)())
+    v = whole.recover(SMALBE().prepare(whole.qp, 1e-9)())
+
+    assert abs(u - v).max() <= 1e-8 * abs(v).max()
+
+
+def test_a_sequence_is_warm():
+    qps = [case(Nr=8, Nh=4, steps=3, step=k, feti=8).qp for k in (1, 2, 3)]
+    prepare = SMALBE().chain(1e-6)
+    warm = [prepare(qp)() for qp in qps]
+    cold = [SMALBE().prepare(qp, 1e-6)() for qp in qps]
+
+    for qp, s in zip(qps, warm, strict=True):
+        assert kkt_residuals(qp, s).worst <= 1e-5
+    assert sum(s.counts["P_products"] for s in warm) < sum(
+        s.counts["P_products"] for s in cold
+    )
