@@ -279,6 +279,8 @@ def test_clipping_leaves_convex_matrices_and_raises_negative_eigenvalues():
     assert np.allclose(found, np.sort(np.maximum(spectra, 0)), atol=1e-5)
     assert found.min() > -1e-14
     assert (clipped == np.swapaxes(clipped, 1, 2)).all()
+    in_other_units, _ = clip(1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    assert np.abs(in_other_units / 1e6 - clipped).max() < 1e-13
 
 
 def test_only_a_tangent_that_is_not_convex_is_changed():
