@@ -114,13 +114,13 @@ def _solved(mechanics: Mechanics, guess: States) -> ReferencePoint:
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> States:
-    """Guess the states of the rows; of very many, from the bodies alone."""
+    """Guess the states of the rows; of none or very many, from the bodies alone."""
     inverse = mechanics.inverse
     R, exact = mechanics.motions.felt.toarray().astype(np.float64), mechanics.exact
     f, B = -mechanics.primal.q, mechanics.rows
     lb, ub = (v.astype(np.float64) for v in (exact.lower, exact.upper))
     m = exact.c.size
-    if m > DENSE and not R.shape[1]:
+    if not m or (m > DENSE and not R.shape[1]):
         return unconstrained_guess(mechanics)
     qp = QP(
         P=inverse.congruence(B), q=exact.c.astype(np.float64) - B @ inverse(f),

@@ -134,9 +134,13 @@ def _tamed(qp: QP, near: NDArray[np.bool_]) -> QP:
 
 
 def _is_nonnegative(qp: QP) -> bool:
-    """Whether P is dense, and there are lower bounds only, on all variables."""
+    """Whether P is dense, and there are lower bounds only, on all variables.
+
+    Without variables it is not: scipy's nnls (1.17.1) would crash Python.
+    """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
-    return bool(isinstance(qp.P, np.ndarray) and only and np.isfinite(qp.lb).all())
+    only &= np.isfinite(qp.lb).all() and qp.q.size > 0
+    return bool(isinstance(qp.P, np.ndarray) and only)
 
 
 def _nonnegative(qp: QP) -> Solution:

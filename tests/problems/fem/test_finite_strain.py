@@ -306,6 +306,18 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     assert changed == {0.9: 40, 1.1: 0}
 
 
+def test_convex_cells_stay_what_they_are_triangles_too():
+    """Without strain no cell is changed, asked for or not."""
+    c = cells("neo-hooke", 0.3)
+    tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
+    asked = iter([False, True])
+
+    K, changed = convexified(c, tangents, lambda K: next(asked))
+
+    assert changed == 0
+    assert abs(K - assemble(c, tangents)).max() < 1e-14
+
+
 def test_a_body_that_nothing_holds_is_refused():
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     c = cells_of(mesh, [hyperelastic("svk", SOFT)], np.zeros(4, dtype=np.int64))

@@ -431,3 +431,14 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
         "solvers.reference.interior", "solvers.reference.polish",
         "solvers.reference.saddle", "solvers.reference.solve",
     ]  # fmt: skip
+
+
+def test_a_qp_without_variables_has_the_empty_solution():
+    """As is asked for where no side can touch another; scipy's nnls would crash."""
+    nothing = np.zeros(0)
+    qp = QP(
+        P=np.zeros((0, 0)), q=nothing, A=no_rows(0), b=nothing, G=no_rows(0),
+        h=nothing, lb=nothing, ub=nothing,
+    )  # fmt: skip
+
+    assert reference_solution(qp).x.size == 0
