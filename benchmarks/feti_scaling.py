@@ -35,9 +35,9 @@ from problems.duality.stepping import primal_qp
 from problems.duality.torn_dual import torn_dual
 from problems.feti.elastic import subdivide, torn
 from problems.feti.operators import dual_operator
-from problems.feti.spectrum import spectrum
+from problems.feti.spectrum import spectra_of_equations
 from problems.feti.substructures import local_problems
-from problems.feti.tearing import blocks
+from problems.feti.tearing import structured_bodies
 from problems.models.beam_ring import model
 from solvers.baselines.feti import FETI
 from solvers.smalbe.solver import SMALBE
@@ -91,20 +91,19 @@ def one(way, Nr, cells):
 
 def labels(Nr, cells):
     """Cut beam and ring into squares of `cells` cells, evenly."""
-    beam, ring = blocks((8 * Nr, Nr), cells), blocks((12 * (Nr // 2), Nr), cells)
-    return np.append(beam, beam.max() + 1 + ring)
+    return structured_bodies([(8 * Nr, Nr), (12 * (Nr // 2), Nr)], cells)
 
 
 def known_face(pieces, qp, s):
     """Measure κ without contact, and CG steps with the final active rows known."""
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    F = dual_operator(pieces.B[equality], pieces.domains)
-    kappa = spectrum(F.build(), qp.A[:, equality], tol=1e-3).condition
+    (alone,) = spectra_of_equations(pieces, tol=1e-3)
     m = int(active.sum())
+    F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
     face = replace(
-        qp, P=dual_operator(pieces.B[active], pieces.domains), q=qp.q[active],
-        A=qp.A[:, active], G=no_rows(m), lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
+        qp, P=F, q=qp.q[active], A=qp.A[:, active], G=no_rows(m),
+        lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
     )  # fmt: skip
     steps = {
         name: FETI(preconditioner=kind)
@@ -112,7 +111,7 @@ def known_face(pieces, qp, s):
         .counts["steps_to_tol"]
         for name, kind in (("face", "dirichlet"), ("face none", "none"))
     }
-    return {"kappa": kappa, **steps}
+    return {"kappa": alone.condition, **steps}
 
 
 def exponent(n, values):

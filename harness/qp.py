@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, issparse
 
 Vector = NDArray[np.float64]
+NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 
 
@@ -114,9 +115,10 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Give the reason to decline a `qp` whose P is an operator, else None.
 
-    For `declines` of a solver that reads entries of P, and does not only multiply.
+    For `declines` of a solver that reads entries of P, and does not only multiply. A
+    run that hears this reason multiplies a small P out, on the clock, and asks again.
     """
-    return None if qp.is_explicit else "needs explicit matrices"
+    return None if qp.is_explicit else NEEDS_MATRICES
 
 
 def _freeze(M: Matrix) -> None:

@@ -112,6 +112,7 @@ class Record(Measurement):
     canary_seconds: float | None = None  #: a fixed kernel, just before: drift
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to
+    ranks: int = 1  #: processes of MPI that solved it together
     #: or "sequence": may use what earlier steps left; "sequence, tighten=θ": to
     #: tolerances that tighten, see `Record.tighten`
     mode: str = "cold"
@@ -181,6 +182,8 @@ class Record(Measurement):
             del row["session"]
         if self.step_tol is None:
             del row["step_tol"]
+        if self.ranks == 1:
+            del row["ranks"]
         return json.dumps(row, allow_nan=False)
 
     @staticmethod

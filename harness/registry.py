@@ -63,6 +63,13 @@ class SolverSpec:
         default_factory=dict
     )  #: that differ from defaults
     role: str = ""  #: "null": one that the suite has already, to show the noise
+    ranks: int = 1  #: processes of MPI that one solve runs on
+
+    def on(self, ranks: int) -> SolverSpec:
+        """Ask for the same on so many ranks, under a label that says so."""
+        if ranks == 1:
+            return self
+        return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from harness import Fields, Record, Residuals, Solution, Verdict
 from harness.environment.environment import digest
 from harness.errors import InputError
+from harness.mpi import ranks_asked
 from harness.names import assemble
 from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite
@@ -181,6 +182,7 @@ def solve(
     tol: float = 1e-8,
     options: Mapping[str, Any] | None = None,
     plugins: Plugins = (),
+    ranks: int = 1,
 ) -> Answer:
     """Run one solver on one case, once, in a process of its own, and judge its answer.
 
@@ -192,11 +194,13 @@ def solve(
     options : of the solver, that differ from its defaults. A solver that can tell of
         its iterations does, unless they say ``history = False``
     plugins : Python files with more solvers or families
+    ranks : processes of MPI that solve it together
 
     Raises
     ------
     InputError
-        When there is no such case, solver or option, or the case cannot be built.
+        When there is no such case, solver or option, or the case cannot be built; when
+        ranks are asked for and there is no MPI.
 
     """
     tolerance(tol)
@@ -210,7 +214,8 @@ def solve(
         registries = registries.with_files(
             [file for file in asked if file.resolved() not in held]
         )
-    with answers_of(solver, registries, options) as answer:
+    ranks_asked(ranks, "ranks")
+    with answers_of(solver, registries, options, ranks=ranks) as answer:
         return answer(case, tol)
 
 
@@ -221,10 +226,12 @@ def answers_of(
     options: Mapping[str, Any] | None = None,
     *,
     forks: bool = False,
+    ranks: int = 1,
 ) -> Iterator[Callable[[Case, float], Answer]]:
     """Give what has a solver solve a case to a tolerance, in a process of its own.
 
     solver, options : as of `solve`
+    ranks : as of `solve`
     forks : whether that process may be a fork of this one, made now, if that is safe;
         see `harness.processes.forking`
 
@@ -235,7 +242,7 @@ def answers_of(
 
     """
     given = dict(options or {})
-    spec = SolverSpec(name=solver, label=solver, options=given)
+    spec = SolverSpec(name=solver, label=solver, options=given).on(ranks)
     configured = resolve(spec, registries.solvers)
     plainly = SolverSpec(name=solver, label=solver)
     defaults = options_of(resolve(plainly, registries.solvers))
@@ -265,7 +272,7 @@ def answers_of(
 
     command = registries.worker_command(spec)
     work = None
-    if forks:
+    if forks and ranks == 1:
         from harness.processes.worker import serve  # late: few need it here
 
         work = partial(serve, configured)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
+from harness.processes.ranks import launch, this_rank
 from harness.processes.worker import serve
 from harness.registry import SolverSpec, resolve
 from mortarbench.registries import Registries
@@ -21,8 +22,15 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         name=request["name"], label=request["name"], options=request["options"]
     )
     solver = resolve(spec, registries.solvers)
-    serve(solver, int(request_fd), int(reply_fd), registries.operators)
+    ranks = this_rank() if request.get("ranks", 1) > 1 else None
+    serve(solver, int(request_fd), int(reply_fd), registries.operators, ranks)
     return 0
+
+
+def ranks(registries: Registries, arguments: Sequence[str]) -> int:
+    """Start the ranks of a worker, as `Registries.worker_command` asks for."""
+    count = json.loads(arguments[0])["ranks"]
+    return launch(count, [*registries.start, "worker", *arguments])
 
 
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:

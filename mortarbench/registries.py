@@ -175,12 +175,15 @@ class Registries:
 
     def worker_command(self, spec: SolverSpec) -> list[str]:
         """Make the command that starts the worker of a solver, less its two pipes."""
-        request = {
+        request: dict[str, Any] = {
             "name": spec.name,
             "options": spec.options,
             "plugins": self._absolute_files(),
         }
-        return [*self.start, "worker", json.dumps(request)]
+        if spec.ranks > 1:
+            request["ranks"] = spec.ranks
+        name = "ranks" if spec.ranks > 1 else "worker"
+        return [*self.start, name, json.dumps(request)]
 
     def commands(self, specs: Iterable[SolverSpec]) -> Commands:
         """Make the commands that start the processes of a run."""

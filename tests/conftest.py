@@ -87,3 +87,10 @@ def svg_only():
             yield
 
     return context
+
+
+@pytest.fixture
+def only_svg(svg_only):
+    """Reports of this test have their figures as SVG alone."""
+    with svg_only():
+        yield

@@ -61,6 +61,6 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
 # The variables pin what wheels are built with, too (new pip reads the second).
 echo "setup: installing Python packages into .venv"
 export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_BUILD_CONSTRAINT="$PWD/constraints.txt"
-.venv/bin/python -m pip install -q --disable-pip-version-check -e ".[${extra:-fleet,dev}]"
+.venv/bin/python -m pip install -q --disable-pip-version-check -e ".[${extra:-fleet,mpi,dev}]"
 # what pip does for packages that it copies: no process has to compile ours
 .venv/bin/python -m compileall -q harness problems solvers reports mortarbench

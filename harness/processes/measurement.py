@@ -107,6 +107,8 @@ def measured(
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
     cost, *notes = _believed(reply)
+    if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
+        cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first = reply.answer["first_seconds"]
         notes = _cached(

@@ -34,12 +34,14 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from harness.distributed import Ranks
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays
 from harness.operators import NO_MAKERS, Maker
 from harness.plugin import Solver
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
+from harness.processes.ranks import OnRanks, follow
 from harness.qp import QP, Vector, no_rows
 from harness.record import finite, journal_name
 from harness.solution import Solution, Status
@@ -53,13 +55,26 @@ def serve(
     request_fd: int,
     reply_fd: int,
     operators: Mapping[str, Maker] = NO_MAKERS,
+    ranks: Ranks | None = None,
 ) -> None:
     """Answer requests until there are no more.
 
     operators : what puts an operator P of a request together, see `harness.operators`
+    ranks : that solve together, this process being one of them
     """
     bench = _Bench(solver, operators)
+    if ranks is None:
+        answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
+        return
+    if ranks.rank:
+        os.close(request_fd)
+        os.close(reply_fd)
+        bench.warm_up()
+        follow(solver, ranks, operators, _limit_memory)
+        return
+    bench.on_ranks = OnRanks(solver, ranks)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
+    bench.on_ranks.end()
 
 
 class _Bench:
@@ -72,6 +87,7 @@ class _Bench:
         self._at = -1  # the step of the sequence that came last
         self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
         self._ballast = np.empty(0)
+        self.on_ranks: OnRanks | None = None  #: what measures in place of the solver
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds and one with rows; how that ends will show later.
@@ -108,8 +124,10 @@ class _Bench:
         qp, _ = load_qp(path, operators=self._operators if vouched else None)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
+        if self.on_ranks is not None:
+            self.on_ranks.takes(path, request.get("memory_limit"))
         timed = _measured_here(
-            self._solver,
+            self.on_ranks or self._solver,
             qp,
             request["tol"],
             prepare=self._step(request),

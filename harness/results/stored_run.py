@@ -131,8 +131,11 @@ def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
     name = record.solver
     for name in without_options(record.solver.removesuffix(NULL)):
         if name in known:
-            return replace(known[name], label=record.solver, role=record.role)
-    return SolverSpec(name=name, label=record.solver, role=record.role)
+            spec = known[name]
+            break
+    else:
+        spec = SolverSpec(name=name, label=name)
+    return replace(spec, label=record.solver, role=record.role, ranks=record.ranks)
 
 
 def _family(record: Record, families: Mapping[str, Family]) -> Family:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from harness import checked
 from harness.errors import InputError, shown, unknown
 from harness.files.reading import MOST_TOML, read_text, toml
+from harness.mpi import ranks_asked
 from harness.names import CaseId
 from harness.plugin import Family, Solver
 from harness.record import TIGHTENING
@@ -28,6 +29,7 @@ DEFAULTS: Mapping[str, Any] = {
     "accuracy": None,
     "null_arm": None,
     "tighten": [0],
+    "ranks": [1],
     "max_cases": 100_000,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
@@ -117,7 +119,10 @@ def load_suite(
             repeats=checked.at_least_one("repeats", table["repeats"]),
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
-            solvers=_with_null(_solvers(table["solvers"], solvers), table["null_arm"]),
+            solvers=_with_null(
+                _on_ranks(_solvers(table["solvers"], solvers), table["ranks"], solvers),
+                table["null_arm"],
+            ),
             cases=cases,
             sequences=sequences,
             every=frozenset(
@@ -180,6 +185,24 @@ def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpe
             resolve(spec, registry)
         found[spec.label] = spec
     return tuple(found.values())
+
+
+def _on_ranks(
+    specs: tuple[SolverSpec, ...], ranks: object, registry: Mapping[str, Solver]
+) -> tuple[SolverSpec, ...]:
+    """Ask every solver that can for each number of ranks; others run on one."""
+    counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
+    if len(set(counts)) < len(counts):
+        raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
+    able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
+    if counts != [1] and not any(able.values()):
+        raise InputError(
+            f"ranks = {shown(counts)}: none of the solvers runs on several; expected "
+            "smalbe among them, or no ranks"
+        )
+    return tuple(
+        spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])
+    )
 
 
 def _spec(entry: object) -> SolverSpec:

@@ -15,14 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import issparse
 
-from harness.operators import SerialisableOperator
+from harness.limits import too_large
+from harness.operators import SerialisableOperator, assembled
 from harness.plugin import Solver
-from harness.qp import QP, Matrix, Vector
+from harness.qp import NEEDS_MATRICES, QP, Matrix, Vector
 from harness.record import Measurement
 from harness.solution import Solution, Status, usable_history
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
 MOST_INNER = 100
+MOST_ASSEMBLED = 3000  #: rows of an operator P that is multiplied out
 LARGEST_COUNT = 2**53
 LONGEST_MESSAGE = 1900  #: characters
 
@@ -54,6 +56,9 @@ def measure(
 
     Nothing that the solver does wrong raises: an exception, a missing library or a
     malformed answer becomes the status and message of a solution without a point.
+
+    An operator P that the solver cannot use as such (`harness.needs_matrices`) is
+    multiplied out where it has at most MOST_ASSEMBLED rows: that is preparing, too.
 
     prepare : where that is a step of a sequence, see `harness.plugin.Chained`
     sample_seconds : what takes less is prepared afresh and solved again until all that
@@ -104,11 +109,26 @@ class _Asked:
     prepare: Prepare
 
     def __call__(self, qp: QP) -> Callable[[], Solution]:
-        if (reason := self.solver.declines(qp)) is not None:
+        reason = self.solver.declines(qp)
+        if reason == NEEDS_MATRICES and not qp.is_explicit:
+            qp = _explicit(qp)
+            reason = self.solver.declines(qp)
+        if reason is not None:
             raise _DeclinedError(reason)
         if isinstance(qp.P, SerialisableOperator):
             qp.P.build()
         return self.prepare(qp)
+
+
+def _explicit(qp: QP) -> QP:
+    """Multiply an operator P out, where it is small."""
+    n = qp.q.size
+    if n > MOST_ASSEMBLED or too_large(n, 3):
+        raise _DeclinedError(
+            f"{NEEDS_MATRICES}; P is an operator of {n} rows, and is multiplied out up "
+            f"to {MOST_ASSEMBLED} where memory allows"
+        )
+    return replace(qp, P=assembled(qp.P))
 
 
 class _DeclinedError(Exception):

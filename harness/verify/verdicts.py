@@ -50,6 +50,8 @@ def new_record(
     identity = [IDENTITY, case.name, spec.label, spec.name, options, tol, repeat]
     if (mode, accuracy) != ("cold", None):
         identity += [mode, accuracy]
+    if spec.ranks > 1:
+        identity += [{"ranks": spec.ranks}]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=hex_digest([text.encode()]),
@@ -68,6 +70,7 @@ def new_record(
         mode=mode,
         accuracy=accuracy,
         role=spec.role,
+        ranks=spec.ranks,
         started=datetime.now(UTC).isoformat(timespec="milliseconds"),
         session=session,
     )

@@ -60,11 +60,14 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
-    if argv[:1] in (["worker"], ["generator"]):  # how runs start their processes
+    if argv[:1] in (["worker"], ["ranks"], ["generator"]):  # how runs start processes
         from mortarbench import processes
 
-        start = processes.worker if argv[0] == "worker" else processes.case_worker
-        return start(registries, argv[1:])
+        starts = {
+            "worker": processes.worker, "ranks": processes.ranks,
+            "generator": processes.case_worker,
+        }  # fmt: skip
+        return starts[argv[0]](registries, argv[1:])
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
@@ -255,6 +258,13 @@ def _add_solve_options(command: _Parser) -> None:
         help="relative accuracy that the solver is asked for; default: 1e-8",
     )
     _add_option(command, "an option of the solver, instead of its default")
+    command.add_argument(
+        "--mpi",
+        metavar="N",
+        type=int,
+        default=1,
+        help="solve on N processes of MPI; a case with feti, form dual; default: 1",
+    )
     command.add_argument(
         "--plot",
         metavar="FILE.png|pdf|svg",

@@ -9,6 +9,7 @@ from argparse import Namespace
 from typing import TYPE_CHECKING
 
 from harness.errors import InputError, say
+from harness.mpi import ranks_asked
 from harness.names import parse
 from harness.registry import check_name
 from harness.suite.solver_options import options_for
@@ -31,6 +32,7 @@ def run(registries: Registries, options: Namespace) -> int:
         )
     if options.vtu is not None:
         writable(options.vtu, GRIDS)
+    ranks_asked(options.mpi, "--mpi")
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
@@ -42,7 +44,10 @@ def run(registries: Registries, options: Namespace) -> int:
 
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
     forks = registries.hold_own_code_only() and not _loads_from_here()
-    with answers_of(options.solver, registries, changed, forks=forks) as solved:
+    asked = answers_of(
+        options.solver, registries, changed, forks=forks, ranks=options.mpi
+    )
+    with asked as solved:
         case = built_case(parsed, registries)  # after the fork, which has no use for it
         for remark in case.remarks:
             say(remark)

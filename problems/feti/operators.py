@@ -17,8 +17,9 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999)
 
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
 condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
-or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular: which
-generalised inverse is taken changes λ by what Bᵀ does not feel.
+or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular; of the
+equations it is block diagonal, a block for each node, and inverted as Moore and Penrose
+do, so that nothing is added to λ that Bᵀ does not feel.
 
 Of B W Bᵀ, what couples contact rows with the equations is left out. There is some only
 where contact touches supports; there it would weigh the equations for contact that most
@@ -37,9 +38,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import Vector
+from harness import QP, Vector
+from harness.distributed import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
 from problems.feti.torn import Dense, Kind, Subdomains
@@ -47,8 +50,9 @@ from problems.feti.torn import Dense, Kind, Subdomains
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
-#: of the diagonal of B W Bᵀ, added where rows are redundant
+#: of the diagonal of B W Bᵀ, added where contact rows might depend on one another
 SHIFT = 1e-8
+SINGULAR = 1e-10  #: of the largest eigenvalue of a block of B W Bᵀ: taken for zero
 ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
 _PARTS = ("data", "indices", "indptr")
 _OF_KINDS = ("stiffness", "fixing", "boundary")  #: whose lengths differ by kind
@@ -180,7 +184,7 @@ class DualOperator:
         blocks, weights = self.weighted_blocks(kind, scaling)
         BW = csr_array(self.packed.B @ diags_array(weights))
         gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
-        WB, solve = csr_array(BW.T), _gram_inverse(gram)
+        WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
         def product(x: Dense) -> Dense:
             return solve(BW @ self.packed.multiplied(blocks, WB @ solve(x)))
@@ -214,6 +218,17 @@ class DualOperator:
         if scaling == "multiplicity":
             weights = np.ones_like(weights)
         return blocks, weights
+
+    @property
+    def parts(self) -> int:
+        """How many subdomains there are."""
+        return int(self.domains.kind.size)
+
+    def share(self, qp: QP, ranks: Ranks) -> Share:
+        """Take this rank's share of a dual with this F."""
+        from problems.feti.distributed import shared  # late: one process needs none
+
+        return shared(qp, self, ranks)
 
     @cached_property
     def packed(self) -> Packed:
@@ -302,21 +317,47 @@ def uncoupled(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def _gram_inverse(gram: csr_array) -> Product:
-    """Make x ↦ (B W Bᵀ)⁻¹x; most rows of orthonormal gluing stand alone."""
-    diagonal = gram.diagonal()
-    coupled = np.flatnonzero(np.diff(gram.indptr) > 1)
-    if not coupled.size:
-        return lambda x: np.asarray((x.T / diagonal).T)
-    shift = diags_array(SHIFT * diagonal[coupled])
-    factor = cholesky(csc_matrix(gram[coupled][:, coupled] + shift))
+def gram_inverse(gram: csr_array, equalities: int) -> Product:
+    """Make x ↦ (B W Bᵀ)⁺x of what `uncoupled` leaves."""
+    m = gram.shape[0]
+    inverse = inverted_blocks(csr_array(gram[:equalities, :equalities]))
+    if equalities == m:
+        return lambda x: np.asarray(inverse @ x)
+    contact = csc_matrix(gram[equalities:, equalities:])
+    factor = cholesky(csc_matrix(contact + diags_array(SHIFT * contact.diagonal())))
 
     def solve(x: Dense) -> Dense:
-        y = np.asarray((x.T / diagonal).T)
-        y[coupled] = factor(x[coupled])
+        y = np.empty_like(x)
+        y[:equalities] = inverse @ x[:equalities]
+        y[equalities:] = factor(x[equalities:])
         return y
 
     return solve
+
+
+def inverted_blocks(M: csr_array) -> csr_array:
+    """Return M⁺ of a symmetric M with many small blocks, in whatever order of rows."""
+    if not M.nnz:
+        return M
+    _, block = connected_components(M, directed=False)
+    size = np.bincount(block)
+    order = np.argsort(block, kind="stable")
+    within = np.empty_like(order)
+    within[order] = np.arange(order.size) - (np.cumsum(size) - size)[block[order]]
+    rows, columns = M.tocoo().coords
+    data, places = [], []
+    for n in np.unique(size):
+        mine = size == n
+        number = np.cumsum(mine) - 1
+        dense = np.zeros((mine.sum(), n, n))
+        of = mine[block[rows]]
+        at = number[block[rows[of]]], within[rows[of]], within[columns[of]]
+        dense[at] = M.data[of]
+        members = order[mine[block[order]]].reshape(-1, n)
+        data.append(np.linalg.pinv(dense, rcond=SINGULAR, hermitian=True).ravel())
+        places.append([np.repeat(members, n), np.tile(members, n).ravel()])
+    entries = np.concatenate(data), tuple(np.concatenate(places, axis=1))
+    return csr_array(entries, shape=M.shape)
 
 
 def dual_operator(

@@ -1,9 +1,11 @@
 """Bodies of any mesh cut into connected parts, by a partition of the graph of cells.
 
 Two cells are neighbours if they share an edge. METIS (Karypis and Kumar 1998, SIAM J.
-Sci. Comput. 20) parts the graph of each body so that parts are about equal and few
-edges lie between them. Cells that hang together in a node only would turn against each
-other: a part must be connected by edges, or it has more motions than a rigid body.
+Sci. Comput. 20) parts the graph of each body so that parts are about equal and the
+edges between them are short, measured by the cells around: so parts are compact where
+cells are long and thin, as those of graded meshes are. Cells that hang together in a
+node only would turn against each other: a part must be connected by edges, or it has
+more motions than a rigid body.
 """
 
 from __future__ import annotations
@@ -18,14 +20,21 @@ from problems.fem.mesh import Nodes
 
 Labels = NDArray[np.int64]
 
+SQUARE = 100  #: weight of the edge between two squares
+LARGEST = 10_000  #: weight; METIS adds them up as integers of 32 bits
+IMBALANCE = 300  #: in thousandths: the less, the more pieces are apart from their part
 
-def graph_partition(cells: Nodes, body: Labels, parts: int) -> Labels:
+
+def graph_partition(
+    points: NDArray[np.float64], cells: Nodes, body: Labels, parts: int
+) -> Labels:
     """Label the cells of bodies by parts, each connected and of one body.
 
     Every body has a number of parts in proportion to its cells, one at least.
 
     Parameters
     ----------
+    points : (N, 2) of the nodes
     cells : (E, 4) corners; a triangle repeats its last one
     body : (E,) of each cell, 0, 1, …
     parts : of all bodies together
@@ -50,7 +59,7 @@ def graph_partition(cells: Nodes, body: Labels, parts: int) -> Labels:
     label, first = np.empty(len(cells), dtype=np.int64), 0
     for b, of_body in enumerate(_shares(counts, parts)):
         own = np.flatnonzero(body == b)
-        label[own] = first + _parted(_neighbours(cells[own]), int(of_body))
+        label[own] = first + _parted(neighbours(points, cells[own]), int(of_body))
         first += int(of_body)
     return label
 
@@ -63,18 +72,26 @@ def _shares(counts: Labels, parts: int) -> Labels:
     return shares
 
 
-def _neighbours(cells: Nodes) -> csr_array:
-    """Return the graph of cells (E, E): an entry for each edge that two share."""
+def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
+    """Return the graph of cells (E, E), with an integer weight for each shared edge.
+
+    That is √(L/d), in units of 1 / `SQUARE`, of an edge of length L between centres at
+    the distance d: its length, where the cells around it have the area 1.
+    """
     edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
     cell = np.repeat(np.arange(len(cells)), cells.shape[1])
     is_edge = edges[:, 0] != edges[:, 1]
-    _, number = np.unique(np.sort(edges[is_edge]), axis=0, return_inverse=True)
-    ones = np.ones(number.size, dtype=np.int64)
-    incident = csr_array((ones, (cell[is_edge], number.ravel())))
-    graph = csr_array(incident @ incident.T)
-    graph.setdiag(0)
-    graph.eliminate_zeros()
-    return graph
+    edges, cell = np.sort(edges[is_edge]), cell[is_edge]
+    order = np.lexsort(edges.T)
+    shared = np.flatnonzero((np.diff(edges[order], axis=0) == 0).all(axis=1))
+    one, other = cell[order[shared]], cell[order[shared + 1]]
+    ends, centre = points[edges[order[shared]]], points[cells].mean(axis=1)
+    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    ratio = length / np.linalg.norm(centre[one] - centre[other], axis=1)
+    weight = np.clip(np.rint(SQUARE * np.sqrt(ratio)), 1, LARGEST).astype(np.int64)
+    shape = (len(cells), len(cells))
+    half = csr_array((weight, (one, other)), shape=shape)
+    return csr_array(half + half.T)
 
 
 def _parted(graph: csr_array, parts: int) -> Labels:
@@ -88,10 +105,13 @@ def _parted(graph: csr_array, parts: int) -> Labels:
         return np.zeros(graph.shape[0], dtype=np.int64)
     from pymetis import CSRAdjacency, Options, part_graph  # here: few cases are parted
 
-    adjacency = CSRAdjacency(graph.indptr, graph.indices)
+    adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
     # k-way parts are better, but some may be empty where parts have few cells
-    for recursive, options in ((False, Options(contig=1)), (True, Options())):
-        _, found = part_graph(parts, adjacency, recursive=recursive, options=options)
+    for recursive in (False, True):
+        options = Options(ufactor=IMBALANCE, contig=int(not recursive))
+        _, found = part_graph(
+            parts, adjacency, eweights=weights, recursive=recursive, options=options
+        )
         label = _connected(graph, np.array(found, dtype=np.int64))
         if np.unique(label).size == parts:
             return label

@@ -21,21 +21,17 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import coo_array, csc_matrix, csr_array, vstack
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csc_matrix, csr_array
 from sksparse.cholmod import cholesky
 
 from harness import Vector
-from problems.feti.operators import dual_operator, made
+from problems.feti.operators import dual_operator, inverted_blocks, made, uncoupled
 from problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 
 EXHAUSTED = 1e-10  #: length of a new vector, of the largest Ritz value: none is left
-#: cosine of rows, and eigenvalue of the matrix of their products, taken for zero
-PARALLEL = 1e-10
 CHECKED = 5  #: steps from one look at the Ritz values to the next
 _CHUNK = 64  #: vectors that memory is taken for at once
 
@@ -68,61 +64,44 @@ class Spectrum(NamedTuple):
         )
 
 
-def projector(G: csr_array) -> Product:
-    """Make x ↦ x − Gᵀ(GGᵀ)⁻¹Gx for rows G (r, n) of full rank; r may be 0."""
-    if not G.shape[0]:
-        return lambda x: x
-    factor, GT = cholesky(csc_matrix(G @ G.T)), csr_array(G.T)
-    return lambda x: np.asarray(x - GT @ factor(G @ x))
+def projector(G: csr_array, B: csr_array) -> Product:
+    """Make the orthogonal projector onto ker G ∩ range B.
 
+    Rows of B that depend on one another, those of redundant gluing, meet at a
+    crosspoint; BBᵀ has a small block there.
 
-def dependencies(B: csr_array) -> csr_array:
-    """Return an orthonormal basis of ker Bᵀ, a row each, (k, m).
+    Parameters
+    ----------
+    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
+    B : (m, N)
 
-    Rows of B that depend on one another are few and meet at a crosspoint: each set of
-    rows that are not orthogonal to one another is looked at on its own.
     """
-    gram = coo_array(B @ B.T)
-    coupled = np.abs(gram.data) > PARALLEL * gram.data.max(initial=0.0)
-    i, j, data = gram.row[coupled], gram.col[coupled], gram.data[coupled]
-    _, label = connected_components(
-        coo_array((data, (i, j)), shape=gram.shape), directed=False
-    )
-    order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
-    first = np.cumsum(sizes) - sizes
-    place = np.empty_like(order)  # of each row within its set
-    place[order] = np.arange(order.size) - first[label[order]]
-    found = [csr_array((0, B.shape[0]))]
-    for size in np.unique(sizes[sizes > 1]):
-        sets = np.flatnonzero(sizes == size)
-        number = np.full(sizes.size, -1)
-        number[sets] = np.arange(sets.size)
-        of, here = number[label[i]], sizes[label[i]] == size
-        local = np.zeros((sets.size, size, size))
-        local[of[here], place[i[here]], place[j[here]]] = data[here]
-        values, vectors = np.linalg.eigh(local)
-        block, column = np.nonzero(values < PARALLEL * values[:, -1:])
-        members = order[first[sets[block], None] + np.arange(size)]
-        ends = np.arange(block.size + 1) * size
-        rows = (vectors[block, :, column].ravel(), members.ravel(), ends)
-        found.append(csr_array(rows, shape=(block.size, B.shape[0])))
-    return csr_array(vstack(found))
+    gram = uncoupled(csr_array(B @ B.T), B.shape[0])
+    within = csr_array(gram @ inverted_blocks(gram))
+    if not G.shape[0]:
+        return lambda x: np.asarray(within @ x)
+    factor, GT = cholesky(csc_matrix(G @ G.T)), csr_array(G.T)
+
+    def project(x: Vector) -> Vector:
+        y = within @ x
+        return np.asarray(y - GT @ factor(G @ y))
+
+    return project
 
 
 def spectrum(
-    F: Product, G: csr_array, M: Product | None = None, tol: float = 1e-5
+    F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5
 ) -> Spectrum:
     """Find the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
     Parameters
     ----------
-    F : symmetric, positive definite on ker G
-    G : (r, n) rows of full rank: the equations, and the `dependencies` of B
+    F : symmetric, positive definite on the range of P
+    P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
     tol : error bound of both eigenvalues, relative
 
     """
-    P, n = projector(G), G.shape[1]
     #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
@@ -166,19 +145,23 @@ def spectra_of_equations(
     tol : as of `spectrum`
 
     """
-    B_E = torn.B[: torn.equalities]
-    F = made(dual_operator(B_E, torn.domains, torn.equalities).arrays)
-    G = vstack([(B_E @ torn.domains.kernel).T, dependencies(B_E)], format="csr")
+    B_E, m = torn.B[: torn.equalities], torn.equalities
+    F = made(dual_operator(B_E, torn.domains, m).arrays)
+    P = projector(csr_array((B_E @ torn.domains.kernel).T), B_E)
     inverses = [p and F.preconditioner(*p) for p in preconditioners]
-    return [spectrum(F, G, M, tol) for M in inverses]
+    return [spectrum(F, P, m, M, tol) for M in inverses]
 
 
 def _extreme(alpha: Vector, beta: Vector, length: float) -> Spectrum:
     """Bound the extreme Ritz values, the next vector being of this length."""
-    theta, s = eigh_tridiagonal(alpha, beta)
-    rounding = np.finfo(float).eps * alpha.size * np.abs(theta).max()
-    residual: NDArray[np.float64] = length * np.abs(s[-1]) + rounding
+    last = alpha.size - 1
+    (smallest, s), (largest, t) = (
+        eigh_tridiagonal(alpha, beta, select="i", select_range=(i, i))
+        for i in (0, last)
+    )
+    rounding = float(np.finfo(float).eps) * alpha.size * float(largest[0])
     return Spectrum(
-        float(theta[0]), float(theta[-1]), float(residual[0]), float(residual[-1]),
-        alpha.size,
+        float(smallest[0]), float(largest[0]),
+        length * abs(float(s[-1, 0])) + rounding,
+        length * abs(float(t[-1, 0])) + rounding, alpha.size,
     )  # fmt: skip

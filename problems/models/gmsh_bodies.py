@@ -115,7 +115,7 @@ def model(path: str, sha256: str, plane: Any) -> Bodies:
 @lru_cache(maxsize=4)
 def _subdivided(path: str, sha256: str, plane: Any, parts: int) -> SubdividedBodies:
     bodies = model(path, sha256, plane)
-    label = graph_partition(bodies.mesh.cells, bodies.body, parts)
+    label = graph_partition(bodies.mesh.points, bodies.mesh.cells, bodies.body, parts)
     return subdivide(bodies, label)
 
 

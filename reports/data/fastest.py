@@ -194,6 +194,8 @@ def _fastest(
         for case, row in rows.items()
         if any(time_of(row[s]) is not None for s in group.solvers)
     }
+    if len(solved) < CASES:  # as where a sequence ended: too few for a test over cases
+        ranking = None
     entered = [
         Competitor(solver=s, outcomes={case: row[s] for case, row in solved.items()})
         for s in group.solvers

@@ -139,8 +139,8 @@ def _is_nonnegative(qp: QP) -> bool:
     Without variables it is not: scipy's nnls (1.17.1) would crash Python.
     """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
-    only &= np.isfinite(qp.lb).all() and qp.q.size > 0
-    return bool(isinstance(qp.P, np.ndarray) and only)
+    lower = qp.q.size > 0 and np.isfinite(qp.lb).all()
+    return bool(isinstance(qp.P, np.ndarray) and only and lower)
 
 
 def _nonnegative(qp: QP) -> Solution:

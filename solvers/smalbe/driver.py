@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
+from harness.distributed import DistributedVector
 from solvers.smalbe import compiled
 from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
 from solvers.smalbe.mprgp import Face, Point, Rules, Watch, split
@@ -200,10 +201,11 @@ def outer_loop(
     )  # fmt: skip
     watch = None if history is None else partial(history.watch, problem)
     kind = chosen(qp, options.preconditioner)
+    F = problem.F
     is_compiled = is_compiled and isinstance(problem.rows, DenseRows)
-    if is_compiled and kind in WITHOUT_P:
+    if is_compiled and isinstance(F, compiled.Product) and kind in WITHOUT_P:
         with_model = kind == "model"
-        solver = compiled.Solver(problem, problem.F, rules, options.alpha, with_model)
+        solver = compiled.Solver(problem, F, rules, options.alpha, with_model)
         return partial(_compiled_loop, solver, problem, constants, watch), solver
     plain = partial(problem.plain_model, alpha=options.alpha)
     inner = InnerSolver(
@@ -348,8 +350,48 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
         )  # fmt: skip
         if bound <= enough:
             return bound
+    if isinstance(qp.q, DistributedVector):
+        return _residual_bound(qp, point, Fx)
     task.problem.F.count += 1
     return kkt_residuals(qp, point).worst
+
+
+@np.errstate(all="ignore")
+def _residual_bound(qp: QP, s: Solution, Fx: Vector) -> float:
+    """Bound the worst of `harness.kkt_residuals` from above, of a QP over ranks.
+
+    As `compiled.residual_bound`: with the least scale of energy that may be used, and
+    nothing excused as rounding.
+    """
+    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    told, z, x = qp.diagonal(), s.z_box, s.x
+    d = np.zeros_like(x) if told is None else np.maximum(told, 0)
+    forces = qp.A.T @ s.y + z
+    r = np.abs(Fx + qp.q + forces)
+    at = np.where(z < 0, np.where(lower, qp.lb, 0), np.where(upper, qp.ub, 0))
+    xFx, qx, held = float(x @ Fx), float(qp.q @ x), float(at @ z + qp.b @ s.y)
+    most = max(abs(xFx), abs(qx), abs(held))
+    E = min(most, max(1e4 * abs(xFx / 2 + qx), most / 1e4))
+    if (
+        not E > 0
+        or (z[~lower & (z < 0)] != 0).any()
+        or (z[~upper & (z > 0)] != 0).any()
+    ):
+        return np.inf
+    size = np.maximum(np.maximum(np.abs(Fx), np.abs(qp.q)), np.abs(forces))
+    least = (d[d > 0]).min(initial=np.inf)
+    S = max(float(size.max(initial=0.0)), np.sqrt(E * least) if least < np.inf else 0.0)
+    step = np.where(d > 0, np.maximum(np.abs(x), r / np.where(d > 0, d, 1)), np.inf)
+    own = np.where(r > 0, np.minimum(r / size, r * step / E), 0.0)
+    length = np.minimum(np.sqrt(E / d), E / np.abs(qp.q))
+    known = np.maximum(np.minimum(np.abs(x), 1e3 * length), length)
+    terms = abs(qp.A) @ np.where(np.isfinite(known), known, np.abs(x)) + np.abs(qp.b)
+    missed = np.abs(qp.A @ x - qp.b)
+    return float(max(
+        np.abs(z * (x - at)).max(initial=0.0) / E, abs(xFx + qx + held) / E,
+        r.max(initial=0.0) / S, own.max(initial=0.0),
+        np.where(missed > 0, missed / terms, 0.0).max(initial=0.0),
+    ))  # fmt: skip
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
@@ -393,7 +435,7 @@ class History:
                 letter, outer, problem.F.count,
                 np.linalg.norm(face.phi), np.linalg.norm(face.beta),
                 error / (size or np.linalg.norm(at.x) or 1.0),
-                face.free.size - np.count_nonzero(face.free),
+                np.count_nonzero(~face.free),
                 np.count_nonzero(between & ~face.free) if boxes else None,
                 0.5 * at.x @ (at.g - rhs), perf_counter() - self.began,
             ))  # fmt: skip

@@ -56,9 +56,8 @@ def reduced(
     x: Vector, phi: Vector, alpha: float, lower: Vector, upper: Vector
 ) -> Vector:
     """Return φ̃: the free gradient, cut so that x − ᾱφ̃ is feasible."""
-    return np.asarray(
-        np.minimum(np.maximum(phi, (x - upper) / alpha), (x - lower) / alpha)
-    )
+    cut: Vector = np.minimum(np.maximum(phi, (x - upper) / alpha), (x - lower) / alpha)
+    return cut
 
 
 def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:

@@ -45,9 +45,7 @@ DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 def offered(qp: QP) -> Preconditioned | None:
     """Give what P offers preconditioners by, if it does."""
-    if not isinstance(qp.P, SerialisableOperator):
-        return None
-    product = qp.P.build()
+    product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else qp.P
     return product if isinstance(product, Preconditioned) else None
 
 

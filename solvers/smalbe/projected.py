@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import QP, Vector
+from harness import QP, Matrix, Vector
+from harness.distributed import DistributedVector
 from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
@@ -38,11 +39,24 @@ class Spectrum(NamedTuple):
         return self._replace(ritz=self.ritz._replace(vectors=vectors))
 
 
+@dataclass(eq=False)
+class CountedProduct:
+    """v → Fv of an operator over ranks, counted."""
+
+    F: Matrix
+    count: int = 0
+
+    def __call__(self, v: Vector) -> Vector:
+        self.count += 1
+        product: Vector = self.F @ v
+        return product
+
+
 @dataclass(frozen=True, eq=False)
 class Projected:
     """Steps 1 to 3 of SMALBE: H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and b."""
 
-    F: Product  #: counts its calls
+    F: Product | CountedProduct
     rows: Rows
     spectrum: Spectrum
     b: Vector
@@ -74,7 +88,8 @@ class Projected:
         Cv = C @ v
         Fv = self.F(v - C.T @ Cv)
         shift = rho * Cv - (C @ Fv) / self.spectrum.norm
-        return np.asarray(Fv / self.spectrum.norm + C.T @ shift)
+        Hv: Vector = Fv / self.spectrum.norm + C.T @ shift
+        return Hv
 
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.
@@ -120,7 +135,8 @@ def projected_problem(
 
     find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
     """
-    F = Product(qp.P, qp.q.size)
+    on_ranks = isinstance(qp.q, DistributedVector)
+    F = CountedProduct(qp.P) if on_ranks else Product(qp.P, qp.q.size)
     rows = equality_rows(qp.A, qp.b, boxed(qp))
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     return _normalised(qp, F, rows, spectrum)
@@ -138,7 +154,9 @@ def prepared_problem(qp: QP, steps: int) -> Projected:
     return Projected(F, rows, spectrum, b, bounds, qp.q, diagonal)
 
 
-def _normalised(qp: QP, F: Product, rows: Rows, spectrum: Spectrum) -> Projected:
+def _normalised(
+    qp: QP, F: Product | CountedProduct, rows: Rows, spectrum: Spectrum
+) -> Projected:
     diagonal = _diagonal(qp)
     spectrum = _not_vanishing(spectrum, diagonal)
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q

@@ -20,18 +20,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
-from scipy.sparse import csc_matrix, csr_array, diags_array, issparse
+from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
 from harness import Matrix, Vector, too_large
+from harness.distributed import DistributedColumns
 from solvers.smalbe import compiled
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
+
+SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
@@ -83,7 +86,8 @@ class Rows(ABC):
 
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
-        return np.asarray(v - self.C.T @ (self.C @ v))
+        projected: Vector = v - self.C.T @ (self.C @ v)
+        return projected
 
     @abstractmethod
     def error(self, nu: Vector, Cnu: Vector) -> Vector:
@@ -125,7 +129,7 @@ class DenseRows(Rows):
 class SparseRows(Rows):
     """Sparse, independent equality rows, of which GGᵀ is factorised."""
 
-    unit: csr_array  #: (r, n) the rows of G divided by their norms
+    unit: SparseColumns  #: (r, n) the rows of G divided by their norms
     gram: csc_matrix  #: (r, r) of these
     factor: Factor  #: of their Gram matrix
     bordered: _Bordered | None  #: None where most rows touch bounded components
@@ -150,8 +154,8 @@ class SparseRows(Rows):
         """Return solves with G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
         if self.bordered is not None:
             return self.bordered.solver(~free, shift)
-        held = self.unit[:, np.flatnonzero(~free)]
-        factor = self.factor.cholesky(_csc((1 + shift) * self.gram - held @ held.T))
+        held = _gram(self.unit, ~free)
+        factor = self.factor.cholesky(_csc((1 + shift) * self.gram - held))
         return lambda t: np.asarray(factor(t))
 
 
@@ -166,18 +170,14 @@ class _Bordered:
     order: NDArray[np.int64]  #: (r,) rows, those of c last
     factor: Factor  #: of S in that order
     L_cc: NDArray[np.float64]
-    touching: csc_matrix  #: G_c (c, n)
+    touching: SparseColumns  #: G_c (c, n)
 
     def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
         """Return solves with (1 + shift)S − G_H G_Hᵀ."""
-        G_H, L_cc, n = (
-            self.touching[:, np.flatnonzero(held)],
-            self.L_cc,
-            self.order.size,
-        )
+        L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
         schur = cho_factor(
-            scale * (L_cc @ L_cc.T) - (G_H @ G_H.T).toarray(), lower=True
+            scale * (L_cc @ L_cc.T) - _gram(self.touching, held).toarray(), lower=True
         )
 
         def solve(t: Vector) -> Vector:
@@ -191,9 +191,8 @@ class _Bordered:
         return solve
 
 
-def _bordered(unit: csr_array, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
-    last = np.zeros(gram.shape[0], dtype=bool)
-    last[csc_matrix(unit[:, np.flatnonzero(bounded)]).indices] = True
+def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
+    last = _gram(unit, bounded).diagonal() > 0
     c, rest = np.flatnonzero(last), np.flatnonzero(~last)
     if c.size > MOST_BORDER:
         return None
@@ -204,7 +203,10 @@ def _bordered(unit: csr_array, gram: csc_matrix, bounded: Mask) -> _Bordered | N
     factor = analyze(S, ordering_method="natural", use_long=False)
     factor.cholesky_inplace(S)
     L_cc = factor.L()[rest.size :, rest.size :].toarray()
-    return _Bordered(order, factor, L_cc, csc_matrix(unit[c]))
+    touching = unit[c]
+    if not isinstance(touching, DistributedColumns):
+        touching = csc_array(touching)
+    return _Bordered(order, factor, L_cc, touching)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +268,7 @@ class PenaltyModel:
 class _Factored:
     """C = L⁻¹G of normalised rows G (r, n) with the Cholesky factor L of GGᵀ."""
 
-    unit: csr_array
+    unit: SparseColumns
     factor: Factor
 
     def __len__(self) -> int:
@@ -285,7 +287,8 @@ class _FactoredTransposed:
     C: _Factored
 
     def __matmul__(self, a: Vector) -> Vector:
-        return np.asarray(self.C.unit.T @ _backward(self.C.factor, a))
+        found: Vector = self.C.unit.T @ _backward(self.C.factor, a)
+        return found
 
 
 def _forward(factor: Factor, t: Vector) -> Vector:
@@ -300,6 +303,8 @@ def _backward(factor: Factor, a: Vector) -> Vector:
 
 def is_sparse(G: Matrix) -> bool:
     """Whether rows G (m, n) are too many to be held as an array."""
+    if isinstance(G, DistributedColumns):
+        return True
     return bool(issparse(G) and G.shape[0] * G.shape[1] > MOST_DENSE)
 
 
@@ -318,22 +323,25 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    rows = sparse_rows(csr_array(G), e, bounded)
+    of_ranks = isinstance(G, DistributedColumns)
+    rows = sparse_rows(G if of_ranks else csr_array(G), e, bounded)
     if rows is not None:
         return rows
+    if of_ranks:
+        raise ValueError("the equality rows depend on each other")
     m, n = G.shape
     if reason := too_large(max(m, n), 3 * min(m, n) / max(m, n)):
         raise ValueError(f"the equality rows depend on each other, and {reason}")
     return orthonormal_rows(G, e)
 
 
-def sparse_rows(G: csr_array, e: Vector, bounded: Mask) -> SparseRows | None:
+def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
     """Factorise GGᵀ of sparse G (m, n); None where rows depend on each other."""
-    size = np.sqrt(G.multiply(G).sum(axis=1))
+    size = np.sqrt(_gram(G).diagonal())
     if not (size > 0).all():
         return None
-    unit = csr_array(diags_array(1 / size) @ G)
-    gram = _csc(unit @ unit.T)
+    unit = _scaled(1 / size, G)
+    gram = _csc(_gram(unit))
     factor = analyze(gram, use_long=False)
     try:
         factor.cholesky_inplace(gram)
@@ -348,6 +356,21 @@ def sparse_rows(G: csr_array, e: Vector, bounded: Mask) -> SparseRows | None:
         multipliers=lambda a: _backward(factor, a) / size,
         unit=unit, gram=gram, factor=factor, bordered=_bordered(unit, gram, bounded),
     )  # fmt: skip
+
+
+def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
+    """Return G_F G_Fᵀ of the columns F (n,), or of all."""
+    if isinstance(G, DistributedColumns):
+        return G.gram(columns)
+    part = G if columns is None else G[:, np.flatnonzero(columns)]
+    return csc_array(part @ part.T)
+
+
+def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
+    """Multiply row i with s[i]."""
+    if isinstance(G, DistributedColumns):
+        return G.scaled(s)
+    return csr_array(diags_array(s) @ G)
 
 
 def _csc(M: Matrix) -> csc_matrix:

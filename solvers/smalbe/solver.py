@@ -49,6 +49,8 @@ class SMALBE(Options):
         ),
     )  # fmt: skip
 
+    on_ranks: ClassVar[bool] = True  #: see `harness.processes.ranks`
+
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
             return "takes bounds and equality rows; dualise inequality rows first"

@@ -366,6 +366,7 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
     assert told["not_measured"] == []
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):

@@ -63,6 +63,10 @@ SHORTER = {
         "mortarbench run suites/scaling.toml --case '*Nr=[468]/*/dual' --repeats 1 "
         "--solver smalbe"
     ),
+    "mortarbench run suites/scaling-feti.toml": (
+        "mortarbench run suites/scaling-feti.toml --case 'membranes/S=[24]/*' "
+        "--repeats 1"
+    ),
     "mortarbench run suites/fleet.toml": (
         "mortarbench run suites/fleet.toml --case '*Nr=4/Nh=3/dual' --solver pdas"
     ),

@@ -31,6 +31,7 @@ def test_its_records_are_those_that_were_written(old):
     assert {r.solver for r in records} == {"smalbe", "osqp", "clarabel", "proxqp"}
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_it_is_reported_on(old, capsys):
     assert command("report", old, "--format", "md,csv") == 0
     assert "beam-ring/Nr=4/Nh=3/step=1/dual" in (old / "report/report.md").read_text()

@@ -267,6 +267,7 @@ def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, pag
 
 
 @pytest.mark.parametrize("damaged", [False, True])
+@pytest.mark.usefixtures("only_svg")
 def test_the_journal_alone_makes_a_report(measured, tmp_path, damaged):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured(fields="0123456789abcdef"))
@@ -325,6 +326,7 @@ def test_words_begin_at_the_left_in_every_medium(measured, page):
     assert [words.wordy(i) for i in range(2)] == [False, True]
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_a_wide_table_says_that_it_scrolls_and_keeps_its_first_column(
     measured, tmp_path
 ):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import harness.verify.measure
-from harness import Status
+from harness import QP, Solution, Status, needs_matrices, no_rows
+from harness.operators import SerialisableOperator
 from harness.registry import load_plugin
 from harness.verify.measure import measure
 from tests.support import ADVERSARIES
@@ -163,6 +164,51 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
 
     assert asked == [1]  # the clock had been read once
     assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked
+
+
+class ReadsEntries:
+    """Takes its x from the entries of P."""
+
+    def declines(self, qp):
+        return needs_matrices(qp)
+
+    def prepare(self, qp, tol):
+        x = np.linalg.solve(qp.P, -qp.q)
+        return lambda: Solution(
+            status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0),
+            z_box=np.zeros(qp.q.size),
+        )  # fmt: skip
+
+
+@pytest.fixture
+def by_products():
+    """½xᵀPx − Σx with P = diag(1, 2, 4), known by its products."""
+    free = np.full(3, np.inf)
+    makers = {"matrix": lambda arrays: lambda x: arrays["P"] @ x}
+    arrays = {"P": np.diag([1.0, 2.0, 4.0])}
+    return QP(
+        P=SerialisableOperator(3, "matrix", arrays, makers),
+        q=-np.ones(3), A=no_rows(3), b=np.zeros(0), G=no_rows(3), h=np.zeros(0),
+        lb=-free, ub=free,
+    )  # fmt: skip
+
+
+def test_a_small_operator_is_multiplied_out_for_who_needs_its_entries(by_products):
+    s = measure(ReadsEntries(), by_products, 1e-6).solution
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx([1, 1 / 2, 1 / 4])
+
+
+def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
+    monkeypatch.setattr(harness.verify.measure, "MOST_ASSEMBLED", 2)
+    s = measure(ReadsEntries(), by_products, 1e-6).solution
+
+    assert s.status is Status.DECLINED
+    assert s.message == (
+        "needs explicit matrices; P is an operator of 3 rows, and is multiplied out up "
+        "to 2 where memory allows"
+    )
 
 
 def test_processes_of_runs_import_nothing_that_they_never_call():

@@ -9,6 +9,7 @@ from harness import InputError, Status, kkt_residuals
 from harness.names import parse
 from harness.verify.verdicts import certified
 from problems import PROBLEMS
+from problems.models import beam_ring
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT
@@ -54,6 +55,7 @@ master = "upper bottom"
 COULOMB = "friction=coulomb/mu=0.3"
 CASES = [
     ("beam-ring/Nr=2/Nh=2/steps=1", "feti=2"),
+    ("beam-ring/Nr=3/Nh=2/steps=2/contact=mortar", "feti=4"),
     ("contact-patch/lower=4/upper=6", "feti=2"),
     (f"contact-patch/lower=4/upper=6/{COULOMB}", "feti=2"),
     ("hertz-plane/n=2", "feti=5"),
@@ -94,6 +96,17 @@ def check(name, cut, glue):
 @pytest.mark.parametrize(("name", "cut"), CASES)
 def test_the_displacement_is_that_of_the_bodies_in_one_piece(name, cut, glue):
     check(name, cut, glue)
+
+
+def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
+    def refused(*_: object) -> None:
+        raise AssertionError("a factor of the whole")
+
+    monkeypatch.setattr(beam_ring, "clamped", refused)
+    monkeypatch.setattr(beam_ring, "floating", refused)
+    case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
+    s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
+    assert certified(case, s)[0]["energy_bound"] <= 1e-5
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.linalg import block_diag
-from scipy.sparse import csc_array, eye_array
+from scipy.linalg import block_diag, null_space
+from scipy.sparse import csc_array, csr_array, eye_array
 
 from harness import QP, no_rows
 from harness.files.qpfile import load_qp, save_qp
@@ -15,7 +15,7 @@ from problems import OPERATORS
 from problems.contact.linearise import linearisation
 from problems.duality.stepping import primal_qp
 from problems.feti.elastic import subdivide, torn
-from problems.feti.operators import dual_operator, made
+from problems.feti.operators import dual_operator, inverted_blocks, made
 from problems.feti.tearing import blocks
 from problems.models.beam_ring import model
 from problems.models.membranes import Membranes
@@ -188,6 +188,28 @@ def test_preconditioners_are_what_they_are_defined_to_be(pair, kind, scaling):
     MB = M(B)
     assert_allclose(B.T @ MB, expected, atol=3e-7 * abs(expected).max())
     assert_allclose(M(B[:, 0]), MB[:, 0], atol=1e-6 * abs(MB).max())
+
+
+def test_preconditioners_add_nothing_that_redundant_rows_do_not_feel():
+    pair = membranes("redundant")
+    _, B, _ = dense(pair)
+    deaf = null_space(B.T)
+    M = operator_of(pair).build().preconditioner("dirichlet", "stiffness")
+
+    assert deaf.shape[1] == 2 * 3  # six rows of four copies, of rank three
+    assert_allclose(deaf.T @ M(np.eye(len(B))), 0, atol=1e-13)
+
+
+def test_small_blocks_are_inverted_as_moore_and_penrose_do():
+    rng = np.random.default_rng(8)
+    of_rank_one = np.outer([1.0, -2.0, 3.0], [1.0, -2.0, 3.0])
+    regular = np.diag([2.0, 3.0]) + 1
+    M = block_diag(of_rank_one, [[5.0]], regular, 2 * of_rank_one, [[7.0]])
+    turn = rng.permutation(len(M))
+    M = M[turn][:, turn]
+
+    found = inverted_blocks(csr_array(M)).toarray()
+    assert_allclose(found, np.linalg.pinv(M), atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", KINDS)

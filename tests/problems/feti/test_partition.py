@@ -7,7 +7,7 @@ from scipy.sparse.csgraph import connected_components
 from harness import InputError
 from problems.fem.mesh import half_disc, join, rectangle
 from problems.feti import partition
-from problems.feti.partition import graph_partition
+from problems.feti.partition import graph_partition, neighbours
 
 
 def disc_and_block():
@@ -18,7 +18,7 @@ def disc_and_block():
 @pytest.mark.parametrize("parts", [2, 3, 7, 30, 100])
 def test_parts_are_connected_of_one_body_and_about_equal(parts):
     mesh, body = disc_and_block()
-    label = graph_partition(mesh.cells, body, parts)
+    label = graph_partition(mesh.points, mesh.cells, body, parts)
     sizes = np.bincount(label)
 
     assert sizes.size == parts
@@ -26,17 +26,18 @@ def test_parts_are_connected_of_one_body_and_about_equal(parts):
     assert sizes.max() <= 1.6 * len(body) / parts + 3
     for s in range(parts):
         assert np.unique(body[label == s]).size == 1
-        graph = partition._neighbours(mesh.cells[label == s])
+        graph = neighbours(mesh.points, mesh.cells[label == s])
         assert connected_components(graph)[0] == 1
     assert (np.diff([body[label == s][0] for s in range(parts)]) >= 0).all()
-    assert np.array_equal(label, graph_partition(mesh.cells, body, parts))
+    assert np.array_equal(label, graph_partition(mesh.points, mesh.cells, body, parts))
 
 
 def test_cells_are_neighbours_where_they_share_an_edge():
     """A 2 × 2 grid, and a triangle that touches it in one node only."""
     cells = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7],
                       [8, 9, 10, 10]])  # fmt: skip
-    graph = partition._neighbours(cells).toarray() > 0
+    points = np.random.default_rng(314159).standard_normal((11, 2))
+    graph = neighbours(points, cells).toarray() > 0
     pairs = {tuple(pair) for pair in np.argwhere(graph).tolist() if pair[0] < pair[1]}
 
     assert pairs == {(0, 1), (0, 2), (1, 3), (2, 3)}
@@ -44,7 +45,7 @@ def test_cells_are_neighbours_where_they_share_an_edge():
 
 def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
     strip = rectangle((0.0, 0.0), (6.0, 1.0), (6, 1))
-    graph = partition._neighbours(strip.cells)
+    graph = neighbours(strip.points, strip.cells)
     label = partition._connected(graph, np.array([0, 0, 1, 1, 1, 0]))
 
     assert label.tolist() == [0, 0, 1, 1, 1, 1]
@@ -53,7 +54,7 @@ def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
 def test_cells_that_hang_together_in_a_node_are_no_body():
     cells = np.array([[0, 1, 4, 3], [4, 5, 8, 7], [9, 10, 12, 11], [11, 12, 14, 13]])
     with pytest.raises(InputError, match="do not all hang together by edges"):
-        graph_partition(cells, np.array([0, 0, 1, 1]), 2)
+        graph_partition(np.eye(15)[:, :2], cells, np.array([0, 0, 1, 1]), 2)
 
 
 @pytest.mark.parametrize("parts", [1, 200])
@@ -62,4 +63,14 @@ def test_too_few_and_too_many_parts_are_refused(parts):
     with pytest.raises(
         InputError, match=rf"parts={parts} of 2 bodies .* expected 2 to"
     ):
-        graph_partition(mesh.cells, body, parts)
+        graph_partition(mesh.points, mesh.cells, body, parts)
+
+
+def test_parts_of_long_and_thin_cells_are_compact():
+    """A square of 8 × 128 cells: parts with the fewest edges are 16 times as long."""
+    mesh, body = rectangle((0.0, 0.0), (1.0, 1.0), (8, 128)), np.zeros(1024, dtype=int)
+    label = graph_partition(mesh.points, mesh.cells, body, 16)
+    corners = mesh.points[mesh.cells]
+    boxes = [np.ptp(corners[label == s].reshape(-1, 2), axis=0) for s in range(16)]
+
+    assert np.median([max(box) / min(box) for box in boxes]) <= 4

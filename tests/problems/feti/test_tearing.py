@@ -129,9 +129,10 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     kinds = tuple(elastic_kind(part, D, E) for part in parts.parts)
     held = 2 * mesh.boundaries["left"]
     pair = glue(
-        parts, kinds, load=np.arange(1.0, n + 1), contact=csr_array((0, n)),
+        parts, kinds, load=np.arange(1.0, n + 1),
+        contact=csr_array(eye_array(n, format="csr")[held[:1]]), c=np.ones(1),
         supports=csr_array(eye_array(n, format="csr")[held]),
-        supported=np.zeros(held.size), c=np.zeros(0), E=np.ones(len(mesh.points)),
+        supported=np.zeros(held.size), E=np.ones(len(mesh.points)),
     )  # fmt: skip
     found = without_supports(pair, held)
     first, second = (found.kinds[k] for k in found.kind)
@@ -139,7 +140,8 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     assert abs(first.K @ first.R).max() < 1e-13
     assert_allclose(first.R.T @ first.R, [[1.0]])
     assert abs(first.R[first.fixing]).min() > 0.1
-    assert found.equalities == pair.equalities - held.size == found.B.shape[0]
+    assert found.equalities == pair.equalities - held.size
+    assert found.B.shape[0] == found.c.size == found.equalities + 1  # the contact row
     u = np.arange(n) ** 0.5
     u[held] = 0
     assert_allclose(found.spread @ u, (pair.spread @ u)[pair.spread @ u != 0])

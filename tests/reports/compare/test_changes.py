@@ -167,6 +167,7 @@ def test_cells_that_resolve_nothing_are_counted_apart(changed):
     assert "0 slower, 0 faster, 1 no change seen, 1 not resolved" in said
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_a_folder_has_nothing_to_say_about_itself(tmp_path):
     with Journal(tmp_path / "a", "j") as journal:
         for r in suite(1, cases=2, repeats=2):
@@ -287,6 +288,7 @@ def test_another_version_on_the_same_machine_is_what_one_compares(folders):
     assert any("two: 1.5" in line and "slower" in line for line in said)
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folders):
     other = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     after = suite(2, cases=4, repeats=3, one=9.0, two=9.0, three=9.0)
@@ -302,6 +304,7 @@ def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folder
     assert "~~" in (b / "report/against-a/report.md").read_text()  # struck out
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
     busy = HERE | {"now": {"load": 3.0}}
     a, b = folders(HERE, busy)

@@ -141,6 +141,19 @@ def test_a_winner_over_cases_takes_both_the_interval_and_the_test_of_all_pairs(
     assert why in claim
 
 
+def test_where_few_of_many_cases_were_solved_no_ratio_over_cases_is_told(
+    record, opened
+):
+    """As where a sequence was asked for more steps than there were."""
+    records = [
+        record(s, k, 0.01, **({} if k < 4 else {"verdict": Verdict.DECLINED}))
+        for k in range(9) for s in "ab"
+    ]  # fmt: skip
+    (claim,) = opened(records)["dual"].claims
+    assert "over 9 cases" not in claim
+    assert "was the fastest" not in claim
+
+
 @pytest.mark.parametrize(
     "cases", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 7))]
 )
@@ -440,6 +453,7 @@ def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
     assert r"\item[{dual}] fast was the fastest" in tex
 
 
+@pytest.mark.usefixtures("only_svg")
 def test_plain_sentences_are_those_of_the_report(record, tmp_path):
     with Journal(tmp_path, "test") as journal:
         for r in one_case(record, fast=1.0, slow=2.0):

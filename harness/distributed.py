@@ -1,0 +1,267 @@
+"""Vectors that are spread over the processes of one solve, the *ranks* of MPI.
+
+Every rank runs the same code on its own slice. What acts on each component alone needs
+no other rank; what reduces a vector to a number reduces it over all of them, and all
+ranks get the same number, so that they take the same branches. An algorithm that is
+written with NumPy's vectors therefore runs on ranks as it is written:
+
+    x + alpha*p, np.where(free, g, 0)   on each slice
+    x @ y, v.max(), moves.any()         over all ranks
+
+Whatever else is asked of a `DistributedVector` is refused, rather than answered with
+the slice alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, diags_array
+
+from harness.qp import QP
+from harness.solution import Solution
+
+if TYPE_CHECKING:
+    from mpi4py.MPI import Comm
+
+FEW = 64  #: numbers that are added in the order of the ranks
+
+
+@dataclass(frozen=True, eq=False)
+class Ranks:
+    """The processes of one solve, and what they have spent on one another."""
+
+    comm: Comm
+    #: s, by what was done, see `clocked`
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        return int(self.comm.size)
+
+    @property
+    def rank(self) -> int:
+        """Which one this process is, from 0 on."""
+        return int(self.comm.rank)
+
+    def total(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Add arrays of one shape over all ranks; every rank gets the same sum."""
+        part = np.ascontiguousarray(part, dtype=float)
+        with self.clocked("reduction"):
+            if part.size <= FEW:
+                parts = np.empty((self.size, *part.shape))
+                self.comm.Allgather(part, parts)
+                return np.asarray(parts.sum(axis=0))
+            found = np.empty_like(part)
+            self.comm.Allreduce(part, found)
+            return found
+
+    def extreme(self, value: float, pick: Callable[[Any], Any]) -> float:
+        """Pick the least or largest number of all ranks."""
+        with self.clocked("reduction"):
+            values = np.empty(self.size)
+            self.comm.Allgather(np.array([value], dtype=float), values)
+        return float(pick(values))
+
+    def exchanged(
+        self,
+        out: NDArray[np.float64],
+        sizes: NDArray[np.int64],
+        coming: NDArray[np.int64],
+    ) -> NDArray[np.float64]:
+        """Send consecutive parts to all ranks, and return what comes from them.
+
+        sizes, coming : (size,) of what goes to each and of what comes from each
+        """
+        found = np.empty(int(coming.sum()))
+        starts = np.cumsum(sizes) - sizes, np.cumsum(coming) - coming
+        self.comm.Alltoallv(
+            [np.ascontiguousarray(out), (sizes, starts[0])],
+            [found, (coming, starts[1])],
+        )
+        return found
+
+    @contextmanager
+    def clocked(self, what: str) -> Iterator[None]:
+        """Note how long something takes."""
+        start = perf_counter()
+        try:
+            yield
+        finally:
+            took = perf_counter() - start
+            self.seconds[what] = self.seconds.get(what, 0.0) + took
+
+
+class DistributedVector(np.ndarray):
+    """The slice (n_rank,) of a vector that this rank holds; reductions are of all.
+
+    Raises
+    ------
+    TypeError
+        For what is neither done component by component nor one of the reductions sum,
+        min, max, any, all, dot product, norm and count.
+
+    """
+
+    ranks: Ranks
+
+    def __array_finalize__(self, obj: Any) -> None:
+        if isinstance(obj, DistributedVector):
+            self.ranks = obj.ranks
+
+    def dot(self, other: Any) -> Any:  # type: ignore[override]  # no `out`
+        """Return the dot product over all ranks."""
+        return self @ other
+
+    def _refused(self, *args: Any, **kwargs: Any) -> Any:
+        raise TypeError("this method of a distributed vector would see its slice only")
+
+    argmax = argmin = argpartition = argsort = cumprod = cumsum = mean = _refused
+    partition = prod = sort = std = trace = var = searchsorted = tofile = _refused
+
+    def __array_ufunc__(
+        self, ufunc: np.ufunc, method: str, *inputs: Any, **how: Any
+    ) -> Any:
+        plain = [_slice(i) for i in inputs]
+        if ufunc is np.matmul:
+            return _contracted(self.ranks, *plain)
+        if method == "__call__":
+            if "out" in how:
+                how["out"] = tuple(_slice(out) for out in how["out"])
+            return _again(self.ranks, getattr(ufunc, method)(*plain, **how))
+        if method == "reduce" and ufunc in _REDUCTIONS:
+            return _REDUCTIONS[ufunc](self.ranks, ufunc.reduce(*plain, **how))
+        raise TypeError(f"{ufunc.__name__}.{method} of a distributed vector")
+
+    def __array_function__(
+        self, function: Any, types: Any, args: Any, kwargs: Any
+    ) -> Any:
+        plain = [_slice(a) for a in args]
+        if function is np.linalg.norm and len(args) == 1 and not kwargs:
+            return np.sqrt(float(_contracted(self.ranks, plain[0], plain[0])))
+        if function is np.count_nonzero:
+            return int(self.ranks.total(np.array([np.count_nonzero(plain[0])]))[0])
+        if function in _COMPONENTWISE:
+            return _again(self.ranks, function(*plain, **kwargs))
+        raise TypeError(f"{function.__name__} of a distributed vector")
+
+
+def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
+    """Take an array (n_rank,) for this rank's slice of a vector."""
+    found = np.ascontiguousarray(part).view(DistributedVector)
+    found.ranks = ranks
+    return found
+
+
+def _slice(value: Any) -> Any:
+    return np.asarray(value) if isinstance(value, DistributedVector) else value
+
+
+def _again(ranks: Ranks, found: Any) -> Any:
+    if isinstance(found, tuple):
+        return tuple(_again(ranks, f) for f in found)
+    return distributed(found, ranks) if np.ndim(found) == 1 else found
+
+
+def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
+    """Multiply (n,) or (k, n) with (n,) or (n, k), summed over all ranks."""
+    found = ranks.total(np.atleast_1d(a @ b))
+    return found if np.ndim(a) + np.ndim(b) > 2 else float(found[0])
+
+
+@dataclass(frozen=True, eq=False)
+class DistributedColumns:
+    """A sparse matrix G (r, n) of whose columns each rank holds a slice.
+
+    Vectors (r,) are the same on all ranks: r is the size of a coarse problem.
+    """
+
+    part: csr_array  #: (r, n_rank)
+    ranks: Ranks
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, and columns of this rank."""
+        rows, columns = self.part.shape
+        return rows, columns
+
+    @property
+    def T(self) -> _DistributedRows:
+        """Gᵀ, which takes (r,) to this rank's slice of (n,)."""
+        return _DistributedRows(self)
+
+    def __matmul__(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
+        return self.ranks.total(self.part @ np.asarray(v))
+
+    def __abs__(self) -> DistributedColumns:
+        return DistributedColumns(abs(self.part), self.ranks)
+
+    def scaled(self, s: NDArray[np.float64]) -> DistributedColumns:
+        """Multiply row i with s[i]."""
+        return DistributedColumns(csr_array(diags_array(s) @ self.part), self.ranks)
+
+    def __getitem__(self, rows: NDArray[np.int64]) -> DistributedColumns:
+        return DistributedColumns(csr_array(self.part[rows]), self.ranks)
+
+    def gram(self, columns: NDArray[np.bool_] | None = None) -> csc_array:
+        """Return G_F G_Fᵀ (r, r) of some columns F, or of all."""
+        part = self.part
+        if columns is not None:
+            part = part[:, np.flatnonzero(np.asarray(columns))]
+        with self.ranks.clocked("coarse"):
+            return csc_array(sum(self.ranks.comm.allgather(csc_array(part @ part.T))))
+
+
+@dataclass(frozen=True, eq=False)
+class _DistributedRows:
+    columns: DistributedColumns
+
+    def __matmul__(self, y: NDArray[np.float64]) -> DistributedVector:
+        return distributed(self.columns.part.T @ y, self.columns.ranks)
+
+
+class Share(NamedTuple):
+    """What one rank has of a QP that is solved on several."""
+
+    qp: QP  #: vectors are distributed, A has distributed columns, b is on every rank
+    #: gathers a solution of it on rank 0; None on the others
+    whole: Callable[[Solution], Solution | None]
+
+
+@runtime_checkable
+class Distributable(Protocol):
+    """A product x ↦ Px that can be done by several ranks.
+
+    What puts an operator together may return one (`harness.operators`).
+    """
+
+    @property
+    def parts(self) -> int:
+        """How many parts there are, the most ranks that can share them."""
+
+    def share(self, qp: QP, ranks: Ranks) -> Share:
+        """Take this rank's share of a `qp` with this P; called by all ranks.
+
+        Raises
+        ------
+        InputError
+            When there are more ranks than parts.
+
+        """
+
+
+_REDUCTIONS: Mapping[np.ufunc, Callable[[Ranks, Any], Any]] = {
+    np.add: lambda ranks, part: type(part)(ranks.total(np.array([part]))[0]),
+    np.minimum: lambda ranks, part: ranks.extreme(part, np.min),
+    np.maximum: lambda ranks, part: ranks.extreme(part, np.max),
+    np.logical_or: lambda ranks, part: bool(ranks.extreme(part, np.max)),
+    np.logical_and: lambda ranks, part: bool(ranks.extreme(part, np.min)),
+}
+_COMPONENTWISE = frozenset({np.where, np.clip, np.zeros_like, np.empty_like, np.copy})

@@ -1,0 +1,44 @@
+"""Whether, and on how many processes of MPI, a solve can run: its ranks."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+from harness.errors import InputError, shown
+
+MOST_RANKS = 4096
+MISSING = (
+    "needs mpi4py and an mpiexec; expected `pip install 'mortarbench[mpi]'`, or an MPI "
+    "of the system with an mpi4py that was built for it"
+)
+
+
+def mpiexec() -> str | None:
+    """Find what starts ranks, beside this Python or on the path; None without MPI."""
+    if find_spec("mpi4py") is None:
+        return None
+    beside = Path(sys.executable).with_name("mpiexec")
+    return str(beside) if beside.is_file() else shutil.which("mpiexec")
+
+
+def ranks_asked(count: object, where: str) -> int:
+    """Check a number of ranks, and that they can be started here if there are several.
+
+    where : what asks, for the message
+
+    Raises
+    ------
+    InputError
+        When it is no number from 1 on, or there is no MPI.
+
+    """
+    if type(count) is not int or not 1 <= count <= MOST_RANKS:
+        raise InputError(
+            f"{where} = {shown(count)}; expected a number of ranks, 1 to {MOST_RANKS}"
+        )
+    if count > 1 and mpiexec() is None:
+        raise InputError(f"{where} = {count} {MISSING}")
+    return count

@@ -1,0 +1,222 @@
+"""A worker on several ranks of MPI, and the process that starts them.
+
+`launch` is what runs start in place of a worker: it has `mpiexec` start the worker as
+so many processes, which inherit the pipes to the parent. Rank 0 is the worker of
+`harness.processes.worker`, and speaks with the parent; the others follow it. Each rank
+has a CPU to itself while there are enough. What all of them hold together counts for
+the limit of memory, and all of them end with any of them.
+
+A solver that can run so says `on_ranks = True`: its `prepare` is called on every rank
+with that rank's share of the QP (`harness.distributed.Share`), and every rank comes to
+the same solution, in slices.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness.distributed import Distributable, Ranks, Share
+from harness.files.qpfile import load_qp
+from harness.mpi import MISSING, mpiexec
+from harness.operators import Maker, SerialisableOperator
+from harness.plugin import Solver
+from harness.qp import QP
+from harness.solution import Solution
+from harness.verify.measure import memory_mib
+
+_ORDER = 7  #: tag of what rank 0 tells the others to do
+_IDLE_SECONDS = 2e-4  #: between two looks for an order
+_ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others to fail, too
+#: how a rank tells `launch` its process, and how mpiexec tells which one ended, and why
+_STARTED = re.compile(r"rank (\d+) is process (\d+)$")
+_ENDED = re.compile(r"PID (\d+) RUNNING")
+_WHY = re.compile(r"EXIT STRING: (.*)$")
+
+
+def launch(ranks: int, command: Sequence[str]) -> int:
+    """Start `command` on so many ranks, wait until they have ended, and say how.
+
+    The last two words of the command are file descriptors, which the ranks inherit.
+    """
+    start, fds = mpiexec(), tuple(map(int, command[-2:]))
+    if start is None:
+        print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
+        return 1
+    with suppress(
+        OSError
+    ):  # ours is one CPU, that of a worker; our parent has the rest
+        usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
+        os.sched_setaffinity(0, usable)
+    process = subprocess.Popen(
+        [start, "-n", str(ranks), *command], pass_fds=fds, stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+    )  # fmt: skip
+    for fd in fds:
+        os.close(fd)
+    said, which, why = "", "", ""
+    rank_of: dict[str, str] = {}
+    assert process.stdout is not None
+    for line in process.stdout:
+        if match := _STARTED.match(line):
+            rank_of[match[2]] = match[1]
+            continue
+        if line.startswith("rank "):
+            said = line.strip()
+        elif match := _ENDED.search(line):
+            which = rank_of.get(match[1], "")
+        elif match := _WHY.search(line):
+            why = match[1].strip()
+        sys.stderr.write(line)
+        sys.stderr.flush()
+    code = process.wait()
+    if code:
+        one = f"rank {which}" if which else "one"
+        ended = f"{one} of {ranks} ranks ended: {why or f'mpiexec says {code}'}"
+        print(said or ended, file=sys.stderr)
+    return 1 if code else 0
+
+
+def this_rank() -> Ranks:
+    """Join the other ranks, on a CPU of our own if there is one for each."""
+    from mpi4py import MPI  # late: whoever starts no ranks needs none
+
+    ranks = Ranks(MPI.COMM_WORLD)
+    cpus = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cpus[ranks.rank % len(cpus)]})
+    print(f"rank {ranks.rank} is process {os.getpid()}", file=sys.stderr, flush=True)
+    return ranks
+
+
+def follow(
+    solver: Solver,
+    ranks: Ranks,
+    operators: Mapping[str, Maker],
+    limit: Callable[[float | None], None],
+) -> None:
+    """Do on this rank what rank 0 orders, until it orders nothing more.
+
+    limit : limits the memory of this process, in MiB
+    """
+    run: Callable[[], Solution] | None = None
+    share: Share | None = None
+    while (order := _next_order(ranks)) is not None:
+        try:
+            if "qp" in order:
+                qp, _ = load_qp(Path(order["qp"]), operators=operators)
+                limit(order["memory_limit"])
+                share = _share(qp, ranks)
+                run = solver.prepare(share.qp, order["tol"])
+            elif run is not None and share is not None:
+                _whole(run(), share, ranks)
+        except BaseException as e:
+            if _ordered(ranks, _ALONE_SECONDS):
+                continue  # rank 0 has failed alike, and says so
+            traceback.print_exc()
+            what = " ".join(f"{type(e).__name__}: {e}".split())
+            print(f"rank {ranks.rank} of {ranks.size}: {what}", file=sys.stderr)
+            sys.stderr.flush()
+            ranks.comm.Abort(1)
+
+
+def _next_order(ranks: Ranks) -> dict[str, Any] | None:
+    _ordered(ranks, np.inf)
+    order: dict[str, Any] | None = ranks.comm.recv(source=0, tag=_ORDER)
+    return order
+
+
+def _ordered(ranks: Ranks, seconds: float) -> bool:
+    """Wait for an order without keeping a CPU busy; whether one came."""
+    deadline = time.monotonic() + seconds
+    while not ranks.comm.iprobe(source=0, tag=_ORDER):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(_IDLE_SECONDS)
+    return True
+
+
+class OnRanks:
+    """A solver on rank 0, which has the others do their share."""
+
+    def __init__(self, solver: Solver, ranks: Ranks) -> None:
+        self._solver = solver
+        self._ranks = ranks
+        self._path = Path()
+        self._memory_limit: float | None = None
+
+    def takes(self, path: Path, memory_limit: float | None) -> None:
+        """Say in which file the next QP is."""
+        self._path, self._memory_limit = path, memory_limit
+
+    def end(self) -> None:
+        """Let the others end."""
+        self._order(None)
+
+    def declines(self, qp: QP) -> str | None:
+        """Decline what cannot be shared, besides what the solver declines."""
+        if not getattr(self._solver, "on_ranks", False):
+            return "runs in one process only; expected --mpi 1, or smalbe"
+        product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
+        if not isinstance(product, Distributable):
+            return "P cannot be shared by ranks; expected a case with feti, form dual"
+        if product.parts < self._ranks.size:
+            return (
+                f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "
+                "most one rank for each"
+            )
+        return self._solver.declines(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        """Prepare on all ranks."""
+        order = {
+            "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+        }  # fmt: skip
+        self._order(order)
+        self._ranks.seconds.clear()
+        share = _share(qp, self._ranks)
+        run = self._solver.prepare(share.qp, tol)
+
+        def solve() -> Solution:
+            self._order({})
+            found = _whole(run(), share, self._ranks)
+            assert found is not None  # this is rank 0
+            return found
+
+        return solve
+
+    def _order(self, order: dict[str, Any] | None) -> None:
+        for rank in range(1, self._ranks.size):
+            self._ranks.comm.send(order, dest=rank, tag=_ORDER)
+
+
+def _share(qp: QP, ranks: Ranks) -> Share:
+    product = qp.P.build()
+    assert isinstance(product, Distributable)
+    return product.share(qp, ranks)
+
+
+def _whole(s: Solution, share: Share, ranks: Ranks) -> Solution | None:
+    """Gather a solution on rank 0, with what each rank has spent."""
+    found = share.whole(s)
+    told = {**ranks.seconds, "peak": memory_mib("VmHWM") or 0.0}
+    spent = ranks.comm.gather(told)
+    if found is None or spent is None:
+        return None
+    reported: dict[str, Any] = {"ranks": ranks.size}
+    for name in sorted({name for one in spent for name in one}):
+        values = [one.get(name, 0.0) for one in spent]
+        unit = "mib" if name == "peak" else "seconds"
+        reported[f"rank_{name}_{unit}_largest"] = float(np.max(values))
+        reported[f"rank_{name}_{unit}_mean"] = float(np.mean(values))
+    return replace(found, reported={**found.reported, **reported})

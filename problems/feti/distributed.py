@@ -1,0 +1,292 @@
+"""The dual of torn bodies over ranks: who holds what, and what is exchanged.
+
+A rank holds subdomains and, of every vector of multipliers, the rows that it *owns*. A
+row of B that touches subdomains of several ranks is owned by one of them, in turn; the
+others get its multiplier before they multiply, and send what they add to it:
+
+    F λ = Σ_ranks B_p K_p⁺ B_pᵀ λ
+
+Nothing of the size of the whole is anywhere: a rank has the columns of B, and the rows
+of all vectors, that its subdomains touch. Subdomains go to ranks so that these do
+alike much work and share few rows, by graph partitioning (METIS).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+
+from harness import QP, InputError, Solution, Vector, no_rows
+from harness.distributed import (
+    DistributedColumns,
+    DistributedVector,
+    Ranks,
+    Share,
+    distributed,
+)
+from harness.operators import Product
+from problems.fem.mesh import Nodes
+from problems.feti.operators import (
+    DualOperator,
+    gram_inverse,
+    touched,
+    uncoupled,
+)
+from problems.feti.torn import Dense, Subdomains
+
+
+class Parts(NamedTuple):
+    """What every rank knows of all."""
+
+    rank: NDArray[np.int64]  #: (S,) of each subdomain
+    reach: csr_array  #: (m, ranks) whether a row touches subdomains of a rank
+    owner: NDArray[np.int64]  #: (m,) rank of each row
+
+
+def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
+    """Give subdomains, and rows of B (m, N), to ranks.
+
+    Raises
+    ------
+    InputError
+        Where there are fewer subdomains than ranks.
+
+    """
+    S = domains.kind.size
+    if S < ranks:
+        raise InputError(
+            f"{ranks} ranks for {S} subdomains; expected at most one rank for each"
+        )
+    rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
+    sub = np.searchsorted(domains.start, B.indices, side="right") - 1
+    ones = np.ones(rows.size, dtype=np.int32)
+    touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
+    touches.data[:] = 1
+    rank = _balanced(touches, _work(B, domains), ranks)
+    of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
+    reach = csr_array(touches @ of_rank)
+    reach.data[:] = 1
+    turn = np.arange(B.shape[0]) % np.diff(reach.indptr)
+    return Parts(rank, reach, reach.indices[reach.indptr[:-1] + turn].astype(np.int64))
+
+
+def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
+    """Count what a product does in each subdomain: its dense block."""
+    sizes = np.array([part.size for part in touched(B, domains)])
+    return (sizes**2)[domains.kind]
+
+
+def _balanced(
+    touches: csr_array, work: NDArray[np.int64], ranks: int
+) -> NDArray[np.int64]:
+    """Partition the graph of subdomains that share rows, by work."""
+    if ranks == 1:
+        return np.zeros(work.size, dtype=np.int64)
+    import pymetis  # late: one process needs none
+
+    graph = csr_array(touches.T @ touches)
+    graph.setdiag(0)
+    graph.eliminate_zeros()
+    unit = max(int(work.min()), 1)
+    _, found = pymetis.part_graph(
+        ranks, xadj=graph.indptr, adjncy=graph.indices, eweights=graph.data,
+        vweights=work // unit, recursive=True,
+    )  # fmt: skip
+    rank = np.array(found, dtype=np.int64)
+    for idle in np.setdiff1d(np.arange(ranks), rank):  # few subdomains: each gets one
+        largest = np.bincount(rank, minlength=ranks).argmax()
+        rank[np.flatnonzero(rank == largest)[-1]] = idle
+    return rank
+
+
+@dataclass(frozen=True, eq=False)
+class Exchange:
+    """Rows that a rank touches, those it owns among them, and its neighbours' others.
+
+    Multipliers of rows of a neighbour come in the order of the rows, and what is added
+    to them goes back in it.
+    """
+
+    ranks: Ranks
+    rows: Nodes  #: (t,) all that its subdomains touch or that it owns, ascending
+    own: Nodes  #: (o,) places of the owned ones in `rows`
+    lent: Nodes  #: places in the owned ones of what others need, neighbour by neighbour
+    borrowed: Nodes  #: places in `rows` of what others own, neighbour by neighbour
+    lends: NDArray[np.int64]  #: (ranks,) how many go to each
+    borrows: NDArray[np.int64]  #: (ranks,) how many come from each
+
+    def gathered(self, x: Vector) -> Vector:
+        """Complete the owned rows (o,) to all that are touched (t,)."""
+        found = np.empty(self.rows.size)
+        found[self.own] = x
+        with self.ranks.clocked("exchange"):
+            found[self.borrowed] = self.ranks.exchanged(
+                x[self.lent], self.lends, self.borrows
+            )
+        return found
+
+    def added(self, y: Vector) -> Vector:
+        """Add up what all ranks have for the rows that this one owns (o,)."""
+        found = y[self.own]
+        with self.ranks.clocked("exchange"):
+            come = self.ranks.exchanged(y[self.borrowed], self.borrows, self.lends)
+        np.add.at(found, self.lent, come)
+        return found
+
+
+def exchange(parts: Parts, ranks: Ranks) -> Exchange:
+    """Find what this rank exchanges with the others."""
+    me = ranks.rank
+    reach, owner = parts.reach.tocsc(), parts.owner
+    reached = [
+        np.sort(reach.indices[reach.indptr[r] : reach.indptr[r + 1]])
+        for r in range(ranks.size)
+    ]
+    rows = reached[me]
+    mine = np.flatnonzero(owner == me)
+    lent = [
+        np.searchsorted(mine, theirs[owner[theirs] == me]) if r != me else theirs[:0]
+        for r, theirs in enumerate(reached)
+    ]
+    borrowed = [
+        np.flatnonzero(owner[rows] == r) if r != me else rows[:0]
+        for r in range(ranks.size)
+    ]
+    return Exchange(
+        ranks=ranks, rows=rows, own=np.searchsorted(rows, mine),
+        lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
+        lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class RankOperator:
+    """F over ranks: takes and gives this rank's slice of vectors of multipliers."""
+
+    local: DualOperator  #: rows that this rank touches, its own subdomains
+    exchange: Exchange
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows that this rank owns, twice."""
+        return (self.exchange.own.size,) * 2
+
+    def __call__(self, x: Dense) -> DistributedVector:
+        """Multiply with F."""
+        return self._over(x, self.local)
+
+    def __matmul__(self, x: Dense) -> DistributedVector:
+        return self(x)
+
+    def diagonal(self) -> DistributedVector:
+        """Give the diagonal of F."""
+        return distributed(
+            self.exchange.added(self.local.diagonal()), self.exchange.ranks
+        )
+
+    def _over(self, x: Dense, local: Product) -> DistributedVector:
+        ranks = self.exchange.ranks
+        touched_x = self.exchange.gathered(np.asarray(x))
+        with ranks.clocked("product"):
+            y = local(touched_x)
+        return distributed(self.exchange.added(y), ranks)
+
+    def preconditioner(self, kind: str, scaling: str) -> Product:
+        """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
+        of, ranks = self.local.packed, self.exchange.ranks
+        blocks, weights = self.local.weighted_blocks(kind, scaling)
+        BW = csr_array(of.B @ diags_array(weights))
+        WB = csr_array(BW.T)
+        solve = self._gram_inverse(csr_array(BW @ of.BT))
+
+        def local(x: Dense) -> Dense:
+            return np.asarray(BW @ of.multiplied(blocks, WB @ x))
+
+        def product(x: Dense) -> Dense:
+            return distributed(solve(self._over(solve(np.asarray(x)), local)), ranks)
+
+        return product
+
+    def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
+        """Make x ↦ (B W Bᵀ)⁻¹x of the sum of all ranks' parts, on owned rows.
+
+        Contact rows, and those that are coupled with others (none if gluing is
+        orthonormal), are solved for by all ranks alike.
+        """
+        at, ranks = self.exchange, self.exchange.ranks
+        diagonal = at.added(part.diagonal())
+        entries = part.tocoo()
+        told = at.rows[entries.row], at.rows[entries.col], entries.data
+        beside = (entries.row != entries.col) & (entries.data != 0)
+        contact = at.rows[at.rows >= self.local.equalities]
+        mine = np.union1d(told[0][beside], contact)
+        known = np.unique(np.concatenate(ranks.comm.allgather(mine)))
+        of_known = np.isin(told[0], known) & np.isin(told[1], known)
+        rows, columns, data = map(
+            np.concatenate,
+            zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
+        )
+        places = np.searchsorted(known, rows), np.searchsorted(known, columns)
+        gram = csr_array((data, places), shape=(known.size,) * 2)
+        gram.sum_duplicates()
+        equalities = int(np.searchsorted(known, self.local.equalities))
+        inverse = gram_inverse(uncoupled(gram, equalities), equalities)
+        place, own = np.intersect1d(known, at.rows[at.own], return_indices=True)[1:]
+
+        def solve(x: Dense) -> Dense:
+            x = np.asarray(x)
+            y = x / diagonal
+            whole = np.zeros(known.size)
+            whole[place] = x[own]
+            y[own] = inverse(ranks.total(whole))[place]
+            return np.asarray(y)
+
+        return solve
+
+
+def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
+    """Take this rank's share of a dual of torn bodies.
+
+    Raises
+    ------
+    InputError
+        Where there are fewer subdomains than ranks.
+
+    """
+    B, domains = operator.B, operator.domains
+    parts = partition(B, domains, ranks.size)
+    at = exchange(parts, ranks)
+    mine = np.flatnonzero(parts.rank == ranks.rank)
+    kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
+    columns = np.concatenate(
+        [np.arange(domains.start[s], domains.start[s + 1]) for s in mine]
+    )
+    local = DualOperator(
+        csr_array(B[at.rows][:, columns]),
+        Subdomains(tuple(domains.kinds[k] for k in kinds), kind),
+        operator.explicit[kinds],
+        operator.equalities,
+    )
+    own = at.rows[at.own]
+    q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))
+    part = QP(
+        P=RankOperator(local, at),
+        q=q, lb=lb, ub=ub, G=no_rows(own.size), h=np.zeros(0),
+        A=DistributedColumns(csr_array(qp.A[:, own]), ranks), b=np.array(qp.b),
+    )  # fmt: skip
+
+    def whole(s: Solution) -> Solution | None:
+        found = ranks.comm.gather((own, np.asarray(s.x), np.asarray(s.z_box)))
+        if found is None:
+            return None
+        x, z_box = np.empty(qp.q.size), np.empty(qp.q.size)
+        for rows, x_part, z_part in found:
+            x[rows], z_box[rows] = x_part, z_part
+        return replace(s, x=x, z_box=z_box)
+
+    return Share(part, whole)

@@ -1,0 +1,253 @@
+"""One solve on several ranks of MPI: against one process, and when ranks end."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mortarbench as mb
+from harness import mpi
+from harness.errors import InputError
+from mortarbench.cli.main import main
+from mortarbench.registries import Registries
+from tests.support import ROOT, SUPPORT
+from tests.support.waiting import soon
+
+CASES = (
+    "beam-ring/Nr=4/Nh=3/feti=4/dual",
+    "membranes/S=2/n=4/glue=redundant/dual",
+)
+CASE = "membranes/S=2/n=4/dual"
+SOLVE = ["solve", CASE, "--solver", "smalbe"]
+TOL = 1e-8
+
+
+@pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
+def found(request):
+    """What several ranks found, of vectors and of two duals."""
+    done = subprocess.run(
+        [
+            mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
+            str(SUPPORT / "on_ranks.py"), *CASES,
+        ],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_reductions_of_distributed_vectors_are_those_of_the_whole(found):
+    for name, (got, known) in found["vectors"]["pairs"].items():
+        assert got == pytest.approx(known, abs=1e-12), name
+
+
+def test_what_would_see_a_slice_only_is_refused(found):
+    assert found["vectors"]["answered"] == []
+    assert found["vectors"]["kept"]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_ranks_multiply_and_precondition_as_one_process_does(found, case):
+    for errors in found[case]["errors"]:
+        assert max(errors.values()) < 1e-13, errors
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(found, case):
+    of = found[case]
+    assert sum(of["rows"]) == of["size"]
+    assert max(of["subdomains"]) <= 1.5 * np.mean(of["subdomains"])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_solution_on_ranks_is_that_of_one_process(found, case):
+    of = found[case]
+    assert of["status"] == ["solved", "solved"]
+    assert of["difference"] < 10 * TOL
+    assert of["same_active"]
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """Two solves on two ranks, and one on one."""
+    case = mb.build(CASE)
+    return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
+
+
+def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
+    first, _, alone = answers
+    assert first.verdict == "verified"
+    assert first.energy_bound <= 1e-6
+    assert first.record.ranks == 2
+    assert first.record.solver == "smalbe ranks=2"
+    assert first.record.reported["ranks"] == 2
+    assert first.record.objective == pytest.approx(alone.record.objective, rel=1e-12)
+    assert first.record.run_id != alone.record.run_id
+
+
+def test_the_same_number_of_ranks_gives_the_same_bits(answers):
+    first, again, _ = answers
+    assert np.array_equal(first.solution.x, again.solution.x)
+
+
+def test_journal_lines_of_one_rank_are_as_they_were(answers):
+    *_, alone = answers
+    assert "ranks" not in json.loads(alone.record.to_json())
+
+
+def test_more_ranks_than_subdomains_are_declined():
+    answer = mb.solve("membranes/S=1/n=2/dual", "smalbe", ranks=3)
+
+    assert answer.verdict == "declined"
+    assert "3 ranks for 2 subdomains" in answer.record.message
+
+
+@pytest.mark.parametrize(
+    ("case", "solver", "message"),
+    [
+        ("beam-ring/Nr=2/Nh=2/steps=1/dual", "smalbe", "cannot be shared by ranks"),
+        (CASE, "clarabel", "runs in one process only"),
+    ],
+)
+def test_what_cannot_be_shared_is_declined(case, solver, message):
+    answer = mb.solve(case, solver, ranks=2)
+
+    assert answer.verdict == "declined"
+    assert message in answer.record.message
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "5000"])
+def test_no_number_of_ranks_is_refused_in_a_line(capfd, count):
+    assert (
+        main(Registries(), ["solve", CASE, "--solver", "smalbe", "--mpi", count]) == 2
+    )
+    assert "expected a number of ranks, 1 to 4096" in capfd.readouterr().err
+
+
+def test_a_missing_mpi_is_said_before_anything_is_built(monkeypatch, capfd):
+    monkeypatch.setattr(mpi, "find_spec", lambda name: None)
+
+    assert main(Registries(), [*SOLVE, "--mpi", "2"]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1
+    assert "pip install 'mortarbench[mpi]'" in error
+    with pytest.raises(InputError, match="needs mpi4py"):
+        mpi.ranks_asked(2, "ranks")
+
+
+SUITE = """
+name = "ranks"
+tolerances = [1e-6]
+repeats = 1
+time_limit = 60
+memory_limit = 4096
+solvers = ["smalbe", "clarabel"]
+ranks = [1, 2]
+[[problems]]
+family = "membranes"
+forms = ["dual"]
+params = { S = 2, n = 4 }
+"""
+
+
+def test_a_suite_asks_those_that_can_for_each_number_of_ranks(tmp_path):
+    suite = tmp_path / "ranks.toml"
+    suite.write_text(SUITE)
+
+    results = mb.run(suite, out=tmp_path / "out")
+
+    found = {r.solver: r for r in results.records}
+    ranks = {name: r.ranks for name, r in found.items()}
+    assert ranks == {"smalbe": 1, "smalbe ranks=2": 2, "clarabel": 1}
+    assert found["smalbe ranks=2"].verdict == "verified"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("ranks = [0]", "ranks = 0; expected a number of ranks"),
+        ("ranks = [2, 2]", "expected distinct numbers"),
+        ("ranks = 2", "ranks"),
+    ],
+)
+def test_wrong_ranks_of_a_suite_are_refused(tmp_path, line, message):
+    suite = tmp_path / "ranks.toml"
+    suite.write_text(SUITE.replace("ranks = [1, 2]", line))
+
+    with pytest.raises(InputError, match=message.replace("[", r"\[")):
+        mb.run(suite, out=tmp_path / "out")
+
+
+def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
+    suite = tmp_path / "ranks.toml"
+    suite.write_text(SUITE.replace('["smalbe", "clarabel"]', '["clarabel"]'))
+
+    with pytest.raises(InputError, match="none of the solvers runs on several"):
+        mb.run(suite, out=tmp_path / "out")
+
+
+LARGE = SUITE.replace("{ S = 2, n = 4 }", "{ S = 24, n = 16 }").replace(
+    "ranks = [1, 2]", "ranks = [2]"
+)
+FAULTS = {
+    "killed": (signal.SIGKILL, "", "crashed", r"rank 1 of 2 ranks ended: Killed"),
+    "hung": (signal.SIGSTOP, "time_limit = 8", "time_limit", "killed after 8 s"),
+    "greedy": (None, "memory_limit = 100", "memory_limit", "above the limit of 100"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
+    tmp_path, fault, monkeypatch
+):
+    sent, limit, verdict, message = FAULTS[fault]
+    monkeypatch.setenv("FAULT", str(tmp_path))
+    suite = tmp_path / "ranks.toml"
+    key = limit.partition(" ")[0]
+    lines = (line for line in LARGE.splitlines() if not key or key not in line)
+    suite.write_text("\n".join([limit, *lines, ""]))
+    command = ["-m", "mortarbench", "run", str(suite), "--solver", "smalbe ranks=2"]
+    run = subprocess.Popen(
+        [sys.executable, *command, "--out", str(tmp_path / "out")], cwd=ROOT,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    if sent is not None:
+        assert soon(lambda: busy(tmp_path))
+        os.kill(busy(tmp_path)[-1], sent)
+    assert run.wait() == 0
+
+    (record,) = mb.load(tmp_path / "out").records
+    assert record.verdict == verdict, record.message
+    assert message.split("ranks")[0] in record.message
+    assert soon(lambda: not processes(tmp_path))
+
+
+def processes(mark):
+    """Processes of a test, but for this one, with their commands."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (entry / "environ").read_bytes().split(b"\0")
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if f"FAULT={mark}".encode() in environment and int(entry.name) != os.getpid():
+            found.append((int(entry.name), command, environment))
+    return found
+
+
+def busy(mark):
+    """Rank 1, once it has the QP; in a list, which is empty before."""
+    return [
+        pid
+        for pid, command, environment in processes(mark)
+        if b"PMI_RANK=1" in environment
+        and b"worker" in command
+        and "qp" in Path(f"/proc/{pid}/maps").read_text()
+    ]
