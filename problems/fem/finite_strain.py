@@ -273,8 +273,8 @@ def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:
     The sum over cells is the same; the cell's own eigenvalues are those of a triangle.
     """
     moved, cells = tangents.copy(), triangular(mesh.cells)
-    moved[cells, 4:6] += moved[cells, 6:8]
-    moved[cells, :, 4:6] += moved[cells, :, 6:8]
-    moved[cells, 6:8] = 0
-    moved[cells, :, 6:8] = 0
+    moved[cells, 4:6] += moved[cells, 6:]
+    moved[cells, :, 4:6] += moved[cells, :, 6:]
+    moved[cells, 6:] = 0
+    moved[cells, :, 6:] = 0
     return moved

@@ -279,6 +279,8 @@ def test_clipping_leaves_convex_matrices_and_raises_negative_eigenvalues():
     assert np.allclose(found, np.sort(np.maximum(spectra, 0)), atol=1e-5)
     assert found.min() > -1e-14
     assert (clipped == np.swapaxes(clipped, 1, 2)).all()
+    in_other_units, _ = clip(1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    assert np.abs(in_other_units / 1e6 - clipped).max() < 1e-13
 
 
 def test_only_a_tangent_that_is_not_convex_is_changed():
@@ -304,6 +306,18 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
 
     assert exact == {0.9: False, 1.1: True}
     assert changed == {0.9: 40, 1.1: 0}
+
+
+def test_convex_cells_stay_what_they_are_triangles_too():
+    """Without strain no cell is changed, asked for or not."""
+    c = cells("neo-hooke", 0.3)
+    tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
+    asked = iter([False, True])
+
+    K, changed = convexified(c, tangents, lambda K: next(asked))
+
+    assert changed == 0
+    assert abs(K - assemble(c, tangents)).max() < 1e-14
 
 
 def test_a_body_that_nothing_holds_is_refused():
