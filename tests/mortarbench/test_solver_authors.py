@@ -170,9 +170,8 @@ def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
     assert (code, out) == (0, "my-own.py\n")
     assert "mortarbench test-solver my-own --plugin my-own.py" in err
     assert conforms(results)
-    assert {c for c, r in results.items() if r.grade is Grade.DECLINE} == {
-        "takes or declines an operator", "solves a sequence"
-    }  # fmt: skip
+    declined = {c for c, r in results.items() if r.grade is Grade.DECLINE}
+    assert declined == {"solves a sequence"}
 
 
 @pytest.mark.slow

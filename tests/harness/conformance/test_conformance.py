@@ -59,6 +59,8 @@ STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
 REWRITTEN = {
     "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
 }  # fmt: skip
+#: takes equations alone, of which these QPs are none
+LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 
@@ -166,7 +168,7 @@ def test_what_an_equivalent_formulation_changes_is_in_the_documents(name):
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
 
-    assert solved
+    assert solved or name in LINEAR
     assert f"| `{name}` |" in page
     assert [w for w in weak if line_of(name, *w) not in page] == []
 
@@ -379,7 +381,7 @@ def test_who_fails_on_an_operator_is_told_the_line_to_write():
     exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
     told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
 
-    assert run_check(check, told()) == (Grade.DECLINE, "needs explicit matrices", None)
+    assert run_check(check, told()).grade is Grade.PASS  # it is multiplied out
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_every_line_is_a_row_and_every_field_a_column(folder):
     path, frame = read(folder("a", *records))
 
     assert path.name == "records.parquet"
-    assert list(frame.columns) == list(json.loads(record(session="a").to_json()))
+    assert list(frame.columns) == list(record(session="a").to_dict())
     assert list(frame.run_id) == ["r1", "r0", "r2"]  # in the order of the journal
     assert list(frame.solver) == ["a"] * 3  # as the journal has it, not as pages do
     assert frame.total_seconds.sum() == 0.75
