@@ -67,6 +67,10 @@ SHORTER = {
         "mortarbench run suites/scaling-feti.toml --case 'membranes/S=[24]/*' "
         "--repeats 1"
     ),
+    "mortarbench run finite-strain": (
+        "mortarbench run finite-strain --solver smalbe --repeats 1 "
+        "--case '*/step=1/*/dual'"
+    ),
     "mortarbench run suites/fleet.toml": (
         "mortarbench run suites/fleet.toml --case '*Nr=4/Nh=3/dual' --solver pdas"
     ),
@@ -106,6 +110,8 @@ ELSEWHERE = {
     "mortarbench run fleet --dask tls://login1:8786": "test_cluster_tls.py",
     "python cluster.py": "it submits jobs to a batch system",
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
+    "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
+    "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
     "gmsh -2 -order 1 press.geo": "gmsh is not here; what it makes is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
         "the environment is there"
