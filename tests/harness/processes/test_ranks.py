@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -191,9 +192,10 @@ def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-LARGE = SUITE.replace("{ S = 2, n = 4 }", "{ S = 24, n = 16 }").replace(
+LARGE = SUITE.replace("{ S = 2, n = 4 }", "{ S = 56, n = 16 }").replace(
     "ranks = [1, 2]", "ranks = [2]"
 )
+WITH_A_SHARE = 110  #: MiB; a rank that waits for an order has 90
 FAULTS = {
     "killed": (signal.SIGKILL, "", "crashed", r"rank 1 of 2 ranks ended: Killed"),
     "hung": (signal.SIGSTOP, "time_limit = 8", "time_limit", "killed after 8 s"),
@@ -218,7 +220,7 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     if sent is not None:
-        assert soon(lambda: busy(tmp_path))
+        assert soon(lambda: busy(tmp_path) or run.poll() is not None)
         os.kill(busy(tmp_path)[-1], sent)
     assert run.wait() == 0
 
@@ -242,12 +244,19 @@ def processes(mark):
     return found
 
 
+def resident_mib(pid):
+    with suppress(OSError):
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    return 0.0
+
+
 def busy(mark):
-    """Rank 1, once it has the QP; in a list, which is empty before."""
+    """Rank 1, once it holds its share of the QP; in a list, which is empty before."""
     return [
         pid
         for pid, command, environment in processes(mark)
         if b"PMI_RANK=1" in environment
         and b"worker" in command
-        and "qp" in Path(f"/proc/{pid}/maps").read_text()
+        and resident_mib(pid) > WITH_A_SHARE
     ]
