@@ -54,9 +54,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    with suppress(
-        OSError
-    ):  # ours is one CPU, that of a worker; our parent has the rest
+    # ours is one CPU, that of a worker; our parent has the rest
+    with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
     process = subprocess.Popen(
