@@ -76,7 +76,7 @@ class StructuredGrid:
     def block(self, columns: slice, rows: slice) -> NDArray[np.float64]:
         """Return the points (l·k, 2) of some rows and columns of nodes, row by row."""
         points = self.place(self.columns[columns], self.rows[rows])
-        return np.ascontiguousarray(points.reshape(-1, 2))
+        return np.asarray(np.ascontiguousarray(points.reshape(-1, 2)))
 
     def side(self, name: str) -> NDArray[np.float64]:
         """Return the points of a side in the order of its chain, (k, 2)."""
@@ -121,7 +121,7 @@ def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
 
     def place(theta: Vector, r: Vector) -> NDArray[np.float64]:
         direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-        return np.asarray(centre) + r[:, None, None] * direction
+        return np.asarray(np.asarray(centre) + r[:, None, None] * direction)
 
     return StructuredGrid(
         columns=np.pi * np.arange(angles + 1) / angles,

@@ -138,10 +138,13 @@ class OwnSubdomains:
         place = {number: k for k, (number, *_) in enumerate(known)}
         kinds = []
         for k, s in enumerate(first):
-            _, (wide, high, m), at = known[leader[group[place[int(self.number[s])]]]]
-            mine = np.flatnonzero(kind == k)
-            turn = images(np.stack([at, *(points[s] for s in mine)]))[1]
-            rotation[mine] = turn[1:]
+            number, (wide, high, m), at = known[
+                leader[group[place[int(self.number[s])]]]
+            ]
+            if number != self.number[s]:
+                mine = np.flatnonzero(kind == k)
+                turn = images(np.stack([at, *(points[s] for s in mine)]))[1]
+                rotation[mine] = turn[1:]
             cells = cells_of_block(wide, high)
             kinds.append(problem.kind(Part(at, cells, np.full(len(cells), m))))
         return Subdomains(tuple(kinds), kind), rotation
@@ -156,15 +159,38 @@ class OwnSubdomains:
         """(S_p, 2, 2) turns each from the axes of its kind to those of the whole."""
         return self._classified[1]
 
+    @property
+    def coarse(self) -> int:
+        """How many rigid motions all subdomains have together."""
+        return self.rank.size * int(self.domains.kinds[0].R.shape[1])
+
     @cached_property
     def f(self) -> Vector:
         """Its part of the load, (N_p,) in the axes of subdomains."""
         d = self.problem.components
-        shared = self.problem.load(self.component) / self.times
-        if d == 1:
-            return np.asarray(shared)
-        turn = self.rotation[self.nodes.block]
-        return np.asarray(np.einsum("mkq,mk->mq", turn, shared.reshape(-1, d)).ravel())
+        found = self.problem.load(self.component) / self.times
+        if d > 1:
+            loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
+            turn = self.rotation[self.nodes.block[loaded]]
+            shared = found.reshape(-1, d)
+            shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
+        return np.asarray(found)
+
+    def resultants(
+        self, unknown: Nodes, value: Vector
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return Rᵀ of single forces: coarse numbers and values, both (k, r).
+
+        unknown, value : torn unknowns and the forces there, (k,)
+        """
+        domains = self.domains
+        modes = domains.kinds[0].R.shape[1]
+        of = np.searchsorted(domains.start, unknown, side="right") - 1
+        R = np.concatenate([kind.R for kind in domains.kinds])
+        first = np.cumsum([0, *(kind.R.shape[0] for kind in domains.kinds)])
+        at = first[domains.kind[of]] + unknown - domains.start[of]
+        number = modes * self.number[of][:, None] + np.arange(modes)
+        return number, R[at] * value[:, None]
 
     @cached_property
     def rows(self) -> _Rows:
@@ -258,8 +284,7 @@ def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
 def _rows(own: OwnSubdomains) -> _Rows:
     """Fill the rows of B, numbered as by `problems.feti.gluing.glue`."""
     problem, ranks = own.problem, own.ranks
-    supports, glued, contact = _supports(own), _glued(own), _contact(own)
-    parts = [supports, glued, contact]
+    parts = [_supports(own), _glued(own), _contact(own)]
     row, column, value = (np.concatenate(p) for p in list(zip(*parts, strict=True))[:3])
     number, place = np.unique(row, return_inverse=True)
     B = csr_array((value, (place, column)), shape=(number.size, own.component.size))
@@ -274,19 +299,17 @@ def _rows(own: OwnSubdomains) -> _Rows:
     )
     reach.sort_indices()
     reach.data[:] = 1
-    E, contact_rows = _equalities(problem), problem.contact.rows.shape[0]
-    beyond, friction = number - E, problem.contact.bound.size
-    is_contact = beyond >= 0
-    c, lower, upper = np.zeros(number.size), np.full(number.size, -np.inf), None
-    upper = np.full(number.size, np.inf)
-    scale = _contact_scale(problem)
-    rubs = beyond >= contact_rows - friction
-    c[is_contact] = (scale * problem.contact.c)[beyond[is_contact]]
-    lower[is_contact & ~rubs] = 0
-    bound = problem.contact.bound / scale[contact_rows - friction :]
-    upper[rubs] = bound[beyond[rubs] - (contact_rows - friction)]
-    lower[rubs] = -upper[rubs]
-    return _Rows(number, B, reach, c, lower, upper, E, E + contact_rows)
+    contact, scale = problem.contact, _contact_scale(problem)
+    rubbing = contact.bound.size  # the last rows, of which both bounds are finite
+    bound = contact.bound / scale[scale.size - rubbing :]
+    below = np.concatenate([np.zeros(scale.size - rubbing), -bound])
+    above = np.concatenate([np.full(scale.size - rubbing, np.inf), bound])
+    E = _equalities(problem)
+    touching = number >= E
+    c, lower, upper = (np.full(number.size, x) for x in (0.0, -np.inf, np.inf))
+    for whole, part in ((scale * contact.c, c), (below, lower), (above, upper)):
+        part[touching] = whole[number[touching] - E]
+    return _Rows(number, B, reach, c, lower, upper, E, E + scale.size)
 
 
 def _supports(own: OwnSubdomains) -> Entries:
@@ -407,29 +430,28 @@ def _contact_scale(problem: StructuredBodies) -> Vector:
 
 def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
     """Return the columns of RᵀBᵀ that belong to own rows, (3S, o)."""
-    ranks, rows, domains = own.ranks, own.rows, own.domains
-    modes = domains.kinds[0].R.shape[1]
-    BR = (rows.B @ domains.kernel).tocoo()
-    subdomain, mode = np.divmod(BR.col, modes)
-    coarse = modes * own.number[subdomain] + mode
-    owner = owners(rows.number, rows.reach)[BR.row]
+    ranks, rows = own.ranks, own.rows
+    entries = rows.B.tocoo()
+    coarse, value = own.resultants(entries.col, entries.data)
+    r, t = own.coarse, rows.number.size
+    places = coarse.ravel(), np.repeat(entries.row, coarse.shape[1])
+    part = coo_array(csr_array((value.ravel(), places), shape=(r, t)))
+    owner = owners(rows.number, rows.reach)[part.col]
     told = [
-        (rows.number[BR.row[to]], coarse[to], BR.data[to])
-        for to in (owner == r for r in range(ranks.size))
+        (part.row[to], rows.number[part.col[to]], part.data[to])
+        for to in (owner == one for one in range(ranks.size))
     ]
-    row, column, value = map(
+    row, column, data = map(
         np.concatenate, zip(*ranks.comm.alltoall(told), strict=True)
     )
-    shape = modes * own.rank.size, mine.size
-    return csr_array((value, (column, np.searchsorted(mine, row))), shape=shape)
+    return csr_array((data, (row, np.searchsorted(mine, column))), shape=(r, mine.size))
 
 
 def _resultants(own: OwnSubdomains) -> Vector:
     """Return Rᵀf (3S,) of all subdomains."""
-    domains, ranks = own.domains, own.ranks
-    modes = domains.kinds[0].R.shape[1]
-    told = ranks.comm.allgather((own.number, domains.kernel.T @ own.f))
-    found = np.empty((own.rank.size, modes))
-    for number, part in told:
-        found[number] = part.reshape(-1, modes)
-    return found.ravel()
+    loaded = np.flatnonzero(own.f)
+    coarse, value = own.resultants(loaded, own.f[loaded])
+    found = np.zeros(own.coarse)
+    for number, part in own.ranks.comm.allgather((coarse, value)):
+        np.add.at(found, number, part)
+    return found

@@ -163,12 +163,23 @@ def classify(
     rotation = np.empty((S, dim, dim))
     for group in alike.values():
         left = np.array(group)
+        spread = np.array([_spread(points[s]) for s in group])
+        # of images, ‖x − x̄‖ differs by no more than their points do
+        off = 2 * ALIKE * np.sqrt(points[group[0]].size)
         while left.size:
-            same, turn = images(np.stack([points[s] for s in left]))
-            kind[left[same]], rotation[left[same]] = len(first), turn[same]
+            near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
+            same, turn = images(np.stack([points[s] for s in left[near]]))
+            found = left[near[same]]
+            kind[found], rotation[found] = len(first), turn[same]
             first.append(int(left[0]))
-            left = left[~same]
+            others = np.delete(np.arange(left.size), near[same])
+            left, spread = left[others], spread[others]
     return first, kind, rotation
+
+
+def _spread(points: NDArray[np.float64]) -> float:
+    """Return ‖x − x̄‖."""
+    return float(np.linalg.norm(points - points.mean(axis=0)))
 
 
 def images(
