@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -118,7 +118,7 @@ def follow(
                 share = _share(qp, ranks)
                 run = solver.prepare(share.qp, order["tol"])
             elif run is not None and share is not None:
-                _whole(run(), share, ranks)
+                _solved(run, share, ranks)
         except BaseException as e:
             if _ordered(ranks, _ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
@@ -145,14 +145,28 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
+class Spent(NamedTuple):
+    """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
+
+    seconds: Mapping[str, tuple[float, float]] = {}
+    counts: Mapping[str, tuple[float, float]] = {}
+
+
 class OnRanks:
-    """A solver on rank 0, which has the others do their share."""
+    """A solver on rank 0, which has the others do their share.
+
+    Attributes
+    ----------
+    spent : what the last solve cost the ranks
+
+    """
 
     def __init__(self, solver: Solver, ranks: Ranks) -> None:
         self._solver = solver
         self._ranks = ranks
         self._path = Path()
         self._memory_limit: float | None = None
+        self.spent = Spent()
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
         """Say in which file the next QP is."""
@@ -182,15 +196,15 @@ class OnRanks:
             "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
         }  # fmt: skip
         self._order(order)
-        self._ranks.seconds.clear()
         share = _share(qp, self._ranks)
         run = self._solver.prepare(share.qp, tol)
 
         def solve() -> Solution:
             self._order({})
-            found = _whole(run(), share, self._ranks)
+            found = _solved(run, share, self._ranks)
             assert found is not None  # this is rank 0
-            return found
+            solution, self.spent = found
+            return solution
 
         return solve
 
@@ -205,17 +219,29 @@ def _share(qp: QP, ranks: Ranks) -> Share:
     return product.share(qp, ranks)
 
 
-def _whole(s: Solution, share: Share, ranks: Ranks) -> Solution | None:
-    """Gather a solution on rank 0, with what each rank has spent."""
+def _solved(
+    run: Callable[[], Solution], share: Share, ranks: Ranks
+) -> tuple[Solution, Spent] | None:
+    """Solve, and gather the solution on rank 0, with what the ranks have spent."""
+    ranks.clear()
+    s = run()
+    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     found = share.whole(s)
-    told = {**ranks.seconds, "peak": memory_mib("VmHWM") or 0.0}
-    spent = ranks.comm.gather(told)
-    if found is None or spent is None:
+    told = ranks.comm.gather((seconds, counts, memory_mib("VmHWM") or 0.0))
+    if found is None or told is None:
         return None
-    reported: dict[str, Any] = {"ranks": ranks.size}
-    for name in sorted({name for one in spent for name in one}):
-        values = [one.get(name, 0.0) for one in spent]
-        unit = "mib" if name == "peak" else "seconds"
-        reported[f"rank_{name}_{unit}_largest"] = float(np.max(values))
-        reported[f"rank_{name}_{unit}_mean"] = float(np.mean(values))
-    return replace(found, reported={**found.reported, **reported})
+    each_seconds, each_counts, peaks = zip(*told, strict=True)
+    reported = {
+        **found.reported, "ranks": ranks.size,
+        "rank_peak_mib_largest": max(peaks),
+        "rank_peak_mib_mean": sum(peaks) / ranks.size,
+    }  # fmt: skip
+    spent = Spent(_mean_and_largest(each_seconds), _mean_and_largest(each_counts))
+    return replace(found, reported=reported), spent
+
+
+def _mean_and_largest(
+    each: Sequence[Mapping[str, float]],
+) -> dict[str, tuple[float, float]]:
+    values = {name: [float(one[name]) for one in each] for name in each[0]}
+    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}
