@@ -16,7 +16,7 @@ The QP is that of `problems.feti.gluing` and `problems.duality.torn_dual`, row b
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from typing import NamedTuple
@@ -28,6 +28,7 @@ from scipy.sparse import coo_array, csr_array
 from harness import QP, Vector, no_rows
 from harness.distributed.vectors import (
     DistributedColumns,
+    Emitted,
     Ranks,
     Share,
     distributed,
@@ -222,7 +223,7 @@ class _Rows(NamedTuple):
     total: int  #: rows of the whole
 
 
-def emitted(problem: StructuredBodies, ranks: Ranks) -> Share:
+def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
     """Make this rank's share of the dual; called by all ranks.
 
     Raises
@@ -234,21 +235,25 @@ def emitted(problem: StructuredBodies, ranks: Ranks) -> Share:
     own = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
     rows, domains = own.rows, own.domains
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
-    free = domains.inverse(own.f)
     mine = at.own
-    q = rows.c[mine] - at.added(rows.B @ free)
-    B = rows.B
-    local = DualOperator(B, domains, explicit_kinds(B, domains), rows.equalities)
-    part = QP(
-        P=RankOperator(local, at),
-        q=distributed(q, ranks),
-        lb=distributed(rows.lower[mine], ranks),
-        ub=distributed(rows.upper[mine], ranks),
-        G=no_rows(mine.size), h=np.zeros(0),
-        A=DistributedColumns(_coarse_rows(own, at.rows[mine]), ranks),
-        b=_resultants(own),
-    )  # fmt: skip
-    return Share(part, gathered_on_one(at, rows.total))
+    q = rows.c[mine] - at.added(rows.B @ domains.inverse(own.f))
+    lower, upper = rows.lower[mine], rows.upper[mine]
+    G, b = _coarse_rows(own, at.rows[mine]), _resultants(own)
+    explicit, kinds = explicit_kinds(rows.B, domains), domains.kinds
+    B, kind, equalities, total = rows.B, domains.kind, rows.equalities, rows.total
+
+    def share() -> Share:
+        anew = Subdomains(tuple(map(replace, kinds)), kind)  # without any factor
+        local = DualOperator(B, anew, explicit, equalities)
+        part = QP(
+            P=RankOperator(local, at), q=distributed(q, ranks),
+            lb=distributed(lower, ranks), ub=distributed(upper, ranks),
+            G=no_rows(q.size), h=np.zeros(0),
+            A=DistributedColumns(G, ranks), b=b,
+        )  # fmt: skip
+        return Share(part, gathered_on_one(at, total))
+
+    return Emitted(total, b.size, share)
 
 
 def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
