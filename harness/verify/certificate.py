@@ -236,7 +236,7 @@ def proof(
 
     """
     exact, motions = mechanics.exact, mechanics.motions
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     gaps = -exact.motion(feasible)
@@ -313,27 +313,33 @@ def _substructured_proof(
         When u or λ cannot be mended.
 
     """
-    exact, motions, parts = mechanics.exact, mechanics.motions, mechanics.substructures
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    exact, parts = mechanics.exact, mechanics.substructures
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
     near = neighbour(mechanics, feasible, lam)
-    moved = (parts.spread @ (claimed - feasible)).astype(np.float64)
-    stretched = (near.Ku, near.Kd, parts.product(moved))
-    energy = np.array([[v @ Kw for Kw in stretched] for v in (near.u, near.d, moved)])
+    moved = mechanics.still(claimed - feasible).astype(np.float64)
+    apart, across = (
+        float(near.d @ near.Kd),
+        float(mechanics.still(feasible) @ near.force),
+    )
+    shift = float(moved @ (mechanics.primal.P @ moved))
 
-    def length(*combined: float) -> float:
-        """Return the norm of a combination of Tû, d and T(u − û)."""
-        w = np.array(combined, dtype=Real)
-        return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
+    def length(square: float) -> float:
+        return float(np.sqrt(max(square, 0.0)))
 
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=near.u - near.d,
-        norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
-        apart=length(0, 1, 0), left=near.left,
+        mechanics, u=feasible, multipliers=lam,
+        equilibrium=parts.spread @ feasible - near.d,
+        norms=[
+            length(near.square), length(near.square - 2 * across + apart),
+            length(near.square - across + 0.25 * apart),
+        ],
+        apart=length(apart), left=near.left,
         works=exact.friction_work(feasible) - lam * exact.motion(feasible),
-        rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
+        rounding=0.0, moved=length(shift),
+        from_middle=length(shift + float(moved @ near.force) + 0.25 * apart),
     )  # fmt: skip
 
 
