@@ -65,8 +65,9 @@ def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neigh
     K = csc_array(mechanics.primal.P)
     residual = times_columns(K.data, K.indices, K.indptr, still, u.size)
     square = float(still @ residual)
-    residual -= exact.f
-    residual += exact.B.T @ multipliers
+    residual += mechanics.primal.q
+    at = np.unique(mechanics.rows.indices)
+    residual[at] += exact.B[:, at].T @ multipliers
     residual[exact.held] = 0
     b = _shared(mechanics, residual.astype(np.float64))
     d = parts.solve(b)
@@ -92,8 +93,10 @@ def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
     inverse = 1 / total
     inverse[held] = 0
     T, R, w = csr_array(parts.spread[at]), csr_array(parts.kernel[at]), parts.weight[at]
-    touched, columns = np.unique(T.indices, return_inverse=True)
-    T = csr_array((T.data, columns, T.indptr), shape=(at.size, touched.size))
+    touched = np.zeros(total.size, dtype=bool)
+    touched[T.indices] = True
+    number = np.cumsum(touched) - 1
+    T = csr_array((T.data, number[T.indices], T.indptr), shape=(at.size, touched.sum()))
     inverse = inverse[touched]
     WR = scaled_rows(R, w)
     TWR = csr_array(T.T @ WR)

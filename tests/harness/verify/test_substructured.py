@@ -85,7 +85,7 @@ class Known:
     def pair_error(self, c: Certificate) -> float:
         """√(‖û − u*‖² + ‖u_λ − Tu*‖²), the second one of torn displacements."""
         parts = self.mechanics.substructures
-        jump = c.equilibrium - parts.spread.astype(Real) @ self.exact.u
+        jump = parts.spread.astype(Real) @ (c.u - self.exact.u) - c.off
         torn = float(np.sqrt(jump @ parts.product(jump)))
         return float(np.hypot(self.error(c.u), torn))
 
