@@ -23,16 +23,25 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator
 
 from harness.distributed.mpi import MISSING, mpiexec
-from harness.distributed.vectors import Distributable, Ranks, Share
+from harness.distributed.vectors import (
+    Distributable,
+    Emit,
+    Emitted,
+    Ranks,
+    Share,
+)
+from harness.errors import InputError
 from harness.files.qpfile import load_qp
 from harness.operators import Maker, SerialisableOperator
 from harness.plugin import Solver
-from harness.qp import QP
+from harness.qp import QP, no_rows
 from harness.solution import Solution
 from harness.verify.measure import memory_mib
 
@@ -102,23 +111,36 @@ def follow(
     solver: Solver,
     ranks: Ranks,
     operators: Mapping[str, Maker],
+    emit: Emit,
     limit: Callable[[float | None], None],
 ) -> None:
     """Do on this rank what rank 0 orders, until it orders nothing more.
 
+    emit : makes this rank's share of a case
     limit : limits the memory of this process, in MiB
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
+    emitted: Emitted | None = None
     while (order := _next_order(ranks)) is not None:
         try:
-            if "qp" in order:
+            if "case" in order:
+                run = share = emitted = None  # before another one is made
+                with suppress(InputError):  # as on rank 0, which goes on with the whole
+                    emitted = emit(order["case"], ranks)
+                limit(order["memory_limit"])
+            elif "declines" in order and emitted is not None:
+                solver.declines(emitted.share().qp)
+            elif "tol" in order and emitted is not None:
+                share = emitted.share()
+                run = solver.prepare(share.qp, order["tol"])
+            elif "qp" in order:
                 qp, _ = load_qp(Path(order["qp"]), operators=operators)
                 limit(order["memory_limit"])
                 share = _share(qp, ranks)
                 run = solver.prepare(share.qp, order["tol"])
             elif run is not None and share is not None:
-                _whole(run(), share, ranks)
+                _solved(run, share, ranks)
         except BaseException as e:
             if _ordered(ranks, _ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
@@ -145,17 +167,47 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
-class OnRanks:
-    """A solver on rank 0, which has the others do their share."""
+class Spent(NamedTuple):
+    """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
 
-    def __init__(self, solver: Solver, ranks: Ranks) -> None:
+    seconds: Mapping[str, tuple[float, float]] = {}
+    counts: Mapping[str, tuple[float, float]] = {}
+
+
+class OnRanks:
+    """A solver on rank 0, which has the others do their share.
+
+    Attributes
+    ----------
+    spent : what the last solve cost the ranks
+
+    """
+
+    def __init__(self, solver: Solver, ranks: Ranks, emit: Emit) -> None:
         self._solver = solver
         self._ranks = ranks
+        self._emit = emit
+        self._emitted: Emitted | None = None
         self._path = Path()
         self._memory_limit: float | None = None
+        self.spent = Spent()
+
+    def emits(self, case: Mapping[str, Any], memory_limit: float | None) -> QP | None:
+        """Have all ranks make their shares of the next QP, where its family can.
+
+        Returns
+        -------
+        its sizes, as a QP without content; None where it is to be loaded
+
+        """
+        self._order({"case": dict(case), "memory_limit": memory_limit})
+        self._emitted = None
+        with suppress(InputError):  # why it cannot be shared will be said of the whole
+            self._emitted = self._emit(case, self._ranks)
+        return None if self._emitted is None else _sized(self._emitted)
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
-        """Say in which file the next QP is."""
+        """Say in which file the next QP is, unless it is emitted."""
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
@@ -166,6 +218,9 @@ class OnRanks:
         """Decline what cannot be shared, besides what the solver declines."""
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
+        if self._emitted is not None:
+            self._order({"declines": True})
+            return self._solver.declines(self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
             return "P cannot be shared by ranks; expected a case in subdomains"
@@ -178,19 +233,23 @@ class OnRanks:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Prepare on all ranks."""
-        order = {
-            "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
-        }  # fmt: skip
-        self._order(order)
-        self._ranks.seconds.clear()
-        share = _share(qp, self._ranks)
+        if self._emitted is not None:
+            self._order({"tol": tol})
+            share = self._emitted.share()
+        else:
+            order = {
+                "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+            }  # fmt: skip
+            self._order(order)
+            share = _share(qp, self._ranks)
         run = self._solver.prepare(share.qp, tol)
 
         def solve() -> Solution:
             self._order({})
-            found = _whole(run(), share, self._ranks)
+            found = _solved(run, share, self._ranks)
             assert found is not None  # this is rank 0
-            return found
+            solution, self.spent = found
+            return solution
 
         return solve
 
@@ -199,23 +258,46 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
+def _sized(emitted: Emitted) -> QP:
+    """Make a QP with the sizes of one that no process has; it holds no numbers."""
+    n, m = emitted.variables, emitted.equality_rows
+    nothing = np.broadcast_to(0.0, n)
+    return QP(
+        P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
+        q=nothing, lb=nothing, ub=nothing, G=no_rows(n), h=np.zeros(0),
+        A=csr_array((m, n)), b=np.zeros(m),
+    )  # fmt: skip
+
+
 def _share(qp: QP, ranks: Ranks) -> Share:
     product = qp.P.build()
     assert isinstance(product, Distributable)
     return product.share(qp, ranks)
 
 
-def _whole(s: Solution, share: Share, ranks: Ranks) -> Solution | None:
-    """Gather a solution on rank 0, with what each rank has spent."""
+def _solved(
+    run: Callable[[], Solution], share: Share, ranks: Ranks
+) -> tuple[Solution, Spent] | None:
+    """Solve, and gather the solution on rank 0, with what the ranks have spent."""
+    ranks.clear()
+    s = run()
+    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     found = share.whole(s)
-    told = {**ranks.seconds, "peak": memory_mib("VmHWM") or 0.0}
-    spent = ranks.comm.gather(told)
-    if found is None or spent is None:
+    told = ranks.comm.gather((seconds, counts, memory_mib("VmHWM") or 0.0))
+    if found is None or told is None:
         return None
-    reported: dict[str, Any] = {"ranks": ranks.size}
-    for name in sorted({name for one in spent for name in one}):
-        values = [one.get(name, 0.0) for one in spent]
-        unit = "mib" if name == "peak" else "seconds"
-        reported[f"rank_{name}_{unit}_largest"] = float(np.max(values))
-        reported[f"rank_{name}_{unit}_mean"] = float(np.mean(values))
-    return replace(found, reported={**found.reported, **reported})
+    each_seconds, each_counts, peaks = zip(*told, strict=True)
+    reported = {
+        **found.reported, "ranks": ranks.size,
+        "rank_peak_mib_largest": max(peaks),
+        "rank_peak_mib_mean": sum(peaks) / ranks.size,
+    }  # fmt: skip
+    spent = Spent(_mean_and_largest(each_seconds), _mean_and_largest(each_counts))
+    return replace(found, reported=reported), spent
+
+
+def _mean_and_largest(
+    each: Sequence[Mapping[str, float]],
+) -> dict[str, tuple[float, float]]:
+    values = {name: [float(one[name]) for one in each] for name in each[0]}
+    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}
