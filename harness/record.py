@@ -120,7 +120,9 @@ class Record(Measurement):
     #: sequence that tightens
     step_tol: float | None = None
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
-    role: str = ""  #: "null": the same solver once more, to show the noise
+    #: "null": the same solver once more, to show the noise; "copies": as many of it at
+    #: once as there are `ranks`, each by itself
+    role: str = ""
     primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
     dual: float | None = None
     complementarity: float | None = None

@@ -23,7 +23,10 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     )
     solver = resolve(spec, registries.solvers)
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
-    serve(solver, int(request_fd), int(reply_fd), registries.operators, ranks)
+    serve(
+        solver, int(request_fd), int(reply_fd), registries.operators, ranks,
+        copies=request.get("copies", False),
+    )  # fmt: skip
     return 0
 
 

@@ -9,6 +9,10 @@ the limit of memory, and all of them end with any of them.
 A solver that can run so says `on_ranks = True`: its `prepare` is called on every rank
 with that rank's share of the QP (`harness.distributed.vectors.Share`), and every rank
 comes to the same solution, in slices.
+
+Copies are what ranks are compared with: each rank solves all of the QP by itself, at
+the same time as the others, with whom it shares nothing but the machine. The slowest
+tells the time.
 """
 
 from __future__ import annotations
@@ -115,8 +119,9 @@ def follow(
             if "qp" in order:
                 qp, _ = load_qp(Path(order["qp"]), operators=operators)
                 limit(order["memory_limit"])
-                share = _share(qp, ranks)
+                share = _share(qp, ranks, copies=order["copies"])
                 run = solver.prepare(share.qp, order["tol"])
+                ranks.comm.Barrier()
             elif run is not None and share is not None:
                 _whole(run(), share, ranks)
         except BaseException as e:
@@ -146,11 +151,12 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
 
 
 class OnRanks:
-    """A solver on rank 0, which has the others do their share."""
+    """A solver on rank 0, which has the others do their share, or the same."""
 
-    def __init__(self, solver: Solver, ranks: Ranks) -> None:
+    def __init__(self, solver: Solver, ranks: Ranks, *, copies: bool = False) -> None:
         self._solver = solver
         self._ranks = ranks
+        self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
 
@@ -164,6 +170,8 @@ class OnRanks:
 
     def declines(self, qp: QP) -> str | None:
         """Decline what cannot be shared, besides what the solver declines."""
+        if self._copies:
+            return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
@@ -177,14 +185,16 @@ class OnRanks:
         return self._solver.declines(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks."""
+        """Prepare on all ranks; it is done when the last one is."""
         order = {
             "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+            "copies": self._copies,
         }  # fmt: skip
         self._order(order)
         self._ranks.seconds.clear()
-        share = _share(qp, self._ranks)
+        share = _share(qp, self._ranks, copies=self._copies)
         run = self._solver.prepare(share.qp, tol)
+        self._ranks.comm.Barrier()
 
         def solve() -> Solution:
             self._order({})
@@ -199,7 +209,9 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
-def _share(qp: QP, ranks: Ranks) -> Share:
+def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
+    if copies:
+        return Share(qp, lambda solution: solution if ranks.rank == 0 else None)
     product = qp.P.build()
     assert isinstance(product, Distributable)
     return product.share(qp, ranks)

@@ -56,11 +56,14 @@ def serve(
     reply_fd: int,
     operators: Mapping[str, Maker] = NO_MAKERS,
     ranks: Ranks | None = None,
+    *,
+    copies: bool = False,
 ) -> None:
     """Answer requests until there are no more.
 
     operators : what puts an operator P of a request together, see `harness.operators`
     ranks : that solve together, this process being one of them
+    copies : each of them solves by itself instead, all at the same time
     """
     bench = _Bench(solver, operators)
     if ranks is None:
@@ -72,7 +75,7 @@ def serve(
         bench.warm_up()
         follow(solver, ranks, operators, _limit_memory)
         return
-    bench.on_ranks = OnRanks(solver, ranks)
+    bench.on_ranks = OnRanks(solver, ranks, copies=copies)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
     bench.on_ranks.end()
 
