@@ -54,7 +54,7 @@ class Communication:
     sent: float  #: bytes
     reduction_seconds: float  #: of one number, over all ranks
     message_seconds: float  #: of the shortest
-    bytes_per_second: float
+    seconds_per_byte: float
 
     @property
     def seconds(self) -> Array:
@@ -63,7 +63,7 @@ class Communication:
             [
                 self.reductions * self.reduction_seconds,
                 self.messages * self.message_seconds,
-                self.sent / self.bytes_per_second,
+                self.sent * self.seconds_per_byte,
             ]
         )
 

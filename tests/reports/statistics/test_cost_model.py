@@ -9,7 +9,7 @@ from reports.statistics.cost_model import Communication, cost_model, growth
 
 SENT = Communication(
     ranks=2, reductions=300, messages=120, sent=4e6,
-    reduction_seconds=5e-6, message_seconds=2e-6, bytes_per_second=2e9,
+    reduction_seconds=5e-6, message_seconds=2e-6, seconds_per_byte=5e-10,
 )  # fmt: skip
 
 
@@ -95,7 +95,7 @@ def test_one_run_each_has_no_band():
 def test_half_of_the_ranks_are_lost_where_what_is_alike_takes_as_long():
     free = Communication(
         ranks=2, reductions=0, messages=0, sent=0, reduction_seconds=1e-6,
-        message_seconds=1e-6, bytes_per_second=1e9,
+        message_seconds=1e-6, seconds_per_byte=1e-9,
     )  # fmt: skip
     found = cost_model({1: [1.1] * 2, 2: [0.6] * 2}, {}, [free])  # W = 1, C = 0.1
     # speed-up 1.1/(1/N + 0.1) ≥ N/2 up to N = 12
