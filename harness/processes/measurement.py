@@ -117,7 +117,11 @@ def measured(
     record = judged(record.but(**asdict(cost)), qp, solution, prove)
     record = noted(record, reply.message, *notes)
     return _within(memory_limit, record).but(
-        canary_seconds=reply.answer["canary_seconds"]
+        canary_seconds=reply.answer["canary_seconds"],
+        **{
+            table: {part: tuple(pair) for part, pair in reply.answer[table].items()}
+            for table in ("rank_seconds", "rank_counts", "rank_network")
+        },
     ), solution
 
 

@@ -27,11 +27,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from harness.distributed.mpi import MISSING, mpiexec
+from harness.distributed.network import network
 from harness.distributed.vectors import Distributable, Ranks, Share
 from harness.files.qpfile import load_qp
 from harness.operators import Maker, SerialisableOperator
@@ -92,12 +93,15 @@ def launch(ranks: int, command: Sequence[str]) -> int:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks, on a CPU of our own if there is one for each."""
+    """Join the other ranks, on a CPU of our own if there is one for each.
+
+    How fast they talk to one another is measured at once, before anything is timed.
+    """
     from mpi4py import MPI  # late: whoever starts no ranks needs none
 
-    ranks = Ranks(MPI.COMM_WORLD)
     cpus = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[ranks.rank % len(cpus)]})
+    os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
+    ranks = Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
     print(f"rank {ranks.rank} is process {os.getpid()}", file=sys.stderr, flush=True)
     return ranks
 
@@ -123,7 +127,7 @@ def follow(
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
             elif run is not None and share is not None:
-                _whole(run(), share, ranks)
+                _solved(run, share, ranks)
         except BaseException as e:
             if _ordered(ranks, _ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
@@ -150,8 +154,22 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
+class Spent(NamedTuple):
+    """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
+
+    seconds: Mapping[str, tuple[float, float]] = {}
+    counts: Mapping[str, tuple[float, float]] = {}
+    network: Mapping[str, tuple[float, float]] = {}  #: as each of them measured it
+
+
 class OnRanks:
-    """A solver on rank 0, which has the others do their share, or the same."""
+    """A solver on rank 0, which has the others do their share, or the same.
+
+    Attributes
+    ----------
+    spent : what the last solve cost the ranks
+
+    """
 
     def __init__(self, solver: Solver, ranks: Ranks, *, copies: bool = False) -> None:
         self._solver = solver
@@ -159,6 +177,7 @@ class OnRanks:
         self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
+        self.spent = Spent()
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
         """Say in which file the next QP is."""
@@ -191,16 +210,17 @@ class OnRanks:
             "copies": self._copies,
         }  # fmt: skip
         self._order(order)
-        self._ranks.seconds.clear()
         share = _share(qp, self._ranks, copies=self._copies)
         run = self._solver.prepare(share.qp, tol)
         self._ranks.comm.Barrier()
 
         def solve() -> Solution:
             self._order({})
-            found = _whole(run(), share, self._ranks)
+            found = _solved(run, share, self._ranks)
             assert found is not None  # this is rank 0
-            return found
+            solution, spent = found
+            self.spent = Spent() if self._copies else spent
+            return solution
 
         return solve
 
@@ -217,17 +237,29 @@ def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
     return product.share(qp, ranks)
 
 
-def _whole(s: Solution, share: Share, ranks: Ranks) -> Solution | None:
-    """Gather a solution on rank 0, with what each rank has spent."""
+def _solved(
+    run: Callable[[], Solution], share: Share, ranks: Ranks
+) -> tuple[Solution, Spent] | None:
+    """Solve, and gather the solution on rank 0, with what the ranks have spent."""
+    ranks.clear()
+    s = run()
+    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     found = share.whole(s)
-    told = {**ranks.seconds, "peak": memory_mib("VmHWM") or 0.0}
-    spent = ranks.comm.gather(told)
-    if found is None or spent is None:
+    peak = memory_mib("VmHWM") or 0.0
+    told = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
+    if found is None or told is None:
         return None
-    reported: dict[str, Any] = {"ranks": ranks.size}
-    for name in sorted({name for one in spent for name in one}):
-        values = [one.get(name, 0.0) for one in spent]
-        unit = "mib" if name == "peak" else "seconds"
-        reported[f"rank_{name}_{unit}_largest"] = float(np.max(values))
-        reported[f"rank_{name}_{unit}_mean"] = float(np.mean(values))
-    return replace(found, reported={**found.reported, **reported})
+    *tables, peaks = zip(*told, strict=True)
+    reported = {
+        **found.reported, "ranks": ranks.size,
+        "rank_peak_mib_largest": max(peaks),
+        "rank_peak_mib_mean": sum(peaks) / ranks.size,
+    }  # fmt: skip
+    return replace(found, reported=reported), Spent(*map(_mean_and_largest, tables))
+
+
+def _mean_and_largest(
+    each: Sequence[Mapping[str, float]],
+) -> dict[str, tuple[float, float]]:
+    values = {name: [float(one[name]) for one in each] for name in each[0]}
+    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}

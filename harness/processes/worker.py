@@ -41,7 +41,7 @@ from harness.operators import NO_MAKERS, Maker
 from harness.plugin import Solver
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
-from harness.processes.ranks import OnRanks, follow
+from harness.processes.ranks import OnRanks, Spent, follow
 from harness.qp import QP, Vector, no_rows
 from harness.record import finite, journal_name
 from harness.solution import Solution, Status
@@ -141,12 +141,16 @@ class _Bench:
         _limit_memory(None)
         s = timed.solution
         _write_new(out, s)
+        spent = Spent() if self.on_ranks is None else self.on_ranks.spent
         return {
             "claimed": s.status,
             "message": s.message,
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
+            "rank_seconds": spent.seconds,
+            "rank_counts": spent.counts,
+            "rank_network": spent.network,
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},

@@ -122,9 +122,9 @@ class Halo:
 
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
-        found = np.empty(self.rows.size)
-        found[self.own] = x
         with self.ranks.clocked("exchange"):
+            found = np.empty(self.rows.size)
+            found[self.own] = x
             found[self.borrowed] = self.ranks.exchanged(
                 x[self.lent], self.lends, self.borrows
             )
@@ -132,10 +132,10 @@ class Halo:
 
     def added(self, y: Vector) -> Vector:
         """Add up what all ranks have for the rows that this one owns (o,)."""
-        found = y[self.own]
         with self.ranks.clocked("exchange"):
+            found = y[self.own]
             come = self.ranks.exchanged(y[self.borrowed], self.borrows, self.lends)
-        np.add.at(found, self.lent, come)
+            np.add.at(found, self.lent, come)
         return found
 
 
@@ -190,7 +190,7 @@ class RankOperator:
     def _over(self, x: Dense, local: Product) -> DistributedVector:
         ranks = self.halo.ranks
         touched_x = self.halo.gathered(np.asarray(x))
-        with ranks.clocked("product"):
+        with ranks.clocked("products"):
             y = local(touched_x)
         return distributed(self.halo.added(y), ranks)
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
+from harness.distributed.vectors import inner_products
 
 Mask = NDArray[np.bool_]
 ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations
@@ -18,10 +19,11 @@ def lengths(
 
     The first is inf along a direction without curvature.
     """
-    curvature, slope = float(p @ Hp), float(g @ p)
     moves = p != 0
     bound = np.where(p > 0, lower, upper)[moves]
-    feasible = float(((x[moves] - bound) / p[moves]).min(initial=np.inf))
+    curvature, slope, feasible = inner_products(
+        (p, Hp), (g, p), least=(x[moves] - bound) / p[moves]
+    )
     return slope / curvature if curvature > 0 else np.inf, feasible
 
 
@@ -49,7 +51,8 @@ def split(
     free = ~(at_lower | at_upper)
     leads_inside = ((g < 0) & ~at_upper) | ((g > 0) & ~at_lower)
     phi, beta = np.where(free, g, 0.0), np.where(~free & leads_inside, g, 0.0)
-    return free, phi, beta, float(phi @ phi), float(beta @ beta)
+    phi_square, beta_square = inner_products((phi, phi), (beta, beta))
+    return free, phi, beta, phi_square, beta_square
 
 
 def reduced(
@@ -62,7 +65,8 @@ def reduced(
 
 def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
     """Return z − (zᵀHp / pᵀHp) p."""
-    return z - float(z @ Hp) / float(p @ Hp) * p
+    along, curvature = inner_products((z, Hp), (p, Hp))
+    return z - along / curvature * p
 
 
 def tilted_step(
