@@ -39,7 +39,9 @@ from reports.figures.style import (
 from reports.statistics.intervals import Interval
 
 _BAND = 0.18  #: opacity
+_LONG = 72  #: letters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
+_BEYOND = 1.5  #: times the values that an axis goes on for intervals
 _REST = "#9aa2ad"  #: time that no part is told of
 _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)  #: between measured and model
 
@@ -59,11 +61,12 @@ def strong_figure(found: Sequence[StrongSeries]) -> Figure:
             )
         )  # fmt: skip
     for i, s in enumerate(found):
-        keys.append(Key(label=legible(s.title), look=_line(look(i)), solver=s.solver))
+        label = legible(s.title, _LONG)
+        keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
     if any(s.copies for s in found):
         keys.append(Key(label="as many copies at once", look=_copies_look(INK)))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
-    return _figure(panels, keys, columns=2)
+    return _figure(panels, keys, columns=1)
 
 
 def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
@@ -124,7 +127,7 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
             Panel(
                 x=_ranks_axis([1, *s.model.measured[1:], *asked]),
                 y=_times_axis("speed-up of the solve", marks),
-                title=legible(s.case), marks=tuple(marks),
+                title=legible(s.case, 44), marks=tuple(marks),
                 rules=(Rule(axis="x", at=float(last), look=_EDGE),),
                 texts=(
                     Text(text="model, not measured", place=(0.97, 0.06),
@@ -165,7 +168,7 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
                 start += taken
     keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
     keys.append(Key(label="rest", look=_bar(_REST)))
-    names = [f"{legible(s.case)}, {n} ranks" for s, n in found]
+    names = [f"{legible(s.case, 44)}, {n} ranks" for s, n in found]
     panel = Panel(
         x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
         marks=tuple(marks), grid="x",
@@ -195,13 +198,13 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
             )
         )  # fmt: skip
     keys = [
-        Key(label=f"{legible(s.title)}: {s.members[0].dofs} dofs of a rank",
+        Key(label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs of a rank",
             look=_line(look(i)), solver=s.solver)
         for i, s in enumerate(found)
     ]  # fmt: skip
     if any(s.copies for s in found):
         keys.append(Key(label="copies of the first at once", look=_copies_look(INK)))
-    return _figure(panels, keys, columns=2)
+    return _figure(panels, keys, columns=1)
 
 
 def _times(
@@ -225,9 +228,18 @@ def _ranks_axis(ranks: Sequence[int]) -> Axis:
 
 
 def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
-    """Make a logarithmic axis whose ticks are powers of two."""
-    shown = [v for m in marks if isinstance(m, Series) for v in m.y]
-    shown += [v for m in marks if isinstance(m, Area) for v in (*m.low, *m.high)]
+    """Make a logarithmic axis whose ticks are powers of two.
+
+    Intervals may leave it where they are wide: values are what it is to show.
+    """
+    curves = [m for m in marks if isinstance(m, Series)]
+    shown = [v for m in curves for v in m.y]
+    least, most = min(shown) / _BEYOND, max(shown) * _BEYOND
+    ends = [
+        v for m in curves if m.intervals for v in (*m.intervals.low, *m.intervals.high)
+    ]
+    ends += [v for m in marks if isinstance(m, Area) for v in (*m.low, *m.high)]
+    shown += [min(max(v, least), most) for v in ends]
     low, high = min([0.9, *shown]), max([2.0, *shown])
     ticks = [2.0**k for k in range(-6, 13) if low <= 2.0**k <= 1.1 * high]
     return Axis(

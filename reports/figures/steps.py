@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,7 +46,7 @@ _FITTED = 24  #: points of a curve of a fit
 class _Curve:
     """One count, or κ, against size."""
 
-    name: str
+    label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
     answers: tuple[Outcome, ...]
@@ -75,7 +75,8 @@ def _figure(
     laws: dict[str, PowerLaw | None],
     solver: str,
 ) -> Figure | None:
-    panels, keys = [], []
+    panels: list[Panel] = []
+    keys: list[Key] = []
     groups = [
         *((title, [*_counts(points, names, laws)]) for title, names in PANELS),
         ("condition number", [*_condition_numbers(points)]),
@@ -89,7 +90,7 @@ def _figure(
             colour = COLOURS[i % len(COLOURS)]
             style = Look(colour=colour, marker=MARKERS[i % len(MARKERS)], dash=None)
             joined = Look(colour=colour, marker=MARKERS[i % len(MARKERS)])
-            label = legible(curve.name.replace("_", " "))
+            label = curve.label
             if curve.law is not None:
                 marks.append(_fit(curve, colour))
                 label += f",  p = {exponent(curve.law)}"
@@ -110,6 +111,9 @@ def _figure(
         )  # fmt: skip
     if not panels:
         return None
+    (low, *_), (high, *_) = points[0], points[-1]
+    if len(panels) > 2 and x.ticks is None and high >= 10 * low:
+        panels = [replace(p, x=replace(p.x, most=4)) for p in panels]  # has less room
     return Figure(
         rows=(Row(panels=tuple(panels)),),
         height=2.5 + LEGEND_LINE * -(-len(keys) // 2),
@@ -128,7 +132,13 @@ def _counts(
         if len(counted) == len(points):
             x, y, answers = zip(*counted, strict=True)
             found.append(
-                _Curve(name=name, x=x, y=y, answers=answers, law=laws.get(name))
+                _Curve(
+                    label=legible(name.replace("_", " ")),
+                    x=x,
+                    y=y,
+                    answers=answers,
+                    law=laws.get(name),
+                )
             )
     return found
 
@@ -144,7 +154,7 @@ def _condition_numbers(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
     ]
     return [
         _Curve(
-            name=name.replace(KAPPA, "κ", 1),
+            label=rf"$\kappa${legible(name.removeprefix(KAPPA).replace('_', ' '))}",
             x=tuple(x for x, _ in points),
             y=tuple(float(o.quantities[name]) for _, o in points),
             answers=tuple(o for _, o in points),

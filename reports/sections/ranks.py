@@ -40,6 +40,7 @@ from reports.statistics.cost_model import CostModel
 from reports.statistics.intervals import Interval
 
 MOST_DRAWN = 4  #: series of a figure; all are tabulated
+MISFIT = 0.2  #: of a model that is not asked about more ranks
 PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: ranks that the model is asked about
 _CROWDED = "more ranks than CPUs: they took turns"
 _NO_MODEL = (
@@ -58,7 +59,9 @@ def ranks(evidence: Evidence) -> Section | None:
     tables += [_weak_table(series) for series in weak]
     tables += _part_tables(strong)
     if modelled:
-        tables += [_model_table(modelled), _prediction_table(modelled)]
+        tables.append(_model_table(modelled))
+    if asked := [s for s in modelled if predicted(s)]:
+        tables.append(_prediction_table(asked))
     return Section(
         name="ranks",
         title="One solve on several ranks",
@@ -259,7 +262,8 @@ def _model_table(found: Sequence[StrongSeries]) -> Table:
         text_columns=2,
         notes=(
             "Misfit: the largest relative difference to a measured time, 0 where two "
-            "numbers of ranks determine W and C.",
+            f"numbers of ranks determine W and C. Above {MISFIT:.0%} the model is not "
+            "asked about more ranks.",
         ),
     )  # fmt: skip
 
@@ -294,8 +298,13 @@ def _prediction_table(found: Sequence[StrongSeries]) -> Table:
 
 
 def predicted(s: StrongSeries) -> tuple[int, ...]:
-    """List the ranks beyond the measured ones that the model is asked about."""
+    """List the ranks beyond the measured ones that the model is asked about.
+
+    None where it does not even fit the measured ones.
+    """
     assert s.model is not None
+    if s.model.misfit > MISFIT:
+        return ()
     most = s.most or PREDICTED[-1]
     return tuple(n for n in PREDICTED if s.model.measured[-1] < n <= most)
 
