@@ -30,7 +30,10 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         family = registries.families[case["family"]]
         return family.emitted(case["form"], case["params"], ranks)
 
-    serve(solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit)
+    serve(
+        solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,
+        copies=request.get("copies", False),
+    )  # fmt: skip
     return 0
 
 

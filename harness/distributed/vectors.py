@@ -50,6 +50,8 @@ class Ranks:
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
+    #: what it takes, as measured by `harness.distributed.network.network`, if it was
+    network: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def size(self) -> int:

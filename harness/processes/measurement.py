@@ -126,7 +126,7 @@ def measured(
         canary_seconds=reply.answer["canary_seconds"],
         **{
             table: {part: tuple(pair) for part, pair in reply.answer[table].items()}
-            for table in ("rank_seconds", "rank_counts")
+            for table in ("rank_seconds", "rank_counts", "rank_network")
         },
     ), solution
 

@@ -58,12 +58,15 @@ def serve(
     operators: Mapping[str, Maker] = NO_MAKERS,
     ranks: Ranks | None = None,
     emit: Emit = lambda case, ranks: None,
+    *,
+    copies: bool = False,
 ) -> None:
     """Answer requests until there are no more.
 
     operators : what puts an operator P of a request together, see `harness.operators`
     ranks : that solve together, this process being one of them
     emit : has ranks emit the case of a request
+    copies : each of them solves by itself instead, all at the same time
     """
     bench = _Bench(solver, operators)
     if ranks is None:
@@ -75,7 +78,7 @@ def serve(
         bench.warm_up()
         follow(solver, ranks, operators, emit, _limit_memory)
         return
-    bench.on_ranks = OnRanks(solver, ranks, emit)
+    bench.on_ranks = OnRanks(solver, ranks, emit, copies=copies)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
     bench.on_ranks.end()
 
@@ -152,6 +155,7 @@ class _Bench:
             "reported": finite(dict(s.reported)),
             "rank_seconds": spent.seconds,
             "rank_counts": spent.counts,
+            "rank_network": spent.network,
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
