@@ -43,6 +43,7 @@ from problems.feti.distributed import (
 )
 from problems.feti.gluing import GLUE
 from problems.feti.operators import DualOperator, explicit_kinds
+from problems.feti.own_bodies import answers
 from problems.feti.structured import Integers, Layout, Places
 from problems.feti.tearing import Part, classify, images
 from problems.feti.torn import Kind, Subdomains
@@ -253,7 +254,8 @@ def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    return Emitted(total, b.size, share)
+    answer = answers(own, at, _contact_scale(problem))
+    return Emitted(total, b.size, share, answer)
 
 
 def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
