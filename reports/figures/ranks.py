@@ -65,6 +65,9 @@ def strong_figure(found: Sequence[StrongSeries]) -> Figure:
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
     if any(s.copies for s in found):
         keys.append(Key(label="as many copies at once", look=_copies_look(INK)))
+    if any(s.crowded(n) for s in found for n in s.several):
+        crowded = replace(look(0), dash=None, fill="none")
+        keys.append(Key(label="more ranks than CPUs: they took turns", look=crowded))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
     return _figure(panels, keys, columns=1)
 
@@ -81,7 +84,12 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
         for n in s.several
         if (ratio := s.reach(n, phase)) is not None
     ]
-    curves = [_curve(measured, _line(style), s.solver)]
+    free = [point for point in measured if not s.crowded(point[0])]
+    crowded = [point for point in measured if s.crowded(point[0])]
+    curves = [_curve(free, _line(style), s.solver)]
+    if crowded:
+        hollow = replace(style, dash=None, fill="none")
+        curves.append(_curve(crowded, hollow, s.solver))
     if len(copied) > 1:
         curves.insert(0, _curve(copied, _copies_look(style.colour), s.solver))
     return curves
@@ -186,7 +194,9 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
         marks: list[Mark] = []
         for i, s in enumerate(found):
             first = s.members[0].answer
-            copied = [(1, first), *sorted(s.copies.items())]
+            beside = {m.ranks for m in s.members}
+            copied = [(1, first)]
+            copied += [(n, o) for n, o in sorted(s.copies.items()) if n in beside]
             if len(copied) > 1:
                 marks += _times(copied, phase, _copies_look(look(i).colour), s.solver)
             answers = [(m.ranks, m.answer) for m in s.members]
