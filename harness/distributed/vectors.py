@@ -276,6 +276,19 @@ class Share(NamedTuple):
     whole: Callable[[Solution], Solution | None]
 
 
+class Emitted(NamedTuple):
+    """A QP that ranks have made together, each its share; no process has it whole."""
+
+    variables: int  #: of the whole
+    equality_rows: int  #: of the whole
+    #: puts this rank's operator together, anew each time: called by all ranks
+    share: Callable[[], Share]
+
+
+#: has all ranks emit a case, family, params and form; None where that is not built
+Emit = Callable[[Mapping[str, Any], Ranks], Emitted | None]
+
+
 @runtime_checkable
 class Distributable(Protocol):
     """A product x ↦ Px that can be done by several ranks.

@@ -30,14 +30,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator
 
 from harness.distributed.mpi import MISSING, mpiexec
 from harness.distributed.network import network
-from harness.distributed.vectors import Distributable, Ranks, Share
+from harness.distributed.vectors import (
+    Distributable,
+    Emit,
+    Emitted,
+    Ranks,
+    Share,
+)
+from harness.errors import InputError
 from harness.files.qpfile import load_qp
 from harness.operators import Maker, SerialisableOperator
 from harness.plugin import Solver
-from harness.qp import QP
+from harness.qp import QP, no_rows
 from harness.solution import Solution
 from harness.verify.measure import memory_mib
 
@@ -110,17 +119,31 @@ def follow(
     solver: Solver,
     ranks: Ranks,
     operators: Mapping[str, Maker],
+    emit: Emit,
     limit: Callable[[float | None], None],
 ) -> None:
     """Do on this rank what rank 0 orders, until it orders nothing more.
 
+    emit : makes this rank's share of a case
     limit : limits the memory of this process, in MiB
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
+    emitted: Emitted | None = None
     while (order := _next_order(ranks)) is not None:
         try:
-            if "qp" in order:
+            if "case" in order:
+                run = share = emitted = None  # before another one is made
+                with suppress(InputError):  # as on rank 0, which goes on with the whole
+                    emitted = emit(order["case"], ranks)
+                limit(order["memory_limit"])
+            elif "declines" in order and emitted is not None:
+                solver.declines(emitted.share().qp)
+            elif "tol" in order and emitted is not None:
+                share = emitted.share()
+                run = solver.prepare(share.qp, order["tol"])
+                ranks.comm.Barrier()
+            elif "qp" in order:
                 qp, _ = load_qp(Path(order["qp"]), operators=operators)
                 limit(order["memory_limit"])
                 share = _share(qp, ranks, copies=order["copies"])
@@ -171,16 +194,37 @@ class OnRanks:
 
     """
 
-    def __init__(self, solver: Solver, ranks: Ranks, *, copies: bool = False) -> None:
+    def __init__(
+        self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
+    ) -> None:
         self._solver = solver
         self._ranks = ranks
+        self._emit = emit
+        self._emitted: Emitted | None = None
         self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
         self.spent = Spent()
 
+    def emits(self, case: Mapping[str, Any], memory_limit: float | None) -> QP | None:
+        """Have all ranks make their shares of the next QP, where its family can.
+
+        Returns
+        -------
+        its sizes, as a QP without content; None where it is to be loaded: it cannot be
+        emitted by ranks, or each solves the whole
+
+        """
+        self._emitted = None
+        if self._copies:
+            return None
+        self._order({"case": dict(case), "memory_limit": memory_limit})
+        with suppress(InputError):  # why it cannot be shared will be said of the whole
+            self._emitted = self._emit(case, self._ranks)
+        return None if self._emitted is None else _sized(self._emitted)
+
     def takes(self, path: Path, memory_limit: float | None) -> None:
-        """Say in which file the next QP is."""
+        """Say in which file the next QP is, unless it is emitted."""
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
@@ -193,6 +237,9 @@ class OnRanks:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
+        if self._emitted is not None:
+            self._order({"declines": True})
+            return self._solver.declines(self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
             return "P cannot be shared by ranks; expected a case in subdomains"
@@ -205,12 +252,16 @@ class OnRanks:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Prepare on all ranks; it is done when the last one is."""
-        order = {
-            "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
-            "copies": self._copies,
-        }  # fmt: skip
-        self._order(order)
-        share = _share(qp, self._ranks, copies=self._copies)
+        if self._emitted is not None:
+            self._order({"tol": tol})
+            share = self._emitted.share()
+        else:
+            order = {
+                "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+                "copies": self._copies,
+            }  # fmt: skip
+            self._order(order)
+            share = _share(qp, self._ranks, copies=self._copies)
         run = self._solver.prepare(share.qp, tol)
         self._ranks.comm.Barrier()
 
@@ -227,6 +278,17 @@ class OnRanks:
     def _order(self, order: dict[str, Any] | None) -> None:
         for rank in range(1, self._ranks.size):
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
+
+
+def _sized(emitted: Emitted) -> QP:
+    """Make a QP with the sizes of one that no process has; it holds no numbers."""
+    n, m = emitted.variables, emitted.equality_rows
+    nothing = np.broadcast_to(0.0, n)
+    return QP(
+        P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
+        q=nothing, lb=nothing, ub=nothing, G=no_rows(n), h=np.zeros(0),
+        A=csr_array((m, n)), b=np.zeros(m),
+    )  # fmt: skip
 
 
 def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:

@@ -174,7 +174,7 @@ def _start(
     slip go on slipping when their friction changes.
     """
     C = problem.rows.C
-    x, mu = np.zeros(problem.b.size), np.zeros(len(C))
+    x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
