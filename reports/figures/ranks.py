@@ -39,6 +39,7 @@ from reports.figures.style import (
 from reports.statistics.intervals import Interval
 
 _BAND = 0.18  #: opacity
+_PALE = "#a9cde6"  #: a band in the first colour, in a legend
 _LONG = 72  #: letters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: times the values that an axis goes on for intervals
@@ -148,7 +149,7 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
         Key(label="model, not measured",
             look=Look(colour=COLOURS[0], dash=DASHED, width=1.4)),
         Key(label="band of the fit",
-            look=Look(colour=COLOURS[0], width=6.0, opacity=_BAND)),
+            look=Look(colour=_PALE, width=6.0)),
         Key(label="as many times as ranks", look=GUIDE),
     )  # fmt: skip
     return _figure(panels, keys, columns=4)
@@ -176,7 +177,7 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
                 start += taken
     keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
     keys.append(Key(label="rest", look=_bar(_REST)))
-    names = [f"{legible(s.case, 44)}, {n} ranks" for s, n in found]
+    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in found]
     panel = Panel(
         x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
         marks=tuple(marks), grid="x",
