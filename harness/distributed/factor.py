@@ -67,7 +67,7 @@ class Touched:
         return distributed(t / self.touching, self.ranks)
 
 
-def touched(rows: Rows, ranks: Ranks) -> Touched:
+def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
     """Tell the others which rows this rank touches, and learn which are shared."""
     every, count = np.unique(
         np.concatenate(ranks.comm.allgather(rows)), return_counts=True

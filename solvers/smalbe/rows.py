@@ -38,7 +38,7 @@ from harness.distributed.factor import (
     LocalFactor,
     SummedFactor,
     local_factor,
-    touched,
+    touched_rows,
 )
 from harness.distributed.vectors import DistributedColumns, distributed
 from solvers.smalbe import compiled
@@ -478,7 +478,7 @@ def rows_over_ranks(
     if not (size > 0).all():
         return None
     with ranks.clocked("coarse"):
-        at = touched(np.flatnonzero(np.diff(part.indptr)), ranks)
+        at = touched_rows(np.flatnonzero(np.diff(part.indptr)), ranks)
         if not at.few_shared:
             return sparse_rows(G, e, bounded)
         rows, here = at.rows, np.asarray(bounded)
