@@ -182,9 +182,8 @@ class SummedFactor:
             u, r = self.local.reduced(np.asarray(t))
             c = len(self.L_cc)
             z_c = _solved(self.L_cc, r[:c])
-            shared = np.zeros(len(self.L_ss))
-            shared[self.local.at.place] = r[c:] - self.L_sc @ z_c
-            z_s = _solved(self.L_ss, ranks.total(shared)) / np.sqrt(ranks.size)
+            z_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            z_s /= np.sqrt(ranks.size)
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
@@ -201,7 +200,21 @@ class SummedFactor:
 
     def __call__(self, t: Dense) -> DistributedVector:
         """Solve for the consistent y (k,) of an additive t (k,)."""
-        return self.backward(self.forward(t))
+        local, c = self.local, len(self.L_cc)
+        with local.at.ranks.clocked("coarse"):
+            u, r = local.reduced(np.asarray(t))
+            z_c = _solved(self.L_cc, r[:c])
+            x_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            x_s = _solved(self.L_ss, x_s, transposed=True)[local.at.place]
+            x_c = _solved(self.L_cc, z_c - x_s @ self.L_sc, transposed=True)
+            y = local.extended(u / self.root**2, np.concatenate([x_c, x_s]))
+            return distributed(y, local.at.ranks)
+
+    def _gathered(self, r: Dense) -> Dense:
+        """Add what all ranks have for the shared rows (s,)."""
+        shared = np.zeros(len(self.L_ss))
+        shared[self.local.at.place] = r
+        return self.local.at.ranks.total(shared)
 
 
 def local_factor(

@@ -36,6 +36,7 @@ from harness.distributed.vectors import (
 from harness.operators import Product
 from problems.fem.mesh import Nodes
 from problems.feti.operators import (
+    ROUNDING,
     SHIFT,
     DualOperator,
     Group,
@@ -125,6 +126,13 @@ class Halo:
     borrowed: Nodes  #: places in `rows` of what others own, neighbour by neighbour
     lends: NDArray[np.int64]  #: (ranks,) how many go to each
     borrows: NDArray[np.int64]  #: (ranks,) how many come from each
+
+    @property
+    def is_shared(self) -> NDArray[np.bool_]:
+        """Which of its rows other ranks touch, too."""
+        shared = np.zeros(self.rows.size, dtype=bool)
+        shared[self.borrowed] = shared[self.own[self.lent]] = True
+        return shared
 
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
@@ -225,12 +233,8 @@ class RankOperator:
         """
         at, equalities = self.halo, self.local.equalities
         diagonal = at.added(part.diagonal())
-        row, column = part.tocoo().coords
-        beside = (row != column) & (part.tocoo().data != 0)
         is_contact = at.rows >= equalities
-        coupled = np.zeros(at.rows.size, dtype=bool)
-        coupled[row[beside & ~is_contact[column]]] = True
-        coupled &= ~is_contact
+        coupled = np.isin(at.rows, _coupled(part, at, diagonal, ~is_contact))
         contact = touched_rows(at.rows[is_contact], at.ranks)
         solves = []
         if contact.few_shared:
@@ -249,6 +253,25 @@ class RankOperator:
             return np.asarray(y)
 
         return solve
+
+
+def _coupled(
+    part: csr_array, at: Halo, diagonal: Vector, some: NDArray[np.bool_]
+) -> Nodes:
+    """Find which of some rows (t,) the sum of all parts couples beyond rounding."""
+    row, column = part.tocoo().coords
+    size = np.sqrt(at.gathered(diagonal))
+    share = part.tocoo().data / (size[row] * size[column])
+    beside = (row != column) & some[row] & some[column] & (share != 0)
+    between = at.is_shared[row] & at.is_shared[column]
+    found = [at.rows[row[beside & ~between & (np.abs(share) > ROUNDING)]]]
+    told = [v[beside & between] for v in (at.rows[row], at.rows[column], share)]
+    rows, columns, shares = map(
+        np.concatenate, zip(*at.ranks.comm.allgather(told), strict=True)
+    )
+    pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
+    total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
+    return np.concatenate([*found, pairs[0, total > ROUNDING]])
 
 
 def _rank_by_rank(
