@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, cho_factor, solve_triangular
+from scipy.linalg import blas, cho_factor
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -140,8 +140,8 @@ class LocalFactor:
         S = np.zeros((s, s))
         try:
             L_cc = _cholesky(T[:c, :c])
-            L_sc = solve_triangular(L_cc, T[:c, c:], lower=True).T
-            S[np.ix_(place, place)] = T[c:, c:] - L_sc @ L_sc.T
+            L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
+            S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
             fails = 0.0
         except np.linalg.LinAlgError:  # to be said by all ranks alike
             fails = 1.0
@@ -253,10 +253,10 @@ def local_factor(
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return L with LLᵀ = M; an empty one where M is."""
+    """Return L with LLᵀ = M, its upper triangle not to be read."""
     if not len(M):
         return np.zeros((0, 0), order="F")
-    return np.asfortranarray(np.tril(cho_factor(M, lower=True)[0]))
+    return np.asfortranarray(cho_factor(M, lower=True)[0])
 
 
 def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
