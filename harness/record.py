@@ -118,6 +118,9 @@ class Record(Measurement):
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: alike: reductions, messages sent to neighbours, bytes of these
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: alike: what one of these takes, s: reduction_seconds, message_seconds,
+    #: seconds_per_byte; see `harness.distributed.network`
+    rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: or "sequence": may use what earlier steps left; "sequence, tighten=θ": to
     #: tolerances that tighten, see `Record.tighten`
     mode: str = "cold"
@@ -125,7 +128,9 @@ class Record(Measurement):
     #: sequence that tightens
     step_tol: float | None = None
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
-    role: str = ""  #: "null": the same solver once more, to show the noise
+    #: "null": the same solver once more, to show the noise; "copies": as many of it at
+    #: once as there are `ranks`, each by itself
+    role: str = ""
     primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
     dual: float | None = None
     complementarity: float | None = None
@@ -189,7 +194,7 @@ class Record(Measurement):
             del row["step_tol"]
         if self.ranks == 1:
             del row["ranks"]
-        for name in ("rank_seconds", "rank_counts"):
+        for name in ("rank_seconds", "rank_counts", "rank_network"):
             if not row[name]:
                 del row[name]
         return json.dumps(row, allow_nan=False)
@@ -338,6 +343,7 @@ def _check(r: Record) -> None:
     _check_nested("reported", r.reported, MOST_LEVELS)
     _check_spent("rank_seconds", r.rank_seconds)
     _check_spent("rank_counts", r.rank_counts)
+    _check_spent("rank_network", r.rank_network)
 
 
 def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:

@@ -62,6 +62,8 @@ class Ranks:
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
+    #: what it takes, as measured by `harness.distributed.network.network`, if it was
+    network: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -302,6 +304,19 @@ class Share(NamedTuple):
     qp: QP  #: vectors are distributed, A has distributed columns, b is on every rank
     #: gathers a solution of it on rank 0; None on the others
     whole: Callable[[Solution], Solution | None]
+
+
+class Emitted(NamedTuple):
+    """A QP that ranks have made together, each its share; no process has it whole."""
+
+    variables: int  #: of the whole
+    equality_rows: int  #: of the whole
+    #: puts this rank's operator together, anew each time: called by all ranks
+    share: Callable[[], Share]
+
+
+#: has all ranks emit a case, family, params and form; None where that is not built
+Emit = Callable[[Mapping[str, Any], Ranks], Emitted | None]
 
 
 @runtime_checkable

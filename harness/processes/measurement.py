@@ -76,6 +76,12 @@ def measured(
         was not started or was killed before its solve, a full disk, a lost file.
 
     """
+    asked = {
+        "family": record.family,
+        "params": dict(record.params),
+        "form": record.form,
+    }
+    emitted = {"case": asked} if record.ranks > 1 else {}
     limited = {} if isinf(memory_limit) else {"memory_limit": memory_limit}
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
     out = Path(request["out"])
@@ -83,7 +89,13 @@ def measured(
     try:
         _clear(out, returned)
         reply = worker.ask(
-            {**request, **limited, "out": str(returned), "tol": record.asked_tol},
+            {
+                **request,
+                **emitted,
+                **limited,
+                "out": str(returned),
+                "tol": record.asked_tol,
+            },
             time_limit=time_limit,
             memory_limit=memory_limit,
         )
@@ -120,7 +132,7 @@ def measured(
         canary_seconds=reply.answer["canary_seconds"],
         **{
             table: {part: tuple(pair) for part, pair in reply.answer[table].items()}
-            for table in ("rank_seconds", "rank_counts")
+            for table in ("rank_seconds", "rank_counts", "rank_network")
         },
     ), solution
 

@@ -200,6 +200,7 @@ _MEASURED: Mapping[str, Accepts] = {
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
     "rank_seconds": _named(_is_mean_and_largest),
     "rank_counts": _named(_is_mean_and_largest),
+    "rank_network": _named(_is_mean_and_largest),
     "first_seconds": _is_time,
     "canary_seconds": _is_size,
     **{journal_name(f.name): _cost(f) for f in fields(Measurement)},

@@ -91,7 +91,7 @@ class Certificate:
 
     u: Extended  #: û (n,)
     multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    equilibrium: Extended  #: u_λ (n,); of substructures torn, (N,)
+    off: Vector | Extended  #: û − u_λ (n,); of substructures torn, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
@@ -101,6 +101,11 @@ class Certificate:
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, from the answer to the admissible point
     seminorm: bool  #: whether some body can move rigidly: nothing bounds that
+
+    @property
+    def equilibrium(self) -> Extended:
+        """u_λ (n,) of bodies in one piece."""
+        return np.asarray(self.u - self.off)
 
     @property
     def gap(self) -> float:
@@ -184,8 +189,7 @@ def _least_norm(mechanics: Mechanics) -> float:
 
 def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | str]:
     """Yield what the answer's own pair proves and, if that is mostly work, others."""
-    exact, claimed = mechanics.exact, s.x.astype(Real)
-    u = claimed.copy()
+    exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
@@ -196,7 +200,7 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
         pairs.reverse()  # of large problems what mostly is enough comes first
     proven = np.inf
     for pair in pairs:
-        found = _proved(mechanics, claimed, u, *pair)
+        found = _proved(mechanics, s.x, u, *pair)
         yield found
         if _sharp(found):
             return
@@ -204,7 +208,7 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
     if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
-        yield _proved(mechanics, claimed, v, mu, states == CLOSED)
+        yield _proved(mechanics, s.x, v, mu, states == CLOSED)
 
 
 def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
@@ -224,8 +228,8 @@ def _sharp(found: Certificate | str) -> bool:
 
 
 def proof(
-    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
-    closed: Any,
+    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
+    multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (4) and (3) for the pair that mending u and λ yields.
 
@@ -236,7 +240,7 @@ def proof(
 
     """
     exact, motions = mechanics.exact, mechanics.motions
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     gaps = -exact.motion(feasible)
@@ -256,7 +260,7 @@ def proof(
     )
     middle = (feasible + at_rest) * Real(0.5)
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=at_rest,
+        mechanics, u=feasible, multipliers=lam, off=feasible - at_rest,
         norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
         apart=apart, left=left, works=works, rounding=rounding,
         from_middle=_length(mechanics, claimed - middle, held),
@@ -265,7 +269,8 @@ def proof(
 
 
 def _certificate(
-    mechanics: Mechanics, *, u: Extended, multipliers: Extended, equilibrium: Extended,
+    mechanics: Mechanics, *, u: Extended, multipliers: Extended,
+    off: Vector | Extended,
     norms: list[float], apart: float, left: float, works: Extended, rounding: float,
     from_middle: float, moved: float,
 ) -> Certificate:  # fmt: skip
@@ -290,7 +295,7 @@ def _certificate(
     around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
     pair = np.sqrt(2 * gap)
     found = Certificate(
-        u=u, multipliers=multipliers, equilibrium=equilibrium, norm=norms[0],
+        u=u, multipliers=multipliers, off=off, norm=norms[0],
         distance=total, work=work, sliding=float(works[~mechanics.exact.contact].sum()),
         rounding=rounding, claimed=from_middle + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
@@ -302,8 +307,8 @@ def _certificate(
 
 
 def _substructured_proof(
-    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
-    closed: Any,
+    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
+    multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (1) and (3) with the u_λ of `harness.verify.substructured`.
 
@@ -313,27 +318,30 @@ def _substructured_proof(
         When u or λ cannot be mended.
 
     """
-    exact, motions, parts = mechanics.exact, mechanics.motions, mechanics.substructures
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    exact = mechanics.exact
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
     near = neighbour(mechanics, feasible, lam)
-    moved = (parts.spread @ (claimed - feasible)).astype(np.float64)
-    stretched = (near.Ku, near.Kd, parts.product(moved))
-    energy = np.array([[v @ Kw for Kw in stretched] for v in (near.u, near.d, moved)])
+    moved = mechanics.still(claimed - feasible).astype(np.float64)
+    square, apart = near.square, float(near.d @ near.Kd)
+    across = float(mechanics.still(feasible) @ near.force)
+    shift = float(moved @ (mechanics.primal.P @ moved))
 
-    def length(*combined: float) -> float:
-        """Return the norm of a combination of Tû, d and T(u − û)."""
-        w = np.array(combined, dtype=Real)
-        return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
+    def length(square: float) -> float:
+        return float(np.sqrt(max(square, 0.0)))
 
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=near.u - near.d,
-        norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
-        apart=length(0, 1, 0), left=near.left,
+        mechanics, u=feasible, multipliers=lam, off=near.d,
+        norms=[
+            length(square), length(square - 2 * across + apart),
+            length(square - across + 0.25 * apart),
+        ],
+        apart=length(apart), left=near.left,
         works=exact.friction_work(feasible) - lam * exact.motion(feasible),
-        rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
+        rounding=0.0, moved=length(shift),
+        from_middle=length(shift + float(moved @ near.force) + 0.25 * apart),
     )  # fmt: skip
 
 

@@ -14,8 +14,12 @@ same, and identity (1) of `harness.verify.certificate` reads
     ½‖û − u*‖² + ½‖v − Tu*‖² + …  =  ½‖d‖²_{K_T} + Σ(g|v̂| − λ̂v̂)
 
 So the bound is the energy of d, which is small itself: nothing cancels but in ρ, and
-that is formed in extended precision. Multipliers of gluing and supports that a solver
-may have found are not looked at.
+that is formed in extended precision, with the stored K: what rounding makes of TᵀK_T T
+is as large as the errors of very accurate answers, and u* is the solution for K. For d
+the difference is one of the last digits. Multipliers of gluing and supports that a
+solver may have found are not looked at.
+
+Norms of û and of what is near it follow from  (Tû)ᵀK_T d = ûᵀTᵀb.
 
 Forces are shared as balancing domain decomposition does (Mandel 1993), in proportion to
 the stiffness W of the copies,
@@ -36,35 +40,41 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import csc_matrix, csr_array, diags_array
+from scipy.sparse import csc_array, csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
 from harness.mechanics import Extended, Mechanics
 from harness.qp import Vector
+from harness.verify.products import times_columns
 
 
 class Neighbour(NamedTuple):
-    """The u_λ near a displacement û, as torn displacements (N,)."""
+    """The u_λ near a displacement û, by its distance d = Tû − u_λ."""
 
-    u: Extended  #: Tû
-    Ku: Extended  #: K_T Tû
-    d: Vector  #: Tû − u_λ, as far as it was solved for
-    Kd: Vector  #: K_T d
+    square: float  #: ‖û‖²
+    d: Vector  #: (N,) as far as it was solved for
+    Kd: Vector  #: (N,) K_T d
     left: float  #: energy norm of the rest of d
+    force: Vector  #: (n,) TᵀK_T d, so that (Tu)ᵀK_T d = uᵀforce
 
 
 def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neighbour:
     """Find u_λ from an admissible û (n,) and λ̂ (m,)."""
     exact, parts = mechanics.exact, mechanics.substructures
-    torn = parts.spread @ u
-    pull = parts.product(torn)
-    residual = parts.spread.T @ pull - exact.f + exact.B.T @ multipliers
+    still = mechanics.still(u)
+    K = csc_array(mechanics.primal.P)
+    residual = times_columns(K.data, K.indices, K.indptr, still, u.size)
+    square = float(still @ residual)
+    residual += mechanics.primal.q
+    at = np.unique(mechanics.rows.indices)
+    residual[at] += exact.B[:, at].T @ multipliers
     residual[exact.held] = 0
     b = _shared(mechanics, residual.astype(np.float64))
     d = parts.solve(b)
     Kd = parts.product(d)
-    step = parts.solve(b - Kd)
-    return Neighbour(torn, pull, d, Kd, float(np.sqrt(abs(float((b - Kd) @ step)))))
+    b -= Kd
+    left = float(np.sqrt(abs(float(b @ parts.solve(b)))))
+    return Neighbour(square, d, Kd, left, parts.spread.T @ Kd)
 
 
 def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
@@ -73,26 +83,36 @@ def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
     Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
     parts, held = mechanics.substructures, mechanics.exact.held
-    squares = parts.spread.copy()
-    squares.data **= 2
+    squares = csr_array(parts.spread)
+    squares.data = squares.data**2
     total = squares.T @ parts.weight
     part = parts.weight / (squares @ total)
-    single = np.ones(total.size, dtype=bool)
-    single[held] = False
-    inner = (part > 1 - 1e-9) & (squares @ single > 1 - 1e-9)
-    at = np.flatnonzero(~inner)
-    T, R, w = parts.spread[at], parts.kernel[at], parts.weight[at]
+    jointly = squares.T @ np.ones(squares.shape[0]) > 1 + 1e-9
+    jointly[held] = True
+    at = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
     inverse = 1 / total
     inverse[held] = 0
-    WR = csr_array(diags_array(w) @ R)
+    T, R, w = csr_array(parts.spread[at]), csr_array(parts.kernel[at]), parts.weight[at]
+    touched = np.zeros(total.size, dtype=bool)
+    touched[T.indices] = True
+    number = np.cumsum(touched) - 1
+    T = csr_array((T.data, number[T.indices], T.indptr), shape=(at.size, touched.sum()))
+    inverse = inverse[touched]
+    WR = scaled_rows(R, w)
     TWR = csr_array(T.T @ WR)
-    coarse = R.T @ WR - TWR.T @ (diags_array(inverse) @ TWR)
+    coarse = R.T @ WR - TWR.T @ scaled_rows(TWR, inverse)
     solve = _coarse_solve(csr_array(coarse), _moved_together(mechanics))
     b = part * (parts.spread @ residual)
     for _ in range(2):  # the second time for the digits that the first one lost
         mu = solve(parts.kernel.T @ b)
         b[at] -= WR @ mu - w * (T @ (inverse * (TWR @ mu)))
     return np.asarray(b)
+
+
+def scaled_rows(M: csr_array, scale: Vector) -> csr_array:
+    """Multiply row i of M (k, l) by scale[i]."""
+    data = M.data * np.repeat(scale, np.diff(M.indptr))
+    return csr_array((data, M.indices, M.indptr), shape=M.shape)
 
 
 def _moved_together(mechanics: Mechanics) -> Any:

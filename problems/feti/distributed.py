@@ -65,21 +65,27 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
 
     """
     S = domains.kind.size
-    if S < ranks:
-        raise InputError(
-            f"{ranks} ranks for {S} subdomains; expected at most one rank for each"
-        )
     rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
     sub = np.searchsorted(domains.start, B.indices, side="right") - 1
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
     touches.data[:] = 1
-    rank = _balanced(touches, _work(B, domains), ranks)
+    rank = balanced(csr_array(touches.T @ touches), _work(B, domains), ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
+    reach.sort_indices()
     reach.data[:] = 1
-    turn = np.arange(B.shape[0]) % np.diff(reach.indptr)
-    return Parts(rank, reach, reach.indices[reach.indptr[:-1] + turn].astype(np.int64))
+    return Parts(rank, reach, owners(np.arange(B.shape[0]), reach))
+
+
+def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
+    """Choose one of the ranks that touch each of some rows (t,), in turn.
+
+    rows : their numbers
+    reach : (t, ranks) the ranks that touch them, ascending
+    """
+    turn = rows % np.diff(reach.indptr)
+    return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
@@ -88,15 +94,23 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.kind]
 
 
-def _balanced(
-    touches: csr_array, work: NDArray[np.int64], ranks: int
+def balanced(
+    graph: csr_array, work: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
-    """Partition the graph of subdomains that share rows, by work."""
+    """Partition the graph of subdomains that share rows, by work (S,).
+
+    graph : (S, S) how many rows they share
+    """
+    if work.size < ranks:
+        raise InputError(
+            f"{ranks} ranks for {work.size} subdomains; expected at most one rank for "
+            "each"
+        )
     if ranks == 1:
         return np.zeros(work.size, dtype=np.int64)
     import pymetis  # late: one process needs none
 
-    graph = csr_array(touches.T @ touches)
+    graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
     unit = max(int(work.min()), 1)
@@ -153,26 +167,26 @@ class Halo:
         return found
 
 
-def halo_of(parts: Parts, ranks: Ranks) -> Halo:
-    """Find what this rank exchanges with the others."""
-    me = ranks.rank
-    reach, owner = parts.reach.tocsc(), parts.owner
-    reached = [
-        np.sort(reach.indices[reach.indptr[r] : reach.indptr[r + 1]])
-        for r in range(ranks.size)
-    ]
-    rows = reached[me]
-    mine = np.flatnonzero(owner == me)
-    lent = [
-        np.searchsorted(mine, theirs[owner[theirs] == me]) if r != me else theirs[:0]
-        for r, theirs in enumerate(reached)
-    ]
-    borrowed = [
-        np.flatnonzero(owner[rows] == r) if r != me else rows[:0]
-        for r in range(ranks.size)
-    ]
+def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) -> Halo:
+    """Find what this rank exchanges with the others.
+
+    Parameters
+    ----------
+    rows : (t,) all that its subdomains touch, ascending
+    reach : (t, ranks) which ranks touch them
+    owner : (t,) rank of each
+
+    """
+    me, touched_by = ranks.rank, reach.tocsc()
+    own = np.flatnonzero(owner == me)
+    lent, borrowed = [], []
+    for r in range(ranks.size):
+        theirs = touched_by.indices[touched_by.indptr[r] : touched_by.indptr[r + 1]]
+        needed = np.sort(theirs[(owner[theirs] == me) & (r != me)])
+        lent.append(np.searchsorted(own, needed))
+        borrowed.append(np.flatnonzero((owner == r) & (r != me)))
     return Halo(
-        ranks=ranks, rows=rows, own=np.searchsorted(rows, mine),
+        ranks=ranks, rows=rows, own=own,
         lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
         lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
     )  # fmt: skip
@@ -384,7 +398,9 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     """
     B, domains = operator.B, operator.domains
     parts = partition(B, domains, ranks.size)
-    at = halo_of(parts, ranks)
+    touched_here = np.flatnonzero(parts.reach[:, [ranks.rank]].toarray())
+    reach = csr_array(parts.reach[touched_here])
+    at = halo(ranks, touched_here, reach, parts.owner[touched_here])
     mine = np.flatnonzero(parts.rank == ranks.rank)
     kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
     columns = np.concatenate(
@@ -405,13 +421,20 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         A=DistributedColumns(csr_array(qp.A[:, own]), ranks), b=np.array(qp.b),
     )  # fmt: skip
 
+    return Share(part, gathered_on_one(at, qp.q.size))
+
+
+def gathered_on_one(at: Halo, count: int) -> Callable[[Solution], Solution | None]:
+    """Make what gathers a solution of so many multipliers on rank 0."""
+
     def whole(s: Solution) -> Solution | None:
-        found = ranks.comm.gather((own, np.asarray(s.x), np.asarray(s.z_box)))
+        told = at.rows[at.own], np.asarray(s.x), np.asarray(s.z_box)
+        found = at.ranks.comm.gather(told)
         if found is None:
             return None
-        x, z_box = np.empty(qp.q.size), np.empty(qp.q.size)
+        x, z_box = np.empty(count), np.empty(count)
         for rows, x_part, z_part in found:
             x[rows], z_box[rows] = x_part, z_part
         return replace(s, x=x, z_box=z_box)
 
-    return Share(part, whole)
+    return whole

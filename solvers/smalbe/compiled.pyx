@@ -19,9 +19,9 @@ over vectors are in `vectors.h`.
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.string cimport memcpy, memset
-from scipy.linalg.cython_blas cimport dgemv, dsymv
+from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev,
+    dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
 import numpy as np
@@ -33,6 +33,10 @@ cdef extern from "vectors.h" nogil:
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
+    void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
+                    Py_ssize_t n)
+    void add_combination(double s, const double *U, const double *c, double *y,
+                         Py_ssize_t k, Py_ssize_t n)
     void lengths(const double *x, const double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
     void move(double alpha, double *x, double *g, const double *p, const double *Hp,
@@ -43,13 +47,24 @@ cdef extern from "vectors.h" nogil:
     void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, double tau, double *phi,
                  double *free, Py_ssize_t n, double *told)
+    void within(const double *x, const double *origin, const double *lower,
+                const double *upper, double *s, Py_ssize_t n)
     void turn(const double *z, double gamma, double *p, Py_ssize_t n)
+    void symmetric_product(const double *F, double s, const double *v, double *y,
+                           Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    int cholesky(double *S, Py_ssize_t k)
+    void solve(const double *L, double *y, Py_ssize_t k)
+    Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
 
 
 # --- the matrix ---------------------------------------------------------------------
+
+
+cdef enum:
+    BY_BLAS = 600  # unknowns from which on a dense P comes from memory, not from caches
 
 
 cdef class Product:
@@ -95,7 +110,9 @@ cdef class Product:
         cdef double[::1] vector, result
         cdef int n = self.n, one = 1
         cdef double zero = 0.0
-        if self.dense:
+        if self.dense and self.n < BY_BLAS:
+            symmetric_product(self.dense, s, v, y, self.n)
+        elif self.dense:
             dsymv(b"U", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
                   y, &one)
         elif self.data:
@@ -121,28 +138,6 @@ cdef double *pointer(double[::1] v) noexcept:
 
 cdef double *first(const double[:, ::1] M) noexcept:
     return <double *> &M[0, 0] if M.shape[0] and M.shape[1] else NULL
-
-
-cdef void rows_times(
-    const double *U, const double *v, double *out, Py_ssize_t k, Py_ssize_t n
-) noexcept nogil:
-    """out ← Uv for U (k, n) by rows."""
-    cdef int columns = k, order = n, one = 1
-    cdef double unit = 1.0, zero = 0.0
-    if k and n:
-        dgemv(b"T", &order, &columns, &unit, <double *> U, &order, <double *> v, &one,
-              &zero, out, &one)
-
-
-cdef void add_combination(
-    double s, const double *U, const double *c, double *out, Py_ssize_t k, Py_ssize_t n
-) noexcept nogil:
-    """out ← out + s Uᵀc for U (k, n) by rows."""
-    cdef int columns = k, order = n, one = 1
-    cdef double unit = 1.0
-    if k and n:
-        dgemv(b"N", &order, &columns, &s, <double *> U, &order, <double *> c, &one,
-              &unit, out, &one)
 
 
 cdef void without(
@@ -235,7 +230,7 @@ def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int step
     """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`."""
     cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
     cdef int kept, info = 0, again
-    steps = min(steps, n)
+    steps = min(steps, n - r)  # in the range of P
     bases, told, offs = np.zeros((steps, n)), np.zeros(steps), np.zeros(steps)
     cdef double[:, ::1] basis = bases
     cdef double[::1] diagonal = told, off = offs, v = np.array(start), Cv = np.empty(r)
@@ -308,6 +303,8 @@ def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q,
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
 cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
 cdef double NO_SHIFT = 1e-13  # x̃ of this size relative to ν is rounding of e = 0
+cdef double FOUND = 1e-3  # residual over value of a Ritz pair where the spectrum decays
+cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
@@ -332,11 +329,16 @@ cdef class Model:
     It keeps U_F U_Fᵀ for the face F for which it was asked last.
     """
 
-    cdef Py_ssize_t n, k, flips
+    cdef Py_ssize_t n, k, stride, flips
     cdef bint entered
     cdef double tau
-    cdef double[:, ::1] U, gram
-    cdef double[::1] w, root, held, column
+    cdef double[:, ::1] U
+    cdef double[::1] w, room
+    cdef double *root
+    cdef double *gram
+    cdef double *column
+    cdef double *held
+    cdef int[::1] where
 
     @staticmethod
     cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
@@ -376,33 +378,46 @@ cdef class Model:
         The rows are orthonormal, so that it is I less what is held; after as many
         changes as there are components it is summed up anew.
         """
-        cdef Py_ssize_t i, j
-        cdef double was, held
-        cdef double *gram
+        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        cdef double was
         if not self.entered:
             self.entered = True
-            self.root, self.column = np.sqrt(self.w), np.empty(self.k)
-            self.gram, self.held = np.eye(self.k), np.zeros(self.n)
-        gram = &self.gram[0, 0]
+            self.stride = stride = (k + 3) & ~3
+            self.room = np.zeros(stride * (stride + 2) + self.n)
+            self.gram = &self.room[0]
+            self.root = self.gram + stride * stride
+            self.column, self.held = self.root + stride, self.root + 2 * stride
+            self.where, self.flips = np.empty(self.n, dtype=np.int32), self.n + 1
+            for j in range(k):
+                self.root[j] = sqrt(self.w[j])
         if self.flips > self.n:
             self.flips = 0
-            memset(gram, 0, self.k * self.k * sizeof(double))
-            for i in range(self.k):
-                gram[i * self.k + i] = 1.0
-            memset(&self.held[0], 0, self.n * sizeof(double))
-        for i in range(self.n):
-            was, held = self.held[i], piece[i] != 0
-            if was != held:
-                for j in range(self.k):
-                    self.column[j] = self.U[j, i]
-                add_gram(was - held, &self.column[0], gram, self.k)
-                self.held[i] = held
-                self.flips += 1
+            memset(self.gram, 0, stride * stride * sizeof(double))
+            for i in range(k):
+                self.gram[i * stride + i] = 1.0
+            memset(self.held, 0, self.n * sizeof(double))
+        for c in range(changed(piece, self.held, self.n, &self.where[0])):
+            i = self.where[c]
+            was = 1 - self.held[i]
+            for j in range(k):
+                self.column[j] = self.U[j, i]
+            add_gram(2 * was - 1, self.column, self.gram, stride)
+            self.flips += 1
         return 0
 
 
 def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
+
+
+cdef copied(const double *v, Py_ssize_t n):
+    """Make an array of it."""
+    cdef double[::1] made
+    told = np.empty(n)
+    made = told
+    if n:
+        memcpy(&made[0], v, n * sizeof(double))
+    return told
 
 
 cdef class Solver:
@@ -418,82 +433,127 @@ cdef class Solver:
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef int expansion
     cdef double[:, ::1] C, GC, vectors
-    cdef const double[::1] q, diagonal
-    cdef double[::1] x_tilde, b, lower, upper, above, rhs
-    cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
-    cdef double[::1] piece, piece2, Cv, Cw, Ge, told
+    cdef const double[::1] told_q, told_diagonal
+    cdef double[::1] shift, right, least, most, above, room
+    cdef const double *q
+    cdef const double *diagonal  # NULL where an operator does not tell
+    cdef double *x_tilde
+    cdef double *b
+    cdef double *lower
+    cdef double *upper
+    cdef double *rhs
+    cdef double *x
+    cdef double *g
+    cdef double *p
+    cdef double *Hp
+    cdef double *phi
+    cdef double *free
+    cdef double *z
+    cdef double *s
+    cdef double *Hs
+    cdef double *t
+    cdef double *x2
+    cdef double *g2
+    cdef double *box_lower
+    cdef double *box_upper
+    cdef double *piece
+    cdef double *piece2
+    cdef double *Cv
+    cdef double *Cw
+    cdef double *y
+    cdef double *dy
+    cdef double *y2
+    cdef double *slope
+    cdef double *slope2
+    cdef double *c
+    cdef double *core
+    cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
-    cdef double[::1] y, dy, y2, slope, slope2, c, c2
-    cdef double[:, ::1] core, inverse
 
     def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
-        cdef Py_ssize_t i, k
+        cdef Py_ssize_t i, k, n
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
-        self.C, self.GC, self.x_tilde = map(_whole, (rows.C, rows.GC, rows.x_tilde))
+        self.C, self.GC, self.shift = map(_whole, (rows.C, rows.GC, rows.x_tilde))
         self.n, self.r, self.m = F.n, self.C.shape[0], self.GC.shape[0]
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
         self.e_size, self.x_tilde_size = rows.e_size, np.linalg.norm(rows.x_tilde)
-        self.b, self.q = _whole(problem.b), _whole(problem.q)
-        self.lower, self.upper = map(_whole, problem.bounds)
-        self.diagonal = _whole(problem.diagonal)
+        self.right, self.told_q = _whole(problem.b), _whole(problem.q)
+        self.least, self.most = map(_whole, problem.bounds)
+        self.told_diagonal = _whole(problem.diagonal)
         self.alpha, self.Gamma_square, self.reduced = alpha, rules.Gamma**2, rules.reduced
         self.expansion = ("std", "projcg", "mixed", "model").index(rules.expansion)
         self.newton_proportions = rules.proportioning == "model"
         self.plain = rules.expansion != "model"
         self.preconditioned = preconditioned
-        k = 0
         if spectrum.ritz is not None:
-            above, vectors, self.tail = problem.upper_end()
-            k = len(above) + self.r
-            self.above, self.vectors = np.zeros(k), np.concatenate((vectors, rows.C))
-            for i in range(k):
-                self.above[i] = (above[i] if i < k - self.r else 0.0) - self.tail
+            values, residuals, vectors, _ = spectrum.ritz
+            self.find_upper_end(_whole(values), _whole(residuals), vectors, rows.C)
+        k = self.above.shape[0] if spectrum.ritz is not None else 0
         n = self.n
-        cdef double[:, ::1] room = np.empty((17, n)), small = np.empty((7, k))
-        cdef double[:, ::1] cores = np.empty((2 * k, k)), tiny = np.empty((2, self.r))
-        self.x, self.g, self.p, self.Hp, self.phi = (
-            room[0], room[1], room[2], room[3], room[4]
-        )
-        self.free, self.z, self.s, self.Hs, self.t = (
-            room[5], room[6], room[7], room[8], room[9]
-        )
-        self.x2, self.g2, self.box_lower, self.box_upper = (
-            room[10], room[11], room[12], room[13]
-        )
-        self.rhs, self.piece, self.piece2 = room[14], room[15], room[16]
-        self.Cv, self.Cw = tiny[0], tiny[1]
-        self.Ge, self.told = np.empty(self.m), np.empty(4)
-        self.y, self.dy, self.y2, self.slope = small[0], small[1], small[2], small[3]
-        self.slope2, self.c, self.c2 = small[4], small[5], small[6]
-        self.core, self.inverse = cores[:k], cores[k:]
+        self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
+        self.lower, self.upper = pointer(self.least), pointer(self.most)
+        self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
+        self.room = np.empty(17 * n + 2 * self.r + (6 + k) * k)
+        cdef double *at = pointer(self.room)
+        self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.phi, self.free, self.z, self.s = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.box_lower, self.box_upper, self.rhs = at, at + n, at + 2 * n
+        self.piece, self.piece2 = at + 3 * n, at + 4 * n
+        at += 5 * n
+        self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
+        self.slope2, self.c, self.core = at + 4 * k, at + 5 * k, at + 6 * k
+        at += (6 + k) * k
+        self.Cv, self.Cw = at, at + self.r
+
+    cdef int find_upper_end(self, const double[::1] values, const double[::1] residuals,
+                            vectors, rows) except -1:
+        """Choose what a model holds, as `Projected.upper_end` does."""
+        cdef Py_ssize_t i, found = values.shape[0], kept
+        kept = max(found - (1 if residuals[found - 1] <= 1e-10 * values[0] else 2), 0)
+        for i in range(kept):
+            if residuals[i] > values[i]:
+                kept = i
+                break
+        if residuals[0] > FOUND * values[0]:
+            kept = 0
+        self.tail = fmax((values[kept] + residuals[kept]) / self.norm, TAIL)
+        self.vectors = np.concatenate((vectors[:kept], rows))
+        self.above = np.full(kept + self.r, -self.tail)
+        for i in range(kept):
+            self.above[i] += (values[i] + residuals[i]) / self.norm
+        return 0
 
     # the operator
 
     cdef int H(self, const double *v, double *out) except -1:
         """out ← Hv = PFPv/‖PFP‖ + ρQv; one product."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *Pv = pointer(self.t)
+        cdef double *Pv = self.t
         if not self.r:
             self.F.apply(v, out, self.inverse_norm)
             return 0
         memcpy(Pv, v, n * sizeof(double))
-        without(first(self.C), self.r, Pv, &self.Cv[0], n)
+        without(first(self.C), self.r, Pv, self.Cv, n)
         self.F.apply(Pv, out, self.inverse_norm)
-        rows_times(first(self.C), out, &self.Cw[0], self.r, n)
+        rows_times(first(self.C), out, self.Cw, self.r, n)
         for i in range(self.r):
             self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
-        add_combination(1.0, first(self.C), &self.Cw[0], out, self.r, n)
+        add_combination(1.0, first(self.C), self.Cw, out, self.r, n)
         return 0
 
     cdef double infeasibility(self, const double *x):
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
         cdef Py_ssize_t i
         cdef double square = 0.0
-        rows_times(first(self.C), x, pointer(self.Cv), self.r, self.n)
+        rows_times(first(self.C), x, self.Cv, self.r, self.n)
         for i in range(self.r):
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
@@ -514,15 +574,13 @@ cdef class Solver:
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
         cdef Py_ssize_t i, j, k = B.k
-        cdef double *S = first(self.core)
-        cdef int order = k, info = 0
+        cdef double *S = self.core
         B.enter(piece)
         for i in range(k):
-            for j in range(k):
-                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i, j]
+            for j in range(i + 1):
+                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i * B.stride + j]
             S[i * k + i] += B.tau
-        dpotrf(b"U", &order, S, &order, &info)
-        if info:
+        if not cholesky(S, k):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -531,7 +589,7 @@ cdef class Solver:
                    double *slope) noexcept:
         """Find s(y), its piece and the slope Us − W⁻¹y."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *t = pointer(self.t)
+        cdef double *t = self.t
         if not B.k:
             tilted(x, g, B.tau, lower, upper, s, piece, n)
             return
@@ -547,15 +605,14 @@ cdef class Solver:
                            double *s) except -1:
         """s ← argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u, as `Model.step` does."""
         cdef Py_ssize_t i, newton, search, n = self.n, k = B.k
-        cdef double *y = pointer(self.y)
-        cdef double *dy = pointer(self.dy)
-        cdef double *there = pointer(self.y2)
-        cdef double *slope = pointer(self.slope)
-        cdef double *slope_there = pointer(self.slope2)
-        cdef double *piece = &self.piece[0]
-        cdef double *piece_there = &self.piece2[0]
+        cdef double *y = self.y
+        cdef double *dy = self.dy
+        cdef double *there = self.y2
+        cdef double *slope = self.slope
+        cdef double *slope_there = self.slope2
+        cdef double *piece = self.piece
+        cdef double *piece_there = self.piece2
         cdef double begun, now, low, high, at_low, at_high, t, share
-        cdef int order = k, one = 1, info = 0
         if not k:
             self.tilt(B, x, g, lower, upper, y, s, piece, slope)
             return 0
@@ -565,7 +622,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            dpotrs(b"U", &order, &one, first(self.core), &order, dy, &order, &info)
+            solve(self.core, dy, k)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -604,7 +661,7 @@ cdef class Solver:
         cdef Py_ssize_t i
         cdef double square = dot(s, s, self.n), rest = square, missing, tau
         missing = sHs - B.tau * square
-        rows_times(B.rows(), s, pointer(self.c), B.k, self.n)
+        rows_times(B.rows(), s, self.c, B.k, self.n)
         for i in range(B.k):
             rest -= self.c[i] * self.c[i]
             missing -= B.w[i] * self.c[i] * self.c[i]
@@ -617,47 +674,37 @@ cdef class Solver:
 
     cdef void split(self):
         """Split the gradient at x by the face on which x lies."""
-        split(&self.x[0], &self.g[0], &self.lower[0], &self.upper[0], self.B.tau,
-              &self.phi[0], &self.free[0], self.n, &self.told[0])
+        split(self.x, self.g, self.lower, self.upper, self.B.tau,
+              self.phi, self.free, self.n, self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
         self.reduced_square = self.told[2]
 
     cdef int enter_face(self) except -1:
         """Have the preconditioner know the face."""
-        cdef Py_ssize_t i, j, k
-        cdef double *N = first(self.inverse)
-        cdef int order, info = 0
-        if not self.preconditioned or not self.preconditioner.k:
-            return 0
-        cdef Model M = self.preconditioner
-        k = order = M.k
-        for i in range(self.n):
-            self.piece[i] = 1 - self.free[i]
-        self.factor(M, &self.piece[0])
-        memcpy(N, first(self.core), k * k * sizeof(double))
-        dpotri(b"U", &order, N, &order, &info)
-        for i in range(k):
-            for j in range(i + 1):
-                N[i * k + j] *= M.root[i] * M.root[j]
-                N[j * k + i] = N[i * k + j]
+        cdef Py_ssize_t i
+        if self.preconditioned and self.preconditioner.k:
+            for i in range(self.n):
+                self.piece[i] = 1 - self.free[i]
+            self.factor(self.preconditioner, self.piece)
         return 0
 
     cdef const double *preconditioned_gradient(self) noexcept:
         """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
-        cdef Py_ssize_t i, n = self.n, k
-        cdef double tau
-        cdef const double *U
-        cdef double *z = &self.z[0]
-        if not self.preconditioned or not self.preconditioner.k:
-            return &self.phi[0]  # directions have no length
-        k, tau = self.preconditioner.k, self.preconditioner.tau
-        U = self.preconditioner.rows()
-        memcpy(z, &self.phi[0], n * sizeof(double))
-        rows_times(U, z, &self.c[0], k, n)
-        rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
-        add_combination(-1.0, U, &self.c2[0], z, k, n)
+        cdef Py_ssize_t i, n = self.n
+        cdef Model M = self.preconditioner
+        cdef double *z = self.z
+        if not self.preconditioned or not M.k:
+            return self.phi  # directions have no length
+        memcpy(z, self.phi, n * sizeof(double))
+        rows_times(M.rows(), z, self.c, M.k, n)
+        for i in range(M.k):
+            self.c[i] *= M.root[i]
+        solve(self.core, self.c, M.k)
+        for i in range(M.k):
+            self.c[i] *= M.root[i]
+        add_combination(-1.0, M.rows(), self.c, z, M.k, n)
         for i in range(n):
-            z[i] *= self.free[i] / tau
+            z[i] *= self.free[i] / M.tau
         return z
 
     # MPRGP
@@ -672,7 +719,7 @@ cdef class Solver:
 
     cdef void to(self, double alpha, const double *p, const double *Hp):
         """x ← x − αp; the gradient follows without a product."""
-        move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
+        move(alpha, self.x, self.g, p, Hp, self.lower, self.upper,
              self.n)
 
     cdef double searched(self, double *s, double *Hs) except? -1:
@@ -690,8 +737,8 @@ cdef class Solver:
         self.H(s, Hs)
         scale(-1.0, s, n)
         scale(-1.0, Hs, n)
-        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
-                &self.told[0])
+        lengths(self.x, self.g, s, Hs, self.lower, self.upper, n,
+                self.told)
         return fmin(self.told[0], fmax(1.0, self.told[1]))
 
     cdef int step_by_model(self) except -1:
@@ -700,11 +747,11 @@ cdef class Solver:
         0 where there is nothing to gain, or the cost falls without end.
         """
         cdef Py_ssize_t i, n = self.n
-        cdef double *s = &self.s[0]
-        cdef double *Hs = &self.Hs[0]
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
         cdef double length
-        self.step_of_model(self.B, &self.x[0], &self.g[0], &self.lower[0],
-                           &self.upper[0], s)
+        self.step_of_model(self.B, self.x, self.g, self.lower,
+                           self.upper, s)
         length = self.searched(s, Hs)
         if length == 0 or isinf(length):
             return 0
@@ -716,7 +763,7 @@ cdef class Solver:
     cdef int proportion(self, bint by_model) except -1:
         """Take a step that frees components; 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *beta = &self.s[0]
+        cdef double *beta = self.s
         if by_model:
             return self.step_by_model()
         for i in range(n):
@@ -726,12 +773,12 @@ cdef class Solver:
                 or (self.g[i] > 0 and self.x[i] > self.lower[i])
             ):
                 beta[i] = self.g[i]
-        self.H(beta, &self.Hs[0])
-        lengths(&self.x[0], &self.g[0], beta, &self.Hs[0], &self.lower[0],
-                &self.upper[0], n, &self.told[0])
+        self.H(beta, self.Hs)
+        lengths(self.x, self.g, beta, self.Hs, self.lower,
+                self.upper, n, self.told)
         if isinf(fmin(self.told[0], self.told[1])):
             return 0
-        self.to(fmin(self.told[0], self.told[1]), beta, &self.Hs[0])
+        self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
         return 1
 
     cdef int expand(self, double cg, double feasible, bint is_first) except -1:
@@ -742,32 +789,32 @@ cdef class Solver:
             for i in range(n):
                 step = self.x[i] - cg * self.p[i]
                 self.x2[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
-            self.gradient(&self.x2[0], &self.g2[0])
+            self.gradient(self.x2, self.g2)
             if self.expansion == PROJCG or (
-                self.cost(&self.x2[0], &self.g2[0]) <= self.cost(&self.x[0], &self.g[0])
+                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g)
             ):
-                memcpy(&self.x[0], &self.x2[0], n * sizeof(double))
-                memcpy(&self.g[0], &self.g2[0], n * sizeof(double))
+                memcpy(self.x, self.x2, n * sizeof(double))
+                memcpy(self.g, self.g2, n * sizeof(double))
                 return b"e"
         if self.expansion == MODEL:
             return self.expand_by_model(cg, feasible, is_first)
-        self.to(feasible, &self.p[0], &self.Hp[0])
+        self.to(feasible, self.p, self.Hp)
         self.split()
         for i in range(n):
             step = self.x[i] - self.phi[i] / self.B.tau  # cuts φ to φ̃
             self.x[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
-        self.gradient(&self.x[0], &self.g[0])
+        self.gradient(self.x, self.g)
         return b"f" if self.expansion == MIXED else b"e"
 
     cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
         """Project x − α_cg p on the box in the metric of the model."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *p = &self.p[0]
-        cdef double *Hp = &self.Hp[0]
-        cdef double *s = &self.s[0]
-        cdef double *Hs = &self.Hs[0]
-        cdef double *lower = &self.box_lower[0]
-        cdef double *upper = &self.box_upper[0]
+        cdef double *p = self.p
+        cdef double *Hp = self.Hp
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
+        cdef double *lower = self.box_lower
+        cdef double *upper = self.box_upper
         cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
         cdef bint held, release = is_first and self.B.k > 0
         change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
@@ -780,14 +827,15 @@ cdef class Solver:
             self.x2[i] = self.x[i] - beyond * p[i]
             self.g2[i] = self.g[i] - beyond * Hp[i]
         tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
-        self.step_of_model(self.B, &self.x2[0], &self.g2[0], lower, upper, s)
+        self.step_of_model(self.B, self.x2, self.g2, lower, upper, s)
         self.B.tau = tau
+        within(self.x2, self.x, lower, upper, s, n)
         for i in range(n):
-            held = lower[i] == upper[i] and not release
-            s[i] = 0.0 if held else self.x2[i] + s[i] - self.x[i]
-        if dot(&self.g[0], s, n) >= 0:
+            if lower[i] == upper[i] and not release:
+                s[i] = 0.0
+        if dot(self.g, s, n) >= 0:
             beyond = 0.0
-            self.step_of_model(self.B, &self.x[0], &self.g[0], lower, upper, s)
+            self.step_of_model(self.B, self.x, self.g, lower, upper, s)
         length = self.searched(s, Hs)
         if length == 0:
             return b"e"
@@ -804,7 +852,7 @@ cdef class Solver:
     cdef int gradient(self, const double *x, double *g) except -1:
         """g ← Hx − b; one product."""
         self.H(x, g)
-        add(-1.0, &self.rhs[0], g, self.n)
+        add(-1.0, self.rhs, g, self.n)
         return 0
 
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
@@ -817,7 +865,7 @@ cdef class Solver:
         cdef double weight
         self.split()
         self.enter_face()
-        memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
+        memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
@@ -832,9 +880,9 @@ cdef class Solver:
                 by_model = by_model and self.newton_proportions
                 letter = b"p" if self.proportion(by_model) else 0
             else:
-                self.H(&self.p[0], &self.Hp[0])
-                lengths(&self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
-                        &self.lower[0], &self.upper[0], self.n, &self.told[0])
+                self.H(self.p, self.Hp)
+                lengths(self.x, self.g, self.p, self.Hp,
+                        self.lower, self.upper, self.n, self.told)
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
@@ -848,29 +896,29 @@ cdef class Solver:
                 return 0
             self.split()
             self.enter_face()
-            memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
+            memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
             steps += 1
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
         if note is not None:
-            note(chr(letter), np.array(self.x), np.array(self.g))
+            note(chr(letter), copied(self.x, self.n), copied(self.g, self.n))
         return 0
 
     cdef void minimise_along_p(self):
         """Take the CG step whose `lengths` are told, and find the next direction."""
         cdef double curvature = self.told[3], z_Hp
         cdef const double *z
-        advance(self.told[0], &self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
-                &self.lower[0], &self.upper[0], self.B.tau, &self.phi[0],
-                &self.free[0], self.n, &self.told[0])
+        advance(self.told[0], self.x, self.g, self.p, self.Hp,
+                self.lower, self.upper, self.B.tau, self.phi,
+                self.free, self.n, self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
         self.reduced_square, z_Hp = self.told[2], self.told[3]
         z = self.preconditioned_gradient()
-        if z != &self.phi[0]:
-            z_Hp = dot(z, &self.Hp[0], self.n)
-        turn(z, z_Hp / curvature, &self.p[0], self.n)
+        if z != self.phi:
+            z_Hp = dot(z, self.Hp, self.n)
+        turn(z, z_Hp / curvature, self.p, self.n)
 
     # when to stop
 
@@ -878,7 +926,7 @@ cdef class Solver:
         """Whether an inner run may end."""
         cdef double size = sqrt(self.phi_square + self.beta_square)
         if self.r and size < until.coarse:
-            if size < until.M * self.infeasibility(&self.x[0]):
+            if size < until.M * self.infeasibility(self.x):
                 return True
         return size <= until.small and self.small(tol, energy, b_size)
 
@@ -894,13 +942,13 @@ cdef class Solver:
 
     cdef bint met(self, double tol, double b_size):
         """Whether the equality rows are met, as `Rows.met` says."""
-        cdef double error = self.infeasibility(&self.x[0]), square = 0.0, part
+        cdef double error = self.infeasibility(self.x), square = 0.0, part
         cdef Py_ssize_t i
-        part = sqrt(dot(&self.x[0], &self.x[0], self.n))
+        part = sqrt(dot(self.x, self.x, self.n))
         if self.e_size == 0 or self.x_tilde_size <= NO_SHIFT * part:
             return error <= tol * fmax(part, b_size)
         for i in range(self.m):
-            part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0
+            part = dot(&self.GC[i, 0], self.Cv, self.r) if self.r else 0.0
             square += part * part
         return error <= tol * self.x_tilde_size and sqrt(square) <= tol * self.e_size
 
@@ -908,7 +956,7 @@ cdef class Solver:
         """Estimate the relative energy error, as `Projected.energy_error` does."""
         cdef double energy = 0.0, most = 0.0, total = 0.0, part, noise
         cdef Py_ssize_t i
-        if not self.diagonal.shape[0]:
+        if not self.diagonal:
             return 0.0
         for i in range(self.n):
             energy += self.q[i] * (self.x_tilde[i] + self.x[i])
@@ -936,7 +984,7 @@ cdef class Solver:
         for i in range(n):
             nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
         self.H(pointer(nu), pointer(g))
-        add(-1.0, pointer(self.b), pointer(g), n)
+        add(-1.0, self.b, pointer(g), n)
         for i in range(self.r):
             add(mu[i], &self.C[i, 0], pointer(g), n)
         return start, gradient
@@ -957,33 +1005,36 @@ cdef class Solver:
         cdef double energy = constants.energy
         cdef bint stopped, enough, solved, stalled
         cdef Until until
-        np.asarray(self.x)[:], np.asarray(self.g)[:] = at.nu, at.g
+        cdef const double[::1] nu = _whole(at.nu), g = _whole(at.g)
+        if n:
+            memcpy(self.x, &nu[0], n * sizeof(double))
+            memcpy(self.g, &g[0], n * sizeof(double))
         self.rho, self.most_products = at.rho, 0
         cdef double[::1] mu = np.array(at.mu)
-        cdef double b_size = sqrt(dot(pointer(self.b), pointer(self.b), n))
-        b_size = b_size or sqrt(dot(&self.g[0], &self.g[0], n))
+        cdef double b_size = sqrt(dot(self.b, self.b, n))
+        b_size = b_size or sqrt(dot(self.g, self.g, n))
         until.small, until.coarse = tol * b_size, constants.eta * b_size
         done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
         status = "iteration_limit"
         while True:
             trace, until.M = bytearray(), M
-            self.rhs[:] = self.b
+            memcpy(self.rhs, self.b, n * sizeof(double))
             for i in range(self.r):
-                add(-mu[i], &self.C[i, 0], &self.rhs[0], n)
+                add(-mu[i], &self.C[i, 0], self.rhs, n)
             if self.plain:
                 self.B = self.plain_model()
             if self.preconditioned or not self.plain:
                 self.preconditioner = self.model(self.rho)
                 if not self.plain:
                     self.B = self.preconditioner
-            note = watch and watch(len(at.outer) + len(done), np.array(self.rhs))
+            note = watch and watch(len(at.outer) + len(done), copied(self.rhs, n))
             stopped = self.minimise(
                 until, tol, energy, b_size, max(left, 0), trace, note
             )
             left -= len(trace) + 1
             solved = sqrt(self.phi_square + self.beta_square) <= until.small
             solved = solved and self.small(tol, energy, b_size)
-            error = self.infeasibility(&self.x[0])
+            error = self.infeasibility(self.x)
             lagrangian = 0.0
             for i in range(n):
                 lagrangian += 0.5 * self.x[i] * (self.g[i] - self.b[i])
@@ -993,7 +1044,7 @@ cdef class Solver:
             before = lagrangian
             done.append((trace.decode(), M, self.rho, error, lagrangian))
             for i in range(self.r):
-                add(self.rho * self.Cv[i], &self.C[i, 0], &self.g[0], n)
+                add(self.rho * self.Cv[i], &self.C[i, 0], self.g, n)
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
                 M *= constants.beta
@@ -1004,7 +1055,7 @@ cdef class Solver:
                 break
             errors = [*errors, error][len(errors) > 2:]
             stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
-            if (not stopped or stalled) and infeasible(np.asarray(self.x)):
+            if (not stopped or stalled) and infeasible(copied(self.x, n)):
                 status = "infeasible"
                 break
             if not stopped or left < 0:
@@ -1017,7 +1068,7 @@ cdef class Solver:
                 if self.rho >= MOST_RHO:
                     break
                 self.change_penalty(fmin(10 * self.rho, MOST_RHO))
-        return (np.array(self.x), np.array(self.g), np.asarray(mu), M, self.rho, done,
+        return (copied(self.x, n), copied(self.g, n), np.asarray(mu), M, self.rho, done,
                 status)
 
     cdef Model plain_model(self):
@@ -1028,9 +1079,9 @@ cdef class Solver:
     cdef void change_penalty(self, double rho):
         """Change ρ; the gradient follows without a product."""
         cdef Py_ssize_t i
-        self.infeasibility(&self.x[0])
+        self.infeasibility(self.x)
         for i in range(self.r):
-            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], &self.g[0], self.n)
+            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], self.g, self.n)
         self.rho = rho
 
     # back to the problem as given

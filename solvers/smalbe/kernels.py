@@ -51,6 +51,13 @@ def moved(
     return np.where(down, lower, np.where(up, upper, new)), g - alpha * Hp
 
 
+def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
+    """Return x + s, in the box up to rounding, on the bounds that it reaches."""
+    to, noise = x + s, ROUNDING * (np.abs(x) + np.abs(s))
+    down, up = to - lower <= noise, upper - to <= noise
+    return np.where(down, lower, np.where(up, upper, to))
+
+
 def split(
     x: Vector, g: Vector, lower: Vector, upper: Vector
 ) -> tuple[Mask, Vector, Vector, float, float]:

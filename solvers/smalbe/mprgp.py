@@ -263,7 +263,8 @@ def _model_expansion(
     beyond = cg - feasible if math.isfinite(cg) else 0.0
     z = Point(half.x - beyond * p, half.g - beyond * Hp)
     relaxed = B.relaxed(task.rules.relaxation)
-    s = np.where(held, 0.0, z.x + relaxed.step(*z, box) - half.x)
+    to = kernels.within(z.x, relaxed.step(*z, box), *box)
+    s = np.where(held, 0.0, to - half.x)
     if half.g @ s >= 0:
         beyond, s = 0.0, B.step(*half, box)
     if not s.any():

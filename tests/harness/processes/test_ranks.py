@@ -177,16 +177,24 @@ params = { S = 2, n = 4 }
 """
 
 
-def test_a_suite_asks_those_that_can_for_each_number_of_ranks(tmp_path):
+def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_path):
     suite = tmp_path / "ranks.toml"
-    suite.write_text(SUITE)
+    suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))
 
     results = mb.run(suite, out=tmp_path / "out")
 
     found = {r.solver: r for r in results.records}
-    ranks = {name: r.ranks for name, r in found.items()}
-    assert ranks == {"smalbe": 1, "smalbe ranks=2": 2, "clarabel": 1}
+    asked = {name: (r.ranks, r.role) for name, r in found.items()}
+    assert asked == {
+        "smalbe": (1, ""), "smalbe ranks=2": (2, ""), "clarabel": (1, ""),
+        "smalbe copies=2": (2, "copies"),
+    }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
+    # a copy does what one process alone does, to the last bit
+    assert found["smalbe copies=2"].verdict == "verified"
+    alone, copies = found["smalbe"], found["smalbe copies=2"]
+    assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
+    assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
 
 
 @pytest.mark.parametrize(
@@ -195,6 +203,8 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks(tmp_path):
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
+        ("ranks = [1]\ncopies = true", "copies = true: what copies reach is compared"),
+        ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )
 def test_wrong_ranks_of_a_suite_are_refused(tmp_path, line, message):
