@@ -217,6 +217,8 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
     cdef Py_ssize_t i, j
     cdef double s
     result = np.zeros(m)
+    if not m:
+        return result
     cdef double[::1] y = result
     for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
@@ -423,7 +425,7 @@ cdef copied(const double *v, Py_ssize_t n):
 cdef class Solver:
     """One projected problem, the rules of its solution, and room for the vectors.
 
-    problem : a `Projected` with the `Product` P; rules : a `Rules`
+    problem : a `Projected` with the `Product` F; options : an `Options`
     """
 
     cdef Product F
@@ -473,7 +475,7 @@ cdef class Solver:
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
 
-    def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
+    def __init__(self, problem, Product F, options, bint preconditioned):
         cdef Py_ssize_t i, k, n
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
@@ -484,10 +486,11 @@ cdef class Solver:
         self.right, self.told_q = _whole(problem.b), _whole(problem.q)
         self.least, self.most = map(_whole, problem.bounds)
         self.told_diagonal = _whole(problem.diagonal)
-        self.alpha, self.Gamma_square, self.reduced = alpha, rules.Gamma**2, rules.reduced
-        self.expansion = ("std", "projcg", "mixed", "model").index(rules.expansion)
-        self.newton_proportions = rules.proportioning == "model"
-        self.plain = rules.expansion != "model"
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.reduced = options.reduced
+        self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.newton_proportions = options.proportioning == "model"
+        self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
@@ -989,7 +992,7 @@ cdef class Solver:
             add(mu[i], &self.C[i, 0], pointer(g), n)
         return start, gradient
 
-    def smalbe(self, constants, double tol, at, infeasible, watch=None):
+    def smalbe(self, options, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
@@ -1001,8 +1004,8 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = -INFINITY, lagrangian, error, M = at.M
-        cdef long left = constants.max_steps - len(at.steps) - len(at.outer)
-        cdef double energy = constants.energy
+        cdef long left = options.max_steps - len(at.steps) - len(at.outer)
+        cdef double energy = options.energy
         cdef bint stopped, enough, solved, stalled
         cdef Until until
         cdef const double[::1] nu = _whole(at.nu), g = _whole(at.g)
@@ -1013,7 +1016,7 @@ cdef class Solver:
         cdef double[::1] mu = np.array(at.mu)
         cdef double b_size = sqrt(dot(self.b, self.b, n))
         b_size = b_size or sqrt(dot(self.g, self.g, n))
-        until.small, until.coarse = tol * b_size, constants.eta * b_size
+        until.small, until.coarse = tol * b_size, options.eta * b_size
         done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
         status = "iteration_limit"
         while True:
@@ -1047,9 +1050,9 @@ cdef class Solver:
                 add(self.rho * self.Cv[i], &self.C[i, 0], self.g, n)
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
-                M *= constants.beta
-                if constants.rho_growth != 1:
-                    self.change_penalty(constants.rho_growth * self.rho)
+                M *= options.beta
+                if options.rho_growth != 1:
+                    self.change_penalty(options.rho_growth * self.rho)
             if solved:
                 status = "solved"
                 break
@@ -1094,68 +1097,84 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result = np.zeros((4, n))
-        cdef const double[::1] v = nu, low = _whole(lb), high = _whole(ub)
-        cdef double[::1] x, z_box, Fx, rest, at = np.empty(n)
-        cdef double[::1] a = self.norm * np.asarray(mu), da = np.zeros(r)
-        cdef double[:, ::1] S = np.zeros((r, r))
+        result, multipliers = np.zeros((3, n)), np.empty(r)
+        cdef double[:, ::1] whole = result, S
+        cdef const double[::1] v = nu, least = _whole(lb), most = _whole(ub), at_mu = mu
+        cdef double[::1] a = multipliers
+        cdef double *x = first(whole)
+        cdef double *z_box = x + n
+        cdef double *Fx = z_box + n
+        cdef double *rest = self.s
+        cdef double *at = self.Hs  # −2 at the lower bound, 1 at the upper, −1 at both
+        cdef double *da = self.Cv
         cdef double s
-        x, z_box, Fx, rest = result
         for i in range(n):
             at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
             s = self.x_tilde[i] + v[i]
-            s = low[i] if at[i] < 0 else (high[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, low[i]), high[i])  # l − x̃ + x̃ may differ in the last bit
-        self.F.apply(&x[0], &Fx[0])
+            s = least[i] if at[i] < 0 else (most[i] if at[i] > 0 else s)
+            x[i] = fmin(fmax(s, least[i]), most[i])  # l − x̃ + x̃ may differ from l
+        self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
-        for i in range(r):
-            a[i] -= dot(&self.C[i, 0], &rest[0], n)
-        for i in range(r):
-            add(a[i], &self.C[i, 0], &rest[0], n)
-        for k in range(n):
-            if at[k] == 0:
-                for i in range(r):
-                    da[i] += self.C[i, k] * rest[k]
-                    for j in range(i + 1):
-                        S[i, j] += self.C[i, k] * self.C[j, k]
         if r:
+            S = np.zeros((r, r))
+            rows_times(first(self.C), rest, da, r, n)
+            for i in range(r):
+                a[i] = self.norm * at_mu[i] - da[i]
+                da[i] = 0.0
+            add_combination(1.0, first(self.C), pointer(a), rest, r, n)
+            for k in range(n):
+                if at[k] == 0:
+                    for i in range(r):
+                        da[i] += self.C[i, k] * rest[k]
+                        for j in range(i + 1):
+                            S[i, j] += self.C[i, k] * self.C[j, k]
             dpotrf(b"U", &order, &S[0, 0], &order, &info)
             for i in range(r):
                 if info or S[i, i] < 1e-4:
                     return None
-            dpotrs(b"U", &order, &one, &S[0, 0], &order, &da[0], &order, &info)
-        for i in range(r):
-            a[i] -= da[i]
-            add(-da[i], &self.C[i, 0], &rest[0], n)
+            dpotrs(b"U", &order, &one, &S[0, 0], &order, da, &order, &info)
+            for i in range(r):
+                a[i] -= da[i]
+            add_combination(-1.0, first(self.C), da, rest, r, n)
         for i in range(n):
             if at[i] < 0:
                 z_box[i] = -fmax(rest[i], 0.0)
-            if at[i] == 1 or at[i] == -1:  # −1 is both
+            if at[i] == 1 or at[i] == -1:
                 z_box[i] -= fmin(rest[i], 0.0)
-        return np.asarray(x), np.asarray(a), np.asarray(z_box), np.asarray(Fx)
+        return result[0], multipliers, result[1], result[2]
 
 
-def residual_bound(*vectors, G):
+def residual_bound(
+    cost, told_diagonal, const double[::1] x, const double[::1] y,
+    const double[::1] z_box, const double[::1] Fx, lower, upper, right,
+    const double[:, ::1] rows,
+):
     """Bound the worst of `harness.kkt_residuals` from above, without products.
 
-    vectors : q, the diagonal of P (empty for an operator), x, y, z_box, Px, lb, ub, e;
-    G (m, n), e (m,): the rows Gx = e
+    cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
+    x, y, z_box, Fx : the point and Px
+    lower, upper, right, rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
 
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef const double[:, ::1] rows = G
-    cdef const double[::1] q, diagonal, x, y, z_box, Fx, lb, ub, e
-    q, diagonal, x, y, z_box, Fx, lb, ub, e = map(_whole, vectors)
+    cdef const double[::1] q = _whole(cost), diagonal = _whole(told_diagonal)
+    cdef const double[::1] e = _whole(right)
+    cdef const double[::1] lb = _whole(lower), ub = _whole(upper)
     cdef Py_ssize_t i, j, n = x.shape[0], m = e.shape[0]
     cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
     cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-    cdef double[::1] forces = np.array(z_box), size = np.empty(n)
-    if not diagonal.shape[0]:
+    cdef double[:, ::1] room
+    cdef double *forces
+    cdef double *size
+    if not diagonal.shape[0] or not n:
         return INFINITY
+    room = np.empty((2, n))
+    forces, size = &room[0, 0], &room[1, 0]
+    memcpy(forces, &z_box[0], n * sizeof(double))
     for i in range(m):
-        add(y[i], &rows[i, 0], pointer(forces), n)
+        add(y[i], &rows[i, 0], forces, n)
         held += e[i] * y[i]
     for i in range(n):
         if not lb[i] <= x[i] <= ub[i]:
