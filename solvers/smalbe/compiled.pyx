@@ -53,8 +53,8 @@ cdef extern from "vectors.h" nogil:
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
-    int cholesky(double *S, Py_ssize_t k)
-    void solve(const double *L, double *y, Py_ssize_t k)
+    int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
+    void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
@@ -325,22 +325,55 @@ cdef struct Until:
     double M
 
 
-cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n).
-
-    It keeps U_F U_Fᵀ for the face F for which it was asked last.
-    """
+cdef class Gram:
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
 
     cdef Py_ssize_t n, k, stride, flips
-    cdef bint entered
-    cdef double tau
     cdef double[:, ::1] U
-    cdef double[::1] w, room
-    cdef double *root
-    cdef double *gram
+    cdef double[::1] room
+    cdef int[::1] where
+    cdef double *values  # (k, k), rows of `stride` numbers
     cdef double *column
     cdef double *held
-    cdef int[::1] where
+
+    def __cinit__(self, double[:, ::1] U):
+        self.U, self.k, self.n = U, U.shape[0], U.shape[1]
+        self.stride, self.flips = (self.k + 3) & ~3, self.n + 1
+        self.room = np.zeros(self.stride * (self.stride + 1) + self.n)
+        self.where = np.empty(self.n, dtype=np.int32)
+        self.values = &self.room[0]
+        self.column = self.values + self.stride * self.stride
+        self.held = self.column + self.stride
+
+    cdef void enter(self, const double *piece) noexcept:
+        """Have it be that of the face where `piece` is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew.
+        """
+        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        if self.flips > self.n:
+            self.flips = 0
+            memset(self.values, 0, stride * stride * sizeof(double))
+            for i in range(k):
+                self.values[i * stride + i] = 1.0
+            memset(self.held, 0, self.n * sizeof(double))
+        for c in range(changed(piece, self.held, self.n, &self.where[0])):
+            i = self.where[c]
+            for j in range(k):
+                self.column[j] = self.U[j, i]
+            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
+            self.flips += 1
+
+
+cdef class Model:
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
+
+    cdef Py_ssize_t n, k
+    cdef double tau
+    cdef double[:, ::1] U
+    cdef double[::1] w, root
+    cdef Gram gram
 
     @staticmethod
     cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
@@ -353,6 +386,7 @@ cdef class Model:
             kept = np.asarray(w) > 0
             U, w = np.asarray(U)[kept], np.asarray(w)[kept]
         B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
+        B.root = np.sqrt(w)
         return B
 
     cdef double *rows(self) noexcept:
@@ -372,39 +406,16 @@ cdef class Model:
             return Model.of_norm(tau, self.n)
         for i in range(self.k):
             w[i] += self.tau - tau
-        return Model.above_tail(self.U, w, tau)
+        cdef Model B = Model.above_tail(self.U, w, tau)
+        if B.k == self.k:
+            B.gram = self.gram  # of the same rows
+        return B
 
     cdef int enter(self, const double *piece) except -1:
-        """Have the Gram matrix be that of the face where `piece` is zero.
-
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
-        """
-        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
-        cdef double was
-        if not self.entered:
-            self.entered = True
-            self.stride = stride = (k + 3) & ~3
-            self.room = np.zeros(stride * (stride + 2) + self.n)
-            self.gram = &self.room[0]
-            self.root = self.gram + stride * stride
-            self.column, self.held = self.root + stride, self.root + 2 * stride
-            self.where, self.flips = np.empty(self.n, dtype=np.int32), self.n + 1
-            for j in range(k):
-                self.root[j] = sqrt(self.w[j])
-        if self.flips > self.n:
-            self.flips = 0
-            memset(self.gram, 0, stride * stride * sizeof(double))
-            for i in range(k):
-                self.gram[i * stride + i] = 1.0
-            memset(self.held, 0, self.n * sizeof(double))
-        for c in range(changed(piece, self.held, self.n, &self.where[0])):
-            i = self.where[c]
-            was = 1 - self.held[i]
-            for j in range(k):
-                self.column[j] = self.U[j, i]
-            add_gram(2 * was - 1, self.column, self.gram, stride)
-            self.flips += 1
+        """Have the Gram matrix of the face where `piece` is zero."""
+        if self.gram is None:
+            self.gram = Gram(self.U)
+        self.gram.enter(piece)
         return 0
 
 
@@ -500,7 +511,7 @@ cdef class Solver:
         self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
         self.lower, self.upper = pointer(self.least), pointer(self.most)
         self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
-        self.room = np.empty(17 * n + 2 * self.r + (6 + k) * k)
+        self.room = np.zeros(17 * n + 2 * self.r + (9 + k) * (k + 3))
         cdef double *at = pointer(self.room)
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -512,9 +523,9 @@ cdef class Solver:
         self.piece, self.piece2 = at + 3 * n, at + 4 * n
         at += 5 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
-        self.slope2, self.c, self.core = at + 4 * k, at + 5 * k, at + 6 * k
-        at += (6 + k) * k
-        self.Cv, self.Cw = at, at + self.r
+        self.slope2, self.c, self.Cv = at + 4 * k, at + 5 * k, at + 6 * k
+        self.Cw = self.Cv + self.r
+        self.core = self.Cw + self.r
 
     cdef int find_upper_end(self, const double[::1] values, const double[::1] residuals,
                             vectors, rows) except -1:
@@ -576,14 +587,16 @@ cdef class Solver:
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k
+        cdef Py_ssize_t i, j, k = B.k, stride
         cdef double *S = self.core
+        cdef double *U_F
         B.enter(piece)
+        U_F, stride = B.gram.values, B.gram.stride
         for i in range(k):
-            for j in range(i + 1):
-                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i * B.stride + j]
-            S[i * k + i] += B.tau
-        if not cholesky(S, k):
+            for j in range(i, k):
+                S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
+            S[i * stride + i] += B.tau
+        if not cholesky(S, k, stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -625,7 +638,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, dy, k)
+            solve(self.core, dy, k, B.gram.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -702,7 +715,7 @@ cdef class Solver:
         rows_times(M.rows(), z, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.c, M.k)
+        solve(self.core, self.c, M.k, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         add_combination(-1.0, M.rows(), self.c, z, M.k, n)
