@@ -38,7 +38,9 @@ from solvers.smalbe.projected import (
 from solvers.smalbe.rows import DenseRows, Rows, is_sparse
 from solvers.smalbe.spectrum import random_start
 
-STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
+STEPS = {
+    "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
+}  # fmt: skip
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
