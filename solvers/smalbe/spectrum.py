@@ -35,13 +35,18 @@ def random_start(n: int) -> Vector:
     return start
 
 
+def size(v: Vector) -> int:
+    """Count the components of a vector; of one over ranks, those of all."""
+    return int((np.zeros_like(v) + 1).sum())
+
+
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
 
     The residual of the pair (θ, Vᵀs) is |β s_k| with the last off-diagonal entry β. A
     start vector from an invariant subspace keeps the process there.
     """
-    basis = np.zeros((min(steps, start.size), start.size))
+    basis = np.zeros((min(steps, size(start)), start.size))
     diagonal: list[float] = []
     off: list[float] = []
     v, beta = start, float(np.linalg.norm(start))
