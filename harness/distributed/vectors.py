@@ -313,6 +313,9 @@ class Emitted(NamedTuple):
     equality_rows: int  #: of the whole
     #: puts this rank's operator together, anew each time: called by all ranks
     share: Callable[[], Share]
+    #: of this rank's slice of a solution, what `harness.verify.over_ranks` takes to
+    #: certify it; None where that needs the whole
+    answer: Callable[[Solution], Any] | None = None
 
 
 #: has all ranks emit a case, family, params and form; None where that is not built
@@ -348,4 +351,6 @@ _REDUCTIONS: Mapping[np.ufunc, Callable[[Ranks, Any], Any]] = {
     np.logical_or: lambda ranks, part: bool(ranks.extreme(part, np.max)),
     np.logical_and: lambda ranks, part: bool(ranks.extreme(part, np.min)),
 }
-_COMPONENTWISE = frozenset({np.where, np.clip, np.zeros_like, np.empty_like, np.copy})
+_COMPONENTWISE = frozenset(
+    {np.where, np.clip, np.zeros_like, np.empty_like, np.copy, np.broadcast_to}
+)

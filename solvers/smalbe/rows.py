@@ -568,5 +568,7 @@ def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
 
 def as_dense(G: Matrix) -> NDArray[np.float64]:
     """Return a matrix as an array, row by row."""
+    if not G.shape[0]:
+        return np.zeros(G.shape)
     dense = G.toarray() if hasattr(G, "toarray") else G
     return np.ascontiguousarray(dense, dtype=float)
