@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Matrix, Vector
-from harness.distributed.vectors import DistributedVector
+from harness.distributed.vectors import DistributedVector, length
 from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
@@ -183,9 +183,9 @@ def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    n = rows.x_tilde.size
-    steps = min(steps, n - len(rows.C))  # the dimension of the range of 𝒫
-    ritz = lanczos(PFP, rows.project(random_start(n)), steps)
+    most = length(rows.x_tilde) - len(rows.C)  # the dimension of the range of 𝒫
+    start = rows.project(random_start(rows.x_tilde.size))
+    ritz = lanczos(PFP, start, min(steps, most))
     return Spectrum(ritz.norm or 1.0, ritz)
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
 
 from harness import Vector
+from harness.distributed.vectors import length
 
 FEW = 5  #: steps after which a flat spectrum shows
 FLAT = 10.0  #: ratio of Ritz values of one size
@@ -46,7 +47,7 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     steps where all Ritz values are of one size: conjugate gradients need few steps
     there, and no model.
     """
-    basis = np.zeros((min(steps, start.size), start.size))
+    basis = np.zeros((min(steps, length(start)), start.size))
     diagonal: list[float] = []
     off: list[float] = []
     v, beta = start, float(np.linalg.norm(start))
