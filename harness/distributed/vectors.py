@@ -210,13 +210,6 @@ def inner_products(
     return (*sums.tolist(), *found[:, len(products) :].min(axis=0).tolist())
 
 
-def length(v: Vector) -> int:
-    """Return the number of components of a vector, on all ranks together."""
-    if not isinstance(v, DistributedVector):
-        return v.size
-    return int(v.ranks.total(np.array([float(v.size)]))[0])
-
-
 def on_slices(function: Callable[P, R]) -> Callable[P, R]:
     """Have what acts component by component act on slices: one pass, wrapped once.
 

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Matrix, Vector
-from harness.distributed.vectors import DistributedVector, length
+from harness.distributed.vectors import DistributedVector
 from solvers.common.conversion import boxed
 from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
 from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
-from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start
+from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start, size
 
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
 FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
@@ -175,7 +175,7 @@ def _diagonal(qp: QP) -> Vector:
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
     """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
-    mean = float(diagonal.sum()) / diagonal.size if diagonal.size else 0.0
+    mean = float(diagonal.mean()) if diagonal.size else 0.0
     if spectrum.norm > NOTHING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)
@@ -183,9 +183,9 @@ def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    most = length(rows.x_tilde) - len(rows.C)  # the dimension of the range of 𝒫
     start = rows.project(random_start(rows.x_tilde.size))
-    ritz = lanczos(PFP, start, min(steps, most))
+    steps = min(steps, size(start) - len(rows.C))  # the dimension of the range of 𝒫
+    ritz = lanczos(PFP, start, steps)
     return Spectrum(ritz.norm or 1.0, ritz)
 
 

@@ -16,6 +16,7 @@ from harness.distributed.factor import DependentRowsError, local_factor, touched
 from harness.distributed.vectors import DistributedVector, Ranks, distributed
 from solvers.smalbe.rows import equality_rows
 from solvers.smalbe.solver import SMALBE
+from solvers.smalbe.spectrum import lanczos
 
 TOL = 1e-8
 REFUSED = {
@@ -39,6 +40,10 @@ def vectors(ranks):
     own = slice(ends[ranks.rank], ends[ranks.rank + 1])
     v, w = distributed(a[own], ranks), distributed(b[own], ranks)
     positive = v > 0
+    few = np.array_split(np.arange(1.0, 6.0), ranks.size)[ranks.rank]
+    ritz = lanczos(
+        lambda x: distributed(few * x, ranks), distributed(np.ones_like(few), ranks), 9
+    )
     pairs = {
         "dot": (v @ w, a @ b),
         "method": (v.dot(w), a @ b),
@@ -51,6 +56,8 @@ def vectors(ranks):
         "count": (np.count_nonzero(positive), np.count_nonzero(a > 0)),
         "matrix": (np.abs(C[:, own] @ v - C @ a).max(), 0.0),
         "where": (np.where(positive, v, 0.0).sum(), a[a > 0].sum()),
+        "least Ritz value": (ritz.values[-1], 1.0),
+        "largest Ritz value": (ritz.values[0], 5.0),
         "clip": (np.clip(v, -1, 1).sum(), np.clip(a, -1, 1).sum()),
     }
     answered = []
