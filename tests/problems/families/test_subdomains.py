@@ -181,3 +181,25 @@ def test_subdomains_of_graded_meshes_are_compact(n, most):
 
     assert s.status is Status.SOLVED
     assert s.counts["P_products"] <= most
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "obstacle/n=8/shape=hemisphere/feti=4/glue=redundant/dual",
+        "beam-ring/Nr=4/Nh=2/steps=1/feti=2/glue=redundant/dual",
+    ],
+)
+def test_multipliers_of_redundant_rows_do_not_drift(name):
+    """Nothing is added to λ that Bᵀ does not feel: its part in ker Bᵀ stays zero."""
+    qp = built(name).qp
+    operator = qp.P.build()
+    rows = operator.B[: operator.equalities]
+    size, modes = np.linalg.eigh((rows @ rows.T).toarray())
+    unfelt = modes[:, size < 1e-10 * size[-1]]
+    s = SOLVERS["smalbe"].prepare(qp, TOL)()
+
+    assert unfelt.shape[1] > 0
+    assert s.status is Status.SOLVED
+    drift = unfelt.T @ s.x[: operator.equalities]
+    assert np.linalg.norm(drift) <= 1e-7 * np.linalg.norm(s.x)
