@@ -182,10 +182,11 @@ def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
     p: Any = params
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
+    column, row = (x.astype(np.int64) for x in layout.block[1:])
     none = np.zeros(0)
     return StructuredBodies(
         layout=layout, components=2, E=moduli[:1], glue=p["glue"],
-        material=_material(p, layout.block.column, layout.block.row),
+        material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
         load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
         contact=Contact(no_rows(2 * grid.nodes), none, none),
