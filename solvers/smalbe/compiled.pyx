@@ -19,9 +19,9 @@ over vectors are in `vectors.h`.
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.string cimport memcpy, memset
-from scipy.linalg.cython_blas cimport dgemv, dsymv
+from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotri, dpotrs, dstev,
+    dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
 import numpy as np
@@ -33,6 +33,10 @@ cdef extern from "vectors.h" nogil:
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
+    void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
+                    Py_ssize_t n)
+    void add_combination(double s, const double *U, const double *c, double *y,
+                         Py_ssize_t k, Py_ssize_t n)
     void lengths(const double *x, const double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
     void move(double alpha, double *x, double *g, const double *p, const double *Hp,
@@ -43,13 +47,24 @@ cdef extern from "vectors.h" nogil:
     void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, double tau, double *phi,
                  double *free, Py_ssize_t n, double *told)
+    void within(const double *x, const double *origin, const double *lower,
+                const double *upper, double *s, Py_ssize_t n)
     void turn(const double *z, double gamma, double *p, Py_ssize_t n)
+    void symmetric_product(const double *F, double s, const double *v, double *y,
+                           Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
+    void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
+    Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
 
 
 # --- the matrix ---------------------------------------------------------------------
+
+
+cdef enum:
+    BY_BLAS = 600  # unknowns from which on a dense P comes from memory, not from caches
 
 
 cdef class Product:
@@ -95,7 +110,9 @@ cdef class Product:
         cdef double[::1] vector, result
         cdef int n = self.n, one = 1
         cdef double zero = 0.0
-        if self.dense:
+        if self.dense and self.n < BY_BLAS:
+            symmetric_product(self.dense, s, v, y, self.n)
+        elif self.dense:
             dsymv(b"U", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
                   y, &one)
         elif self.data:
@@ -121,28 +138,6 @@ cdef double *pointer(double[::1] v) noexcept:
 
 cdef double *first(const double[:, ::1] M) noexcept:
     return <double *> &M[0, 0] if M.shape[0] and M.shape[1] else NULL
-
-
-cdef void rows_times(
-    const double *U, const double *v, double *out, Py_ssize_t k, Py_ssize_t n
-) noexcept nogil:
-    """out ← Uv for U (k, n) by rows."""
-    cdef int columns = k, order = n, one = 1
-    cdef double unit = 1.0, zero = 0.0
-    if k and n:
-        dgemv(b"T", &order, &columns, &unit, <double *> U, &order, <double *> v, &one,
-              &zero, out, &one)
-
-
-cdef void add_combination(
-    double s, const double *U, const double *c, double *out, Py_ssize_t k, Py_ssize_t n
-) noexcept nogil:
-    """out ← out + s Uᵀc for U (k, n) by rows."""
-    cdef int columns = k, order = n, one = 1
-    cdef double unit = 1.0
-    if k and n:
-        dgemv(b"N", &order, &columns, &s, <double *> U, &order, <double *> c, &one,
-              &unit, out, &one)
 
 
 cdef void without(
@@ -222,6 +217,8 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
     cdef Py_ssize_t i, j
     cdef double s
     result = np.zeros(m)
+    if not m:
+        return result
     cdef double[::1] y = result
     for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
@@ -231,11 +228,26 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
     return result
 
 
+cdef double FLAT = 10.0  # ratio of Ritz values of one size
+
+cdef enum:
+    FEW = 5
+
+
+cdef bint is_flat(const double[::1] diagonal, const double[::1] off) except -1:
+    """Whether all Ritz values of the first FEW steps are of one size."""
+    cdef double[::1] theta = np.array(diagonal[:FEW]), between = np.array(off[:FEW])
+    cdef double none
+    cdef int order = FEW, one = 1, info = 0
+    dstev(b"N", &order, &theta[0], &between[0], &none, &one, &none, &info)
+    return theta[0] >= theta[FEW - 1] / FLAT
+
+
 def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int steps):
     """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`."""
     cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
     cdef int kept, info = 0, again
-    steps = min(steps, n)
+    steps = min(steps, n - r)  # in the range of P
     bases, told, offs = np.zeros((steps, n)), np.zeros(steps), np.zeros(steps)
     cdef double[:, ::1] basis = bases
     cdef double[::1] diagonal = told, off = offs, v = np.array(start), Cv = np.empty(r)
@@ -264,6 +276,8 @@ def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int step
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
+            break
+        if kept == FEW and is_flat(told, offs):
             break
     if not kept:
         return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
@@ -308,6 +322,8 @@ def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q,
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
 cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
 cdef double NO_SHIFT = 1e-13  # x̃ of this size relative to ν is rounding of e = 0
+cdef double FOUND = 1e-3  # residual over value of a Ritz pair where the spectrum decays
+cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
@@ -326,17 +342,55 @@ cdef struct Until:
     double M
 
 
+cdef class Gram:
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
+
+    cdef Py_ssize_t n, k, stride, flips
+    cdef double[:, ::1] U
+    cdef double[::1] room
+    cdef int[::1] where
+    cdef double *values  # (k, k), rows of `stride` numbers
+    cdef double *column
+    cdef double *held
+
+    def __cinit__(self, double[:, ::1] U):
+        self.U, self.k, self.n = U, U.shape[0], U.shape[1]
+        self.stride, self.flips = (self.k + 3) & ~3, self.n + 1
+        self.room = np.zeros(self.stride * (self.stride + 1) + self.n)
+        self.where = np.empty(self.n, dtype=np.int32)
+        self.values = &self.room[0]
+        self.column = self.values + self.stride * self.stride
+        self.held = self.column + self.stride
+
+    cdef void enter(self, const double *piece) noexcept:
+        """Have it be that of the face where `piece` is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew.
+        """
+        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        if self.flips > self.n:
+            self.flips = 0
+            memset(self.values, 0, stride * stride * sizeof(double))
+            for i in range(k):
+                self.values[i * stride + i] = 1.0
+            memset(self.held, 0, self.n * sizeof(double))
+        for c in range(changed(piece, self.held, self.n, &self.where[0])):
+            i = self.where[c]
+            for j in range(k):
+                self.column[j] = self.U[j, i]
+            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
+            self.flips += 1
+
+
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n).
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
 
-    It keeps U_F U_Fᵀ for the face F for which it was asked last.
-    """
-
-    cdef Py_ssize_t n, k, flips
-    cdef bint entered
+    cdef Py_ssize_t n, k
     cdef double tau
-    cdef double[:, ::1] U, gram
-    cdef double[::1] w, root, held, column
+    cdef double[:, ::1] U
+    cdef double[::1] w, root
+    cdef Gram gram
 
     @staticmethod
     cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
@@ -349,6 +403,7 @@ cdef class Model:
             kept = np.asarray(w) > 0
             U, w = np.asarray(U)[kept], np.asarray(w)[kept]
         B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
+        B.root = np.sqrt(w)
         return B
 
     cdef double *rows(self) noexcept:
@@ -368,36 +423,16 @@ cdef class Model:
             return Model.of_norm(tau, self.n)
         for i in range(self.k):
             w[i] += self.tau - tau
-        return Model.above_tail(self.U, w, tau)
+        cdef Model B = Model.above_tail(self.U, w, tau)
+        if B.k == self.k:
+            B.gram = self.gram  # of the same rows
+        return B
 
     cdef int enter(self, const double *piece) except -1:
-        """Have the Gram matrix be that of the face where `piece` is zero.
-
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
-        """
-        cdef Py_ssize_t i, j
-        cdef double was, held
-        cdef double *gram
-        if not self.entered:
-            self.entered = True
-            self.root, self.column = np.sqrt(self.w), np.empty(self.k)
-            self.gram, self.held = np.eye(self.k), np.zeros(self.n)
-        gram = &self.gram[0, 0]
-        if self.flips > self.n:
-            self.flips = 0
-            memset(gram, 0, self.k * self.k * sizeof(double))
-            for i in range(self.k):
-                gram[i * self.k + i] = 1.0
-            memset(&self.held[0], 0, self.n * sizeof(double))
-        for i in range(self.n):
-            was, held = self.held[i], piece[i] != 0
-            if was != held:
-                for j in range(self.k):
-                    self.column[j] = self.U[j, i]
-                add_gram(was - held, &self.column[0], gram, self.k)
-                self.held[i] = held
-                self.flips += 1
+        """Have the Gram matrix of the face where `piece` is zero."""
+        if self.gram is None:
+            self.gram = Gram(self.U)
+        self.gram.enter(piece)
         return 0
 
 
@@ -405,10 +440,20 @@ def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
 
 
+cdef copied(const double *v, Py_ssize_t n):
+    """Make an array of it."""
+    cdef double[::1] made
+    told = np.empty(n)
+    made = told
+    if n:
+        memcpy(&made[0], v, n * sizeof(double))
+    return told
+
+
 cdef class Solver:
     """One projected problem, the rules of its solution, and room for the vectors.
 
-    problem : a `Projected` with the `Product` P; rules : a `Rules`
+    problem : a `Projected` with the `Product` F; options : an `Options`
     """
 
     cdef Product F
@@ -418,82 +463,131 @@ cdef class Solver:
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef int expansion
     cdef double[:, ::1] C, GC, vectors
-    cdef const double[::1] q, diagonal
-    cdef double[::1] x_tilde, b, lower, upper, above, rhs
-    cdef double[::1] x, g, p, Hp, phi, free, z, s, Hs, t, x2, g2, box_lower, box_upper
-    cdef double[::1] piece, piece2, Cv, Cw, Ge, told
+    cdef const double[::1] told_q, told_diagonal
+    cdef double[::1] shift, right, least, most, above, room
+    cdef const double *q
+    cdef const double *diagonal  # NULL where an operator does not tell
+    cdef double *x_tilde
+    cdef double *b
+    cdef double *lower
+    cdef double *upper
+    cdef double *rhs
+    cdef double *x
+    cdef double *g
+    cdef double *p
+    cdef double *Hp
+    cdef double *phi
+    cdef double *free
+    cdef double *z
+    cdef double *s
+    cdef double *Hs
+    cdef double *t
+    cdef double *x2
+    cdef double *g2
+    cdef double *box_lower
+    cdef double *box_upper
+    cdef double *piece
+    cdef double *piece2
+    cdef double *x0
+    cdef double *g0
+    cdef double *Cv
+    cdef double *Cw
+    cdef double *y
+    cdef double *dy
+    cdef double *y2
+    cdef double *slope
+    cdef double *slope2
+    cdef double *c
+    cdef double *core
+    cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
-    cdef double[::1] y, dy, y2, slope, slope2, c, c2
-    cdef double[:, ::1] core, inverse
 
-    def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
-        cdef Py_ssize_t i, k
+    def __init__(self, problem, Product F, options, bint preconditioned):
+        cdef Py_ssize_t i, k, n
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
-        self.C, self.GC, self.x_tilde = map(_whole, (rows.C, rows.GC, rows.x_tilde))
+        self.C, self.GC, self.shift = map(_whole, (rows.C, rows.GC, rows.x_tilde))
         self.n, self.r, self.m = F.n, self.C.shape[0], self.GC.shape[0]
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
         self.e_size, self.x_tilde_size = rows.e_size, np.linalg.norm(rows.x_tilde)
-        self.b, self.q = _whole(problem.b), _whole(problem.q)
-        self.lower, self.upper = map(_whole, problem.bounds)
-        self.diagonal = _whole(problem.diagonal)
-        self.alpha, self.Gamma_square, self.reduced = alpha, rules.Gamma**2, rules.reduced
-        self.expansion = ("std", "projcg", "mixed", "model").index(rules.expansion)
-        self.newton_proportions = rules.proportioning == "model"
-        self.plain = rules.expansion != "model"
+        self.right, self.told_q = _whole(problem.b), _whole(problem.q)
+        self.least, self.most = map(_whole, problem.bounds)
+        self.told_diagonal = _whole(problem.diagonal)
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.reduced = options.reduced
+        self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.newton_proportions = options.proportioning == "model"
+        self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
-        k = 0
         if spectrum.ritz is not None:
-            above, vectors, self.tail = problem.upper_end()
-            k = len(above) + self.r
-            self.above, self.vectors = np.zeros(k), np.concatenate((vectors, rows.C))
-            for i in range(k):
-                self.above[i] = (above[i] if i < k - self.r else 0.0) - self.tail
+            values, residuals, vectors, _ = spectrum.ritz
+            self.find_upper_end(_whole(values), _whole(residuals), vectors, rows.C)
+        k = self.above.shape[0] if spectrum.ritz is not None else 0
         n = self.n
-        cdef double[:, ::1] room = np.empty((17, n)), small = np.empty((7, k))
-        cdef double[:, ::1] cores = np.empty((2 * k, k)), tiny = np.empty((2, self.r))
-        self.x, self.g, self.p, self.Hp, self.phi = (
-            room[0], room[1], room[2], room[3], room[4]
-        )
-        self.free, self.z, self.s, self.Hs, self.t = (
-            room[5], room[6], room[7], room[8], room[9]
-        )
-        self.x2, self.g2, self.box_lower, self.box_upper = (
-            room[10], room[11], room[12], room[13]
-        )
-        self.rhs, self.piece, self.piece2 = room[14], room[15], room[16]
-        self.Cv, self.Cw = tiny[0], tiny[1]
-        self.Ge, self.told = np.empty(self.m), np.empty(4)
-        self.y, self.dy, self.y2, self.slope = small[0], small[1], small[2], small[3]
-        self.slope2, self.c, self.c2 = small[4], small[5], small[6]
-        self.core, self.inverse = cores[:k], cores[k:]
+        self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
+        self.lower, self.upper = pointer(self.least), pointer(self.most)
+        self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
+        self.room = np.zeros(19 * n + 2 * self.r + (9 + k) * (k + 3))
+        cdef double *at = pointer(self.room)
+        self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.phi, self.free, self.z, self.s = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
+        at += 4 * n
+        self.box_lower, self.box_upper, self.rhs = at, at + n, at + 2 * n
+        self.piece, self.piece2 = at + 3 * n, at + 4 * n
+        self.x0, self.g0 = at + 5 * n, at + 6 * n
+        at += 7 * n
+        self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
+        self.slope2, self.c, self.Cv = at + 4 * k, at + 5 * k, at + 6 * k
+        self.Cw = self.Cv + self.r
+        self.core = self.Cw + self.r
+
+    cdef int find_upper_end(self, const double[::1] values, const double[::1] residuals,
+                            vectors, rows) except -1:
+        """Choose what a model holds, as `Projected.upper_end` does."""
+        cdef Py_ssize_t i, found = values.shape[0], kept
+        kept = max(found - (1 if residuals[found - 1] <= 1e-10 * values[0] else 2), 0)
+        for i in range(kept):
+            if residuals[i] > values[i]:
+                kept = i
+                break
+        if residuals[0] > FOUND * values[0]:
+            kept = 0
+        self.tail = fmax((values[kept] + residuals[kept]) / self.norm, TAIL)
+        self.vectors = np.concatenate((vectors[:kept], rows))
+        self.above = np.full(kept + self.r, -self.tail)
+        for i in range(kept):
+            self.above[i] += (values[i] + residuals[i]) / self.norm
+        return 0
 
     # the operator
 
     cdef int H(self, const double *v, double *out) except -1:
         """out ← Hv = PFPv/‖PFP‖ + ρQv; one product."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *Pv = pointer(self.t)
+        cdef double *Pv = self.t
         if not self.r:
             self.F.apply(v, out, self.inverse_norm)
             return 0
         memcpy(Pv, v, n * sizeof(double))
-        without(first(self.C), self.r, Pv, &self.Cv[0], n)
+        without(first(self.C), self.r, Pv, self.Cv, n)
         self.F.apply(Pv, out, self.inverse_norm)
-        rows_times(first(self.C), out, &self.Cw[0], self.r, n)
+        rows_times(first(self.C), out, self.Cw, self.r, n)
         for i in range(self.r):
             self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
-        add_combination(1.0, first(self.C), &self.Cw[0], out, self.r, n)
+        add_combination(1.0, first(self.C), self.Cw, out, self.r, n)
         return 0
 
     cdef double infeasibility(self, const double *x):
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
         cdef Py_ssize_t i
         cdef double square = 0.0
-        rows_times(first(self.C), x, pointer(self.Cv), self.r, self.n)
+        rows_times(first(self.C), x, self.Cv, self.r, self.n)
         for i in range(self.r):
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
@@ -513,16 +607,16 @@ cdef class Solver:
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k
-        cdef double *S = first(self.core)
-        cdef int order = k, info = 0
+        cdef Py_ssize_t i, j, k = B.k, stride
+        cdef double *S = self.core
+        cdef double *U_F
         B.enter(piece)
+        U_F, stride = B.gram.values, B.gram.stride
         for i in range(k):
-            for j in range(k):
-                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i, j]
-            S[i * k + i] += B.tau
-        dpotrf(b"U", &order, S, &order, &info)
-        if info:
+            for j in range(i, k):
+                S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
+            S[i * stride + i] += B.tau
+        if not cholesky(S, k, stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -531,7 +625,7 @@ cdef class Solver:
                    double *slope) noexcept:
         """Find s(y), its piece and the slope Us − W⁻¹y."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *t = pointer(self.t)
+        cdef double *t = self.t
         if not B.k:
             tilted(x, g, B.tau, lower, upper, s, piece, n)
             return
@@ -547,15 +641,14 @@ cdef class Solver:
                            double *s) except -1:
         """s ← argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u, as `Model.step` does."""
         cdef Py_ssize_t i, newton, search, n = self.n, k = B.k
-        cdef double *y = pointer(self.y)
-        cdef double *dy = pointer(self.dy)
-        cdef double *there = pointer(self.y2)
-        cdef double *slope = pointer(self.slope)
-        cdef double *slope_there = pointer(self.slope2)
-        cdef double *piece = &self.piece[0]
-        cdef double *piece_there = &self.piece2[0]
+        cdef double *y = self.y
+        cdef double *dy = self.dy
+        cdef double *there = self.y2
+        cdef double *slope = self.slope
+        cdef double *slope_there = self.slope2
+        cdef double *piece = self.piece
+        cdef double *piece_there = self.piece2
         cdef double begun, now, low, high, at_low, at_high, t, share
-        cdef int order = k, one = 1, info = 0
         if not k:
             self.tilt(B, x, g, lower, upper, y, s, piece, slope)
             return 0
@@ -565,7 +658,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            dpotrs(b"U", &order, &one, first(self.core), &order, dy, &order, &info)
+            solve(self.core, dy, k, B.gram.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -604,7 +697,7 @@ cdef class Solver:
         cdef Py_ssize_t i
         cdef double square = dot(s, s, self.n), rest = square, missing, tau
         missing = sHs - B.tau * square
-        rows_times(B.rows(), s, pointer(self.c), B.k, self.n)
+        rows_times(B.rows(), s, self.c, B.k, self.n)
         for i in range(B.k):
             rest -= self.c[i] * self.c[i]
             missing -= B.w[i] * self.c[i] * self.c[i]
@@ -617,47 +710,37 @@ cdef class Solver:
 
     cdef void split(self):
         """Split the gradient at x by the face on which x lies."""
-        split(&self.x[0], &self.g[0], &self.lower[0], &self.upper[0], self.B.tau,
-              &self.phi[0], &self.free[0], self.n, &self.told[0])
+        split(self.x, self.g, self.lower, self.upper, self.B.tau,
+              self.phi, self.free, self.n, self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
         self.reduced_square = self.told[2]
 
     cdef int enter_face(self) except -1:
         """Have the preconditioner know the face."""
-        cdef Py_ssize_t i, j, k
-        cdef double *N = first(self.inverse)
-        cdef int order, info = 0
-        if not self.preconditioned or not self.preconditioner.k:
-            return 0
-        cdef Model M = self.preconditioner
-        k = order = M.k
-        for i in range(self.n):
-            self.piece[i] = 1 - self.free[i]
-        self.factor(M, &self.piece[0])
-        memcpy(N, first(self.core), k * k * sizeof(double))
-        dpotri(b"U", &order, N, &order, &info)
-        for i in range(k):
-            for j in range(i + 1):
-                N[i * k + j] *= M.root[i] * M.root[j]
-                N[j * k + i] = N[i * k + j]
+        cdef Py_ssize_t i
+        if self.preconditioned and self.preconditioner.k:
+            for i in range(self.n):
+                self.piece[i] = 1 - self.free[i]
+            self.factor(self.preconditioner, self.piece)
         return 0
 
     cdef const double *preconditioned_gradient(self) noexcept:
         """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
-        cdef Py_ssize_t i, n = self.n, k
-        cdef double tau
-        cdef const double *U
-        cdef double *z = &self.z[0]
-        if not self.preconditioned or not self.preconditioner.k:
-            return &self.phi[0]  # directions have no length
-        k, tau = self.preconditioner.k, self.preconditioner.tau
-        U = self.preconditioner.rows()
-        memcpy(z, &self.phi[0], n * sizeof(double))
-        rows_times(U, z, &self.c[0], k, n)
-        rows_times(first(self.inverse), &self.c[0], &self.c2[0], k, k)
-        add_combination(-1.0, U, &self.c2[0], z, k, n)
+        cdef Py_ssize_t i, n = self.n
+        cdef Model M = self.preconditioner
+        cdef double *z = self.z
+        if not self.preconditioned or not M.k:
+            return self.phi  # directions have no length
+        memcpy(z, self.phi, n * sizeof(double))
+        rows_times(M.rows(), z, self.c, M.k, n)
+        for i in range(M.k):
+            self.c[i] *= M.root[i]
+        solve(self.core, self.c, M.k, M.gram.stride)
+        for i in range(M.k):
+            self.c[i] *= M.root[i]
+        add_combination(-1.0, M.rows(), self.c, z, M.k, n)
         for i in range(n):
-            z[i] *= self.free[i] / tau
+            z[i] *= self.free[i] / M.tau
         return z
 
     # MPRGP
@@ -672,7 +755,7 @@ cdef class Solver:
 
     cdef void to(self, double alpha, const double *p, const double *Hp):
         """x ← x − αp; the gradient follows without a product."""
-        move(alpha, &self.x[0], &self.g[0], p, Hp, &self.lower[0], &self.upper[0],
+        move(alpha, self.x, self.g, p, Hp, self.lower, self.upper,
              self.n)
 
     cdef double searched(self, double *s, double *Hs) except? -1:
@@ -690,8 +773,8 @@ cdef class Solver:
         self.H(s, Hs)
         scale(-1.0, s, n)
         scale(-1.0, Hs, n)
-        lengths(&self.x[0], &self.g[0], s, Hs, &self.lower[0], &self.upper[0], n,
-                &self.told[0])
+        lengths(self.x, self.g, s, Hs, self.lower, self.upper, n,
+                self.told)
         return fmin(self.told[0], fmax(1.0, self.told[1]))
 
     cdef int step_by_model(self) except -1:
@@ -700,11 +783,11 @@ cdef class Solver:
         0 where there is nothing to gain, or the cost falls without end.
         """
         cdef Py_ssize_t i, n = self.n
-        cdef double *s = &self.s[0]
-        cdef double *Hs = &self.Hs[0]
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
         cdef double length
-        self.step_of_model(self.B, &self.x[0], &self.g[0], &self.lower[0],
-                           &self.upper[0], s)
+        self.step_of_model(self.B, self.x, self.g, self.lower,
+                           self.upper, s)
         length = self.searched(s, Hs)
         if length == 0 or isinf(length):
             return 0
@@ -716,7 +799,7 @@ cdef class Solver:
     cdef int proportion(self, bint by_model) except -1:
         """Take a step that frees components; 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *beta = &self.s[0]
+        cdef double *beta = self.s
         if by_model:
             return self.step_by_model()
         for i in range(n):
@@ -726,15 +809,16 @@ cdef class Solver:
                 or (self.g[i] > 0 and self.x[i] > self.lower[i])
             ):
                 beta[i] = self.g[i]
-        self.H(beta, &self.Hs[0])
-        lengths(&self.x[0], &self.g[0], beta, &self.Hs[0], &self.lower[0],
-                &self.upper[0], n, &self.told[0])
+        self.H(beta, self.Hs)
+        lengths(self.x, self.g, beta, self.Hs, self.lower,
+                self.upper, n, self.told)
         if isinf(fmin(self.told[0], self.told[1])):
             return 0
-        self.to(fmin(self.told[0], self.told[1]), beta, &self.Hs[0])
+        self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
         return 1
 
-    cdef int expand(self, double cg, double feasible, bint is_first) except -1:
+    cdef int expand(self, double cg, double feasible, bint is_first, long most,
+                    double enough, bytearray trace) except -1:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
@@ -742,35 +826,39 @@ cdef class Solver:
             for i in range(n):
                 step = self.x[i] - cg * self.p[i]
                 self.x2[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
-            self.gradient(&self.x2[0], &self.g2[0])
+            self.gradient(self.x2, self.g2)
             if self.expansion == PROJCG or (
-                self.cost(&self.x2[0], &self.g2[0]) <= self.cost(&self.x[0], &self.g[0])
+                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g)
             ):
-                memcpy(&self.x[0], &self.x2[0], n * sizeof(double))
-                memcpy(&self.g[0], &self.g2[0], n * sizeof(double))
+                memcpy(self.x, self.x2, n * sizeof(double))
+                memcpy(self.g, self.g2, n * sizeof(double))
                 return b"e"
         if self.expansion == MODEL:
-            return self.expand_by_model(cg, feasible, is_first)
-        self.to(feasible, &self.p[0], &self.Hp[0])
+            return self.expand_by_model(cg, feasible, is_first, most, enough, trace)
+        self.to(feasible, self.p, self.Hp)
         self.split()
         for i in range(n):
             step = self.x[i] - self.phi[i] / self.B.tau  # cuts φ to φ̃
             self.x[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
-        self.gradient(&self.x[0], &self.g[0])
+        self.gradient(self.x, self.g)
         return b"f" if self.expansion == MIXED else b"e"
 
-    cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
-        """Project x − α_cg p on the box in the metric of the model."""
+    cdef int expand_by_model(self, double cg, double feasible, bint is_first, long most,
+                             double enough, bytearray trace) except -1:
+        """Project z, where CG leads beyond the box, on it in the metric of the model."""
         cdef Py_ssize_t i, n = self.n
-        cdef double *p = &self.p[0]
-        cdef double *Hp = &self.Hp[0]
-        cdef double *s = &self.s[0]
-        cdef double *Hs = &self.Hs[0]
-        cdef double *lower = &self.box_lower[0]
-        cdef double *upper = &self.box_upper[0]
-        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
-        cdef bint held, release = is_first and self.B.k > 0
-        change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
+        cdef double *p = self.p
+        cdef double *Hp = self.Hp
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
+        cdef double *lower = self.box_lower
+        cdef double *upper = self.box_upper
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, tau = self.B.tau
+        cdef double change = -feasible * self.told[2] + 0.5 * feasible**2 * self.told[3]
+        cdef double least = self.reduced_square / (2 * tau)
+        cdef bint held, is_flat = not self.B.k, release = is_first and not is_flat
+        memcpy(self.x0, self.x, n * sizeof(double))
+        memcpy(self.g0, self.g, n * sizeof(double))
         self.to(feasible, p, Hp)
         for i in range(n):
             held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
@@ -779,50 +867,97 @@ cdef class Solver:
             upper[i] = self.x[i] if held else self.upper[i]
             self.x2[i] = self.x[i] - beyond * p[i]
             self.g2[i] = self.g[i] - beyond * Hp[i]
-        tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
-        self.step_of_model(self.B, &self.x2[0], &self.g2[0], lower, upper, s)
+        if beyond and is_flat:
+            self.minimise_beyond(most, enough, trace)
+        self.B.tau = tau / self.alpha
+        self.step_of_model(self.B, self.x2, self.g2, lower, upper, s)
         self.B.tau = tau
+        within(self.x2, self.x, lower, upper, s, n)
         for i in range(n):
-            held = lower[i] == upper[i] and not release
-            s[i] = 0.0 if held else self.x2[i] + s[i] - self.x[i]
-        if dot(&self.g[0], s, n) >= 0:
-            beyond = 0.0
-            self.step_of_model(self.B, &self.x[0], &self.g[0], lower, upper, s)
+            if lower[i] == upper[i] and not release:
+                s[i] = 0.0
+        if dot(self.g, s, n) >= 0:
+            memcpy(self.x2, self.x, n * sizeof(double))
+            memcpy(self.g2, self.g, n * sizeof(double))
+            self.step_of_model(self.B, self.x, self.g, lower, upper, s)
         length = self.searched(s, Hs)
-        if length == 0:
-            return b"e"
         if isinf(length):
             return 0
-        if -self.told[2] + 0.5 * self.told[3] + change < 0:
-            length = fmax(length, 1.0)
-        self.to(length, s, Hs)
-        add(-beyond, p, s, n)
-        add(-beyond, Hp, Hs, n)
-        self.B = self.raised(self.B, s, dot(s, Hs, n))
+        if length:
+            if -self.told[2] + 0.5 * self.told[3] + change < 0:
+                length = fmax(length, 1.0)
+            change += -length * self.told[2] + 0.5 * length**2 * self.told[3]
+            for i in range(n):  # x + s − z and its product
+                self.x2[i] = self.x[i] - s[i] - self.x2[i]
+                self.g2[i] = self.g[i] - Hs[i] - self.g2[i]
+            self.to(length, s, Hs)
+            self.B = self.raised(self.B, self.x2, dot(self.x2, self.g2, n))
+        if is_flat and -change < least:
+            return self.project_gradient(tau)
         return b"e"
+
+    cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
+        """Go on with CG from z on the face as if it had no bounds."""
+        cdef Py_ssize_t i, n = self.n
+        cdef long step
+        cdef double curvature = dot(self.p, self.Hp, n), length
+        for step in range(most):
+            for i in range(n):
+                self.phi[i] = self.free[i] * self.g2[i]
+            if dot(self.phi, self.phi, n) <= enough:
+                break
+            turn(self.phi, dot(self.phi, self.Hp, n) / curvature, self.p, n)
+            self.H(self.p, self.Hp)
+            trace.append(c'b')
+            curvature = dot(self.p, self.Hp, n)
+            if curvature <= 0:
+                break
+            length = dot(self.phi, self.p, n) / curvature
+            add(-length, self.p, self.x2, n)
+            add(-length, self.Hp, self.g2, n)
+        return 0
+
+    cdef int project_gradient(self, double tau) except -1:
+        """Take the step of plain gradient projection from where the expansion began."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double length
+        memcpy(self.x, self.x0, n * sizeof(double))
+        memcpy(self.g, self.g0, n * sizeof(double))
+        for i in range(n):
+            self.s[i] = fmin(
+                fmax(self.x[i] - self.free[i] * self.g[i] / tau, self.lower[i]),
+                self.upper[i],
+            ) - self.x[i]
+        length = self.searched(self.s, self.Hs)
+        if length == 0 or isinf(length):
+            return 0
+        self.B = self.raised(self.B, self.s, dot(self.s, self.Hs, n))
+        self.to(length, self.s, self.Hs)
+        return b"f"
 
     cdef int gradient(self, const double *x, double *g) except -1:
         """g ← Hx − b; one product."""
         self.H(x, g)
-        add(-1.0, &self.rhs[0], g, self.n)
+        add(-1.0, self.rhs, g, self.n)
         return 0
 
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
                       long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
-        cdef long steps = 0, idle = 0
+        cdef long idle = 0, inside = 0  # CG steps in this face
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
-        cdef double weight
+        cdef double weight, began
         self.split()
         self.enter_face()
-        memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
+        began = self.phi_square
+        memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
                 return 1
-            if steps >= most:
+            if len(trace) >= most:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
@@ -832,45 +967,48 @@ cdef class Solver:
                 by_model = by_model and self.newton_proportions
                 letter = b"p" if self.proportion(by_model) else 0
             else:
-                self.H(&self.p[0], &self.Hp[0])
-                lengths(&self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
-                        &self.lower[0], &self.upper[0], self.n, &self.told[0])
+                self.H(self.p, self.Hp)
+                lengths(self.x, self.g, self.p, self.Hp,
+                        self.lower, self.upper, self.n, self.told)
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
                     self.minimise_along_p()
                     self.tell(b"c", trace, note)
-                    steps += 1
+                    inside += 1
                     continue
-                letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                letter = self.expand(
+                    self.told[0], self.told[1], not has_expanded, max(inside, 1), began,
+                    trace,
+                )
                 has_expanded = True
             if not letter:
                 return 0
             self.split()
             self.enter_face()
-            memcpy(&self.p[0], self.preconditioned_gradient(), self.n * sizeof(double))
+            inside, began = 0, self.phi_square
+            memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
-            steps += 1
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
         if note is not None:
-            note(chr(letter), np.array(self.x), np.array(self.g))
+            note(chr(letter), copied(self.x, self.n), copied(self.g, self.n))
         return 0
 
     cdef void minimise_along_p(self):
         """Take the CG step whose `lengths` are told, and find the next direction."""
         cdef double curvature = self.told[3], z_Hp
         cdef const double *z
-        advance(self.told[0], &self.x[0], &self.g[0], &self.p[0], &self.Hp[0],
-                &self.lower[0], &self.upper[0], self.B.tau, &self.phi[0],
-                &self.free[0], self.n, &self.told[0])
+        advance(self.told[0], self.x, self.g, self.p, self.Hp,
+                self.lower, self.upper, self.B.tau, self.phi,
+                self.free, self.n, self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
         self.reduced_square, z_Hp = self.told[2], self.told[3]
         z = self.preconditioned_gradient()
-        if z != &self.phi[0]:
-            z_Hp = dot(z, &self.Hp[0], self.n)
-        turn(z, z_Hp / curvature, &self.p[0], self.n)
+        if z != self.phi:
+            z_Hp = dot(z, self.Hp, self.n)
+        turn(z, z_Hp / curvature, self.p, self.n)
 
     # when to stop
 
@@ -878,7 +1016,7 @@ cdef class Solver:
         """Whether an inner run may end."""
         cdef double size = sqrt(self.phi_square + self.beta_square)
         if self.r and size < until.coarse:
-            if size < until.M * self.infeasibility(&self.x[0]):
+            if size < until.M * self.infeasibility(self.x):
                 return True
         return size <= until.small and self.small(tol, energy, b_size)
 
@@ -894,13 +1032,13 @@ cdef class Solver:
 
     cdef bint met(self, double tol, double b_size):
         """Whether the equality rows are met, as `Rows.met` says."""
-        cdef double error = self.infeasibility(&self.x[0]), square = 0.0, part
+        cdef double error = self.infeasibility(self.x), square = 0.0, part
         cdef Py_ssize_t i
-        part = sqrt(dot(&self.x[0], &self.x[0], self.n))
+        part = sqrt(dot(self.x, self.x, self.n))
         if self.e_size == 0 or self.x_tilde_size <= NO_SHIFT * part:
             return error <= tol * fmax(part, b_size)
         for i in range(self.m):
-            part = dot(&self.GC[i, 0], &self.Cv[0], self.r) if self.r else 0.0
+            part = dot(&self.GC[i, 0], self.Cv, self.r) if self.r else 0.0
             square += part * part
         return error <= tol * self.x_tilde_size and sqrt(square) <= tol * self.e_size
 
@@ -908,7 +1046,7 @@ cdef class Solver:
         """Estimate the relative energy error, as `Projected.energy_error` does."""
         cdef double energy = 0.0, most = 0.0, total = 0.0, part, noise
         cdef Py_ssize_t i
-        if not self.diagonal.shape[0]:
+        if not self.diagonal:
             return 0.0
         for i in range(self.n):
             energy += self.q[i] * (self.x_tilde[i] + self.x[i])
@@ -930,18 +1068,24 @@ cdef class Solver:
     def begin(self, const double[::1] x, const double[::1] mu, double rho):
         """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
         cdef Py_ssize_t i, n = self.n
-        start, gradient = np.empty(n), np.empty(n)
+        start, gradient = np.empty(n), np.zeros(n)
+        cdef bint moved = False
         cdef double[::1] nu = start, g = gradient
         self.rho = rho
         for i in range(n):
             nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
-        self.H(pointer(nu), pointer(g))
-        add(-1.0, pointer(self.b), pointer(g), n)
+            moved = moved or nu[i] + self.x_tilde[i] != 0
+        if moved:
+            self.H(pointer(nu), pointer(g))
+        else:  # PFPν = 0
+            self.infeasibility(pointer(nu))
+            add_combination(rho, first(self.C), self.Cv, pointer(g), self.r, n)
+        add(-1.0, self.b, pointer(g), n)
         for i in range(self.r):
             add(mu[i], &self.C[i, 0], pointer(g), n)
         return start, gradient
 
-    def smalbe(self, constants, double tol, at, infeasible, watch=None):
+    def smalbe(self, options, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
@@ -953,37 +1097,40 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = -INFINITY, lagrangian, error, M = at.M
-        cdef long left = constants.max_steps - len(at.steps) - len(at.outer)
-        cdef double energy = constants.energy
+        cdef long left = options.max_steps - len(at.steps) - len(at.outer)
+        cdef double energy = options.energy
         cdef bint stopped, enough, solved, stalled
         cdef Until until
-        np.asarray(self.x)[:], np.asarray(self.g)[:] = at.nu, at.g
+        cdef const double[::1] nu = _whole(at.nu), g = _whole(at.g)
+        if n:
+            memcpy(self.x, &nu[0], n * sizeof(double))
+            memcpy(self.g, &g[0], n * sizeof(double))
         self.rho, self.most_products = at.rho, 0
         cdef double[::1] mu = np.array(at.mu)
-        cdef double b_size = sqrt(dot(pointer(self.b), pointer(self.b), n))
-        b_size = b_size or sqrt(dot(&self.g[0], &self.g[0], n))
-        until.small, until.coarse = tol * b_size, constants.eta * b_size
+        cdef double b_size = sqrt(dot(self.b, self.b, n))
+        b_size = b_size or sqrt(dot(self.g, self.g, n))
+        until.small, until.coarse = tol * b_size, options.eta * b_size
         done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
         status = "iteration_limit"
         while True:
             trace, until.M = bytearray(), M
-            self.rhs[:] = self.b
+            memcpy(self.rhs, self.b, n * sizeof(double))
             for i in range(self.r):
-                add(-mu[i], &self.C[i, 0], &self.rhs[0], n)
+                add(-mu[i], &self.C[i, 0], self.rhs, n)
             if self.plain:
                 self.B = self.plain_model()
             if self.preconditioned or not self.plain:
                 self.preconditioner = self.model(self.rho)
                 if not self.plain:
                     self.B = self.preconditioner
-            note = watch and watch(len(at.outer) + len(done), np.array(self.rhs))
+            note = watch and watch(len(at.outer) + len(done), copied(self.rhs, n))
             stopped = self.minimise(
                 until, tol, energy, b_size, max(left, 0), trace, note
             )
             left -= len(trace) + 1
             solved = sqrt(self.phi_square + self.beta_square) <= until.small
             solved = solved and self.small(tol, energy, b_size)
-            error = self.infeasibility(&self.x[0])
+            error = self.infeasibility(self.x)
             lagrangian = 0.0
             for i in range(n):
                 lagrangian += 0.5 * self.x[i] * (self.g[i] - self.b[i])
@@ -993,18 +1140,18 @@ cdef class Solver:
             before = lagrangian
             done.append((trace.decode(), M, self.rho, error, lagrangian))
             for i in range(self.r):
-                add(self.rho * self.Cv[i], &self.C[i, 0], &self.g[0], n)
+                add(self.rho * self.Cv[i], &self.C[i, 0], self.g, n)
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
-                M *= constants.beta
-                if constants.rho_growth != 1:
-                    self.change_penalty(constants.rho_growth * self.rho)
+                M *= options.beta
+                if options.rho_growth != 1:
+                    self.change_penalty(options.rho_growth * self.rho)
             if solved:
                 status = "solved"
                 break
             errors = [*errors, error][len(errors) > 2:]
             stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
-            if (not stopped or stalled) and infeasible(np.asarray(self.x)):
+            if (not stopped or stalled) and infeasible(copied(self.x, n)):
                 status = "infeasible"
                 break
             if not stopped or left < 0:
@@ -1017,7 +1164,7 @@ cdef class Solver:
                 if self.rho >= MOST_RHO:
                     break
                 self.change_penalty(fmin(10 * self.rho, MOST_RHO))
-        return (np.array(self.x), np.array(self.g), np.asarray(mu), M, self.rho, done,
+        return (copied(self.x, n), copied(self.g, n), np.asarray(mu), M, self.rho, done,
                 status)
 
     cdef Model plain_model(self):
@@ -1028,9 +1175,9 @@ cdef class Solver:
     cdef void change_penalty(self, double rho):
         """Change ρ; the gradient follows without a product."""
         cdef Py_ssize_t i
-        self.infeasibility(&self.x[0])
+        self.infeasibility(self.x)
         for i in range(self.r):
-            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], &self.g[0], self.n)
+            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], self.g, self.n)
         self.rho = rho
 
     # back to the problem as given
@@ -1043,68 +1190,84 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result = np.zeros((4, n))
-        cdef const double[::1] v = nu, low = _whole(lb), high = _whole(ub)
-        cdef double[::1] x, z_box, Fx, rest, at = np.empty(n)
-        cdef double[::1] a = self.norm * np.asarray(mu), da = np.zeros(r)
-        cdef double[:, ::1] S = np.zeros((r, r))
+        result, multipliers = np.zeros((3, n)), np.empty(r)
+        cdef double[:, ::1] whole = result, S
+        cdef const double[::1] v = nu, least = _whole(lb), most = _whole(ub), at_mu = mu
+        cdef double[::1] a = multipliers
+        cdef double *x = first(whole)
+        cdef double *z_box = x + n
+        cdef double *Fx = z_box + n
+        cdef double *rest = self.s
+        cdef double *at = self.Hs  # −2 at the lower bound, 1 at the upper, −1 at both
+        cdef double *da = self.Cv
         cdef double s
-        x, z_box, Fx, rest = result
         for i in range(n):
             at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
             s = self.x_tilde[i] + v[i]
-            s = low[i] if at[i] < 0 else (high[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, low[i]), high[i])  # l − x̃ + x̃ may differ in the last bit
-        self.F.apply(&x[0], &Fx[0])
+            s = least[i] if at[i] < 0 else (most[i] if at[i] > 0 else s)
+            x[i] = fmin(fmax(s, least[i]), most[i])  # l − x̃ + x̃ may differ from l
+        self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
-        for i in range(r):
-            a[i] -= dot(&self.C[i, 0], &rest[0], n)
-        for i in range(r):
-            add(a[i], &self.C[i, 0], &rest[0], n)
-        for k in range(n):
-            if at[k] == 0:
-                for i in range(r):
-                    da[i] += self.C[i, k] * rest[k]
-                    for j in range(i + 1):
-                        S[i, j] += self.C[i, k] * self.C[j, k]
         if r:
+            S = np.zeros((r, r))
+            rows_times(first(self.C), rest, da, r, n)
+            for i in range(r):
+                a[i] = self.norm * at_mu[i] - da[i]
+                da[i] = 0.0
+            add_combination(1.0, first(self.C), pointer(a), rest, r, n)
+            for k in range(n):
+                if at[k] == 0:
+                    for i in range(r):
+                        da[i] += self.C[i, k] * rest[k]
+                        for j in range(i + 1):
+                            S[i, j] += self.C[i, k] * self.C[j, k]
             dpotrf(b"U", &order, &S[0, 0], &order, &info)
             for i in range(r):
                 if info or S[i, i] < 1e-4:
                     return None
-            dpotrs(b"U", &order, &one, &S[0, 0], &order, &da[0], &order, &info)
-        for i in range(r):
-            a[i] -= da[i]
-            add(-da[i], &self.C[i, 0], &rest[0], n)
+            dpotrs(b"U", &order, &one, &S[0, 0], &order, da, &order, &info)
+            for i in range(r):
+                a[i] -= da[i]
+            add_combination(-1.0, first(self.C), da, rest, r, n)
         for i in range(n):
             if at[i] < 0:
                 z_box[i] = -fmax(rest[i], 0.0)
-            if at[i] == 1 or at[i] == -1:  # −1 is both
+            if at[i] == 1 or at[i] == -1:
                 z_box[i] -= fmin(rest[i], 0.0)
-        return np.asarray(x), np.asarray(a), np.asarray(z_box), np.asarray(Fx)
+        return result[0], multipliers, result[1], result[2]
 
 
-def residual_bound(*vectors, G):
+def residual_bound(
+    cost, told_diagonal, const double[::1] x, const double[::1] y,
+    const double[::1] z_box, const double[::1] Fx, lower, upper, right,
+    const double[:, ::1] rows,
+):
     """Bound the worst of `harness.kkt_residuals` from above, without products.
 
-    vectors : q, the diagonal of P (empty for an operator), x, y, z_box, Px, lb, ub, e;
-    G (m, n), e (m,): the rows Gx = e
+    cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
+    x, y, z_box, Fx : the point and Px
+    lower, upper, right, rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
 
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef const double[:, ::1] rows = G
-    cdef const double[::1] q, diagonal, x, y, z_box, Fx, lb, ub, e
-    q, diagonal, x, y, z_box, Fx, lb, ub, e = map(_whole, vectors)
+    cdef const double[::1] q = _whole(cost), diagonal = _whole(told_diagonal)
+    cdef const double[::1] e = _whole(right)
+    cdef const double[::1] lb = _whole(lower), ub = _whole(upper)
     cdef Py_ssize_t i, j, n = x.shape[0], m = e.shape[0]
     cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
     cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-    cdef double[::1] forces = np.array(z_box), size = np.empty(n)
-    if not diagonal.shape[0]:
+    cdef double[:, ::1] room
+    cdef double *forces
+    cdef double *size
+    if not diagonal.shape[0] or not n:
         return INFINITY
+    room = np.empty((2, n))
+    forces, size = &room[0, 0], &room[1, 0]
+    memcpy(forces, &z_box[0], n * sizeof(double))
     for i in range(m):
-        add(y[i], &rows[i, 0], pointer(forces), n)
+        add(y[i], &rows[i, 0], forces, n)
         held += e[i] * y[i]
     for i in range(n):
         if not lb[i] <= x[i] <= ub[i]:

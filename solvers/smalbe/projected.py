@@ -175,7 +175,7 @@ def _diagonal(qp: QP) -> Vector:
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
     """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
-    mean = float(diagonal.mean()) if diagonal.size else 0.0
+    mean = float(diagonal.sum()) / diagonal.size if diagonal.size else 0.0
     if spectrum.norm > NOTHING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)
@@ -183,7 +183,9 @@ def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    ritz = lanczos(PFP, rows.project(random_start(rows.x_tilde.size)), steps)
+    n = rows.x_tilde.size
+    steps = min(steps, n - len(rows.C))  # the dimension of the range of 𝒫
+    ritz = lanczos(PFP, rows.project(random_start(n)), steps)
     return Spectrum(ritz.norm or 1.0, ritz)
 
 
