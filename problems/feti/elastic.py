@@ -139,12 +139,12 @@ def structured(
     return StructuredBodies(
         layout=layout, components=2, material=layout.block.body,
         kind=partial(elastic_kind, D=D, E=E), E=E, held=fixed,
-        load=_forces(load[0], load[1] / force), glue=glue,
+        load=forces_at(load[0], load[1] / force), glue=glue,
         contact=_contact_of_sides(layout, pairs, method, laws, units),
     )  # fmt: skip
 
 
-def _forces(component: Nodes, force: Vector) -> Callable[[Nodes], Vector]:
+def forces_at(component: Nodes, force: Vector) -> Callable[[Nodes], Vector]:
     """Make what looks forces up by components; zero elsewhere."""
     order = np.argsort(component)
     known = component[order]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +19,23 @@ from numpy.typing import NDArray
 from problems.fem.mesh import Nodes, StructuredGrid
 from problems.feti.tearing import blocks
 
+Integers = NDArray[np.integer[Any]]
+
 
 class Places(NamedTuple):
     """Nodes by their places in the grids."""
 
-    body: NDArray[np.int64]  #: (k,)
-    column: NDArray[np.int64]  #: (k,) i
-    row: NDArray[np.int64]  #: (k,) j
+    body: Integers  #: (k,)
+    column: Integers  #: (k,) i
+    row: Integers  #: (k,) j
 
 
 class TornNodes(NamedTuple):
     """The nodes of some blocks, block after block and row by row."""
 
-    block: NDArray[np.int64]  #: (M,) place in the list of blocks
+    block: Integers  #: (M,) place in the list of blocks
     at: Places
-    copy: NDArray[np.int64]  #: (M,) which of the copies of its node it is, from 0 on
+    copy: Integers  #: (M,) which of the copies of its node it is, from 0 on
     start: NDArray[np.int64]  #: (blocks + 1,) first of each block, and M
 
 
@@ -132,7 +134,9 @@ class Layout:
             )
         ]
         across = self._columns.times[self._columns.start[at.body] + at.column]
-        return TornNodes(of, at, second[1] * across + second[0], start)
+        copy = (second[1] * across + second[0]).astype(np.int8)
+        small = [x.astype(np.int32) for x in (of, *at)]  # there are many of them
+        return TornNodes(small[0], Places(*small[1:]), copy, start)
 
     def places(self, node: Nodes) -> Places:
         """Find nodes by their numbers."""
@@ -153,7 +157,7 @@ class Layout:
             * self._rows.times[self._rows.start[at.body] + at.row]
         )
 
-    def holder(self, at: Places, copy: NDArray[np.int64]) -> Nodes:
+    def holder(self, at: Places, copy: Integers) -> Nodes:
         """Find the block of a copy of each node."""
         column = self._columns.start[at.body] + at.column
         row = self._rows.start[at.body] + at.row

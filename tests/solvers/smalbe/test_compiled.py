@@ -244,7 +244,7 @@ def test_no_point_has_residuals_above_the_bound(seed):
         z = np.where(np.isinf(qp.ub), np.minimum(z, 0), z)
         point = replace(solution, x=x, y=y, z_box=z)
         bound = compiled.residual_bound(
-            qp.q, qp.P.diagonal(), x, y, z, qp.P @ x, qp.lb, qp.ub, qp.b, G=G
+            qp.q, qp.P.diagonal(), x, y, z, qp.P @ x, qp.lb, qp.ub, qp.b, G
         )
 
         assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9)
