@@ -6,9 +6,11 @@ Products are bound by memory, which the CPUs of a machine share: two copies of a
 two CPUs do not do twice as much as one either. So the speed-up of a solve on all ranks
 is shown beside what so many copies, each on a rank of its own, reach together. Rounds
 of all three ways are interleaved in one job, on one QP; medians are printed, with the
-least and the largest. Nothing is asserted: machines differ.
+least and the largest, and of the last solve on all ranks what each of them spent on its
+parts. Nothing is asserted: machines differ.
 """
 
+import os
 import sys
 import time
 from statistics import median
@@ -31,7 +33,7 @@ def together(comm: MPI.Comm) -> None:
 
 
 def timed(qp, comm):
-    """Prepare and solve on the ranks of `comm`: seconds of the two."""
+    """Prepare and solve on the ranks of `comm`: seconds of both, and of the parts."""
     ranks = Ranks(comm)
     share = qp.P.build().share(qp, ranks)
     comm.Barrier()
@@ -39,30 +41,34 @@ def timed(qp, comm):
     run = SMALBE().prepare(share.qp, TOL)
     comm.Barrier()
     ready = time.perf_counter()
+    ranks.clear()
     run()
     comm.Barrier()
     end = time.perf_counter()
     qp.P.forget()
-    return ready - start, end - ready
+    return (ready - start, end - ready), dict(ranks.seconds) | ranks.counts
 
 
 def main(name: str = CASE, repeats: str = "5") -> None:
     """Print the table."""
     world, alone = MPI.COMM_WORLD, MPI.COMM_SELF
+    cpus = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})  # as ranks of a run
     qp = mb.build(name).qp
     found: dict[str, list[tuple[float, ...]]] = {"alone": [], "copies": [], "ranks": []}
     for round_ in range(int(repeats) + 1):
         together(world)
-        one = timed(qp, alone) if world.rank == 0 else (0.0, 0.0)
+        one, _ = timed(qp, alone) if world.rank == 0 else ((0.0, 0.0), {})
         together(world)
-        copies = timed(qp, alone)
+        copies, _ = timed(qp, alone)
         together(world)
-        all_ = timed(qp, world)
+        all_, parts = timed(qp, world)
         slowest = [world.allreduce(seconds, MPI.MAX) for seconds in copies]
         if round_:  # the first one warms up
             for way, times in zip(found, (one, slowest, all_), strict=True):
                 found[way].append(tuple(times))
-    if world.rank:
+    of_each = world.gather(parts)
+    if of_each is None:
         return
     print(f"{name}: {qp.q.size} multipliers, {world.size} ranks")
     for i, phase in enumerate(("prepare", "solve")):
@@ -78,6 +84,9 @@ def main(name: str = CASE, repeats: str = "5") -> None:
             f"  {phase:8} speed-up {speed:.2f}, of {most:.2f} that copies reach: "
             f"{speed / most:.2f}"
         )
+    for part in of_each[0]:
+        each = ", ".join(f"{one[part]:.3g}" for one in of_each)
+        print(f"  solve, {part:10} by rank: {each}")
 
 
 if __name__ == "__main__":

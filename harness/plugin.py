@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from harness.distributed.vectors import Emitted, Ranks
     from harness.mechanics import Mechanics
     from harness.qp import QP, Vector
     from harness.solution import Solution
@@ -182,6 +183,16 @@ class Family(ABC):
         """Give the case whose mesh has every cell halved; None where there is none.
 
         The mechanics of both have a grid, for `harness.crossval.discretisation`.
+        """
+        return None
+
+    def emitted(
+        self, form: str, params: Mapping[str, Value], ranks: Ranks
+    ) -> Emitted | None:
+        """Have each rank make its share of what `build` would emit, for a solve on all.
+
+        Called by all ranks, with complete params. None, on all of them, where that is
+        not built: one process emits the whole then.
         """
         return None
 

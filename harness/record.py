@@ -113,6 +113,14 @@ class Record(Measurement):
     threads: int | None = None  #: most threads of any library in the worker, as checked
     cpu: int | None = None  #: that the worker was bound to
     ranks: int = 1  #: processes of MPI that solved it together
+    #: of the solve on ranks, [mean, largest] of these, s: products, exchange, coarse,
+    #: waiting; see `harness.distributed.vectors.Ranks`
+    rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: alike: reductions, messages sent to neighbours, bytes of these
+    rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: alike: what one of these takes, s: reduction_seconds, message_seconds,
+    #: seconds_per_byte; see `harness.distributed.network`
+    rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: or "sequence": may use what earlier steps left; "sequence, tighten=θ": to
     #: tolerances that tighten, see `Record.tighten`
     mode: str = "cold"
@@ -120,7 +128,9 @@ class Record(Measurement):
     #: sequence that tightens
     step_tol: float | None = None
     accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
-    role: str = ""  #: "null": the same solver once more, to show the noise
+    #: "null": the same solver once more, to show the noise; "copies": as many of it at
+    #: once as there are `ranks`, each by itself
+    role: str = ""
     primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
     dual: float | None = None
     complementarity: float | None = None
@@ -184,6 +194,9 @@ class Record(Measurement):
             del row["step_tol"]
         if self.ranks == 1:
             del row["ranks"]
+        for name in ("rank_seconds", "rank_counts", "rank_network"):
+            if not row[name]:
+                del row[name]
         return json.dumps(row, allow_nan=False)
 
     @staticmethod
@@ -328,6 +341,17 @@ def _check(r: Record) -> None:
             _check_nested(journal_name(name), value, 0)
     _check_nested("iterations", r.iterations, 0)
     _check_nested("reported", r.reported, MOST_LEVELS)
+    _check_spent("rank_seconds", r.rank_seconds)
+    _check_spent("rank_counts", r.rank_counts)
+    _check_spent("rank_network", r.rank_network)
+
+
+def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:
+    for part, pair in spent.items():
+        if not min(pair) >= 0:
+            raise ValueError(
+                f"{where}[{shown(part)}] = {pair!r}; expected no negative number"
+            )
 
 
 def _share(record: Record, shared: dict[Any, Any]) -> Record:

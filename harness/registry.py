@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+COPIES = "copies"  #: the role of a spec that `SolverSpec.copies` makes
+
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
@@ -62,7 +64,9 @@ class SolverSpec:
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  #: that differ from defaults
-    role: str = ""  #: "null": one that the suite has already, to show the noise
+    #: "null": one that the suite has already, to show the noise; "copies": so many
+    #: independent solves at once, one on each rank, to show what these could reach
+    role: str = ""
     ranks: int = 1  #: processes of MPI that one solve runs on
 
     def on(self, ranks: int) -> SolverSpec:
@@ -70,6 +74,11 @@ class SolverSpec:
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
+
+    def copies(self, count: int) -> SolverSpec:
+        """Ask for so many of the same at once, each on a rank of its own."""
+        label = f"{self.label} copies={count}"
+        return replace(self, ranks=count, role=COPIES, label=label)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from harness.distributed.vectors import Emitted, Ranks
 from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
 from harness.processes.ranks import launch, this_rank
@@ -23,7 +25,15 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     )
     solver = resolve(spec, registries.solvers)
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
-    serve(solver, int(request_fd), int(reply_fd), registries.operators, ranks)
+
+    def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted | None:
+        family = registries.families[case["family"]]
+        return family.emitted(case["form"], case["params"], ranks)
+
+    serve(
+        solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,
+        copies=request.get("copies", False),
+    )  # fmt: skip
     return 0
 
 

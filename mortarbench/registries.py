@@ -15,6 +15,7 @@ from harness.errors import InputError, unknown
 from harness.limits import ONE_THREAD
 from harness.plugin import Family, Reference, Solver
 from harness.registry import (
+    COPIES,
     Plugin,
     PluginFile,
     SolverSpec,
@@ -181,7 +182,7 @@ class Registries:
             "plugins": self._absolute_files(),
         }
         if spec.ranks > 1:
-            request["ranks"] = spec.ranks
+            request |= {"ranks": spec.ranks, "copies": spec.role == COPIES}
         name = "ranks" if spec.ranks > 1 else "worker"
         return [*self.start, name, json.dumps(request)]
 

@@ -245,3 +245,16 @@ def fits_dense(family: str, n: int) -> None:
             f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
             "what there is"
         )
+
+
+def emitted_on_ranks(params: Mapping[str, Value]) -> bool:
+    """Whether ranks can emit their shares: bodies in blocks, linearised once at rest.
+
+    Later load steps and Coulomb's law need solutions of the whole.
+    """
+    once: Mapping[str, Value] = {"steps": 1, "relin": 1, "kinematics": "linear"}
+    return (
+        bool(params["feti"])
+        and params.get("friction") != "coulomb"
+        and all(params.get(key, value) == value for key, value in once.items())
+    )

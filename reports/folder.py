@@ -23,14 +23,14 @@ from reports.figures.scaling import scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
 from reports.sections.answer import answer as fastest_section
 from reports.sections.answer import answer_statements
-from reports.sections.cases import cases
 from reports.sections.convergence import convergence
 from reports.sections.performance import profiles
 from reports.sections.physics import agreement, deformed, physics, tractions
 from reports.sections.ranking import left_out, means, ranking
+from reports.sections.ranks import ranks
 from reports.sections.results import claim_counts, claims, errors, iterations
 from reports.sections.scaling import growth, scaling, steps
-from reports.sections.settings import definitions, environment
+from reports.sections.settings import cases, definitions, environment
 from reports.sections.summary import summary
 from reports.sections.sweeps import accuracy, certified_sweeps
 from reports.sections.times import precision, ratios, times
@@ -68,6 +68,10 @@ _SCALING = (
 _GROWTH = "Do iterations grow?: cases of four sizes or more are needed."
 _STEPS = (
     "Steps of each kind against size: no solver counts anything on three sizes or more."
+)
+_RANKS = (
+    "One solve on several ranks: nothing was verified on one rank and on several; "
+    "ranks = [1, 2] in the suite (see suites/ranks.toml)."
 )
 _PHYSICS = "Physical results: no verified answer has physical quantities."
 _DEFORMED = "Deformed bodies: no verified answer has bodies to draw."
@@ -172,6 +176,7 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         (_grown(found, evidence), _SCALING),
         (growth(found), _GROWTH),
         (steps(found, sweeps(evidence, "feti")), _STEPS),
+        (ranks(evidence), _RANKS),
         (physics(evidence), _PHYSICS),
         (deformed(evidence), _DEFORMED),
         (tractions(evidence), _TRACTIONS),

@@ -17,29 +17,53 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    runtime_checkable,
+)
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from harness.qp import QP
+from harness.qp import QP, Vector
 from harness.solution import Solution
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
 FEW = 64  #: numbers that are added in the order of the ranks
+
+
+#: what `Ranks.clocked` tells apart: products with local operators; copying what is
+#: exchanged; solves of the coarse problem and what else all ranks do alike; blocked in
+#: MPI until the numbers of the others have come
+PARTS = ("products", "exchange", "coarse", "waiting")
 
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """The processes of one solve, and what they have spent on one another."""
+    """The processes of one solve, and what this one has spent on it."""
 
     comm: Comm
-    #: s, by what was done, see `clocked`
-    seconds: dict[str, float] = field(default_factory=dict)
+    #: s, of the `PARTS`, which do not overlap
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
+    #: collective reductions; messages to single ranks, and bytes of these
+    counts: dict[str, int] = field(
+        default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
+    )
+    #: what it takes, as measured by `harness.distributed.network.network`, if it was
+    network: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def size(self) -> int:
@@ -54,21 +78,25 @@ class Ranks:
     def total(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
         """Add arrays of one shape over all ranks; every rank gets the same sum."""
         part = np.ascontiguousarray(part, dtype=float)
-        with self.clocked("reduction"):
-            if part.size <= FEW:
-                parts = np.empty((self.size, *part.shape))
-                self.comm.Allgather(part, parts)
-                return np.asarray(parts.sum(axis=0))
-            found = np.empty_like(part)
+        if part.size <= FEW:
+            return np.asarray(self.everyones(part).sum(axis=0))
+        found = np.empty_like(part)
+        self.counts["reductions"] += 1
+        with self.clocked("waiting"):
             self.comm.Allreduce(part, found)
-            return found
+        return found
 
     def extreme(self, value: float, pick: Callable[[Any], Any]) -> float:
         """Pick the least or largest number of all ranks."""
-        with self.clocked("reduction"):
-            values = np.empty(self.size)
-            self.comm.Allgather(np.array([value], dtype=float), values)
-        return float(pick(values))
+        return float(pick(self.everyones(np.array([value], dtype=float))))
+
+    def everyones(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the arrays of one shape of all ranks, (size, …)."""
+        parts = np.empty((self.size, *part.shape))
+        self.counts["reductions"] += 1
+        with self.clocked("waiting"):
+            self.comm.Allgather(part, parts)
+        return parts
 
     def exchanged(
         self,
@@ -80,23 +108,28 @@ class Ranks:
 
         sizes, coming : (size,) of what goes to each and of what comes from each
         """
-        found = np.empty(int(coming.sum()))
+        out, found = np.ascontiguousarray(out), np.empty(int(coming.sum()))
         starts = np.cumsum(sizes) - sizes, np.cumsum(coming) - coming
-        self.comm.Alltoallv(
-            [np.ascontiguousarray(out), (sizes, starts[0])],
-            [found, (coming, starts[1])],
-        )
+        self.counts["messages"] += int(np.count_nonzero(sizes))
+        self.counts["bytes"] += out.nbytes
+        with self.clocked("waiting"):
+            self.comm.Alltoallv([out, (sizes, starts[0])], [found, (coming, starts[1])])
         return found
 
     @contextmanager
     def clocked(self, what: str) -> Iterator[None]:
-        """Note how long something takes."""
-        start = perf_counter()
+        """Note how long something takes, one of the `PARTS`, less other parts in it."""
+        start, before = perf_counter(), sum(self.seconds.values())
         try:
             yield
         finally:
-            took = perf_counter() - start
-            self.seconds[what] = self.seconds.get(what, 0.0) + took
+            within = sum(self.seconds.values()) - before
+            self.seconds[what] += perf_counter() - start - within
+
+    def clear(self) -> None:
+        """Begin to count anew."""
+        for table in (self.seconds, self.counts):
+            table.update(dict.fromkeys(table, 0))
 
 
 class DistributedVector(np.ndarray):
@@ -160,6 +193,41 @@ def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
     return found
 
 
+def inner_products(
+    *pairs: tuple[Vector, Vector], least: Vector | None = None
+) -> tuple[float, ...]:
+    """Return xᵀy of each pair of vectors (n,); over ranks, in one reduction.
+
+    least : (k,) of which the least is returned, too, after them; inf if there is none
+    """
+    one = pairs[0][0]
+    products = [float(_slice(x) @ _slice(y)) for x, y in pairs]
+    smallest = [] if least is None else [float(_slice(least).min(initial=np.inf))]
+    if not isinstance(one, DistributedVector):
+        return (*products, *smallest)
+    found = one.ranks.everyones(np.array(products + smallest))
+    sums = found[:, : len(products)].sum(axis=0)
+    return (*sums.tolist(), *found[:, len(products) :].min(axis=0).tolist())
+
+
+def on_slices(function: Callable[P, R]) -> Callable[P, R]:
+    """Have what acts component by component act on slices: one pass, wrapped once.
+
+    function : takes vectors (n,), and gives one or a tuple of them
+    """
+
+    @wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        ranks = next((a.ranks for a in args if isinstance(a, DistributedVector)), None)
+        if ranks is None:
+            return function(*args, **kwargs)
+        plain: Any = [_slice(a) for a in args]
+        found: R = _again(ranks, function(*plain, **kwargs))
+        return found
+
+    return wrapped
+
+
 def _slice(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, DistributedVector) else value
 
@@ -216,7 +284,10 @@ class DistributedColumns:
         if columns is not None:
             part = part[:, np.flatnonzero(np.asarray(columns))]
         with self.ranks.clocked("coarse"):
-            return csc_array(sum(self.ranks.comm.allgather(csc_array(part @ part.T))))
+            mine = csc_array(part @ part.T)
+            with self.ranks.clocked("waiting"):
+                all_ = self.ranks.comm.allgather(mine)
+            return csc_array(sum(all_))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,6 +304,22 @@ class Share(NamedTuple):
     qp: QP  #: vectors are distributed, A has distributed columns, b is on every rank
     #: gathers a solution of it on rank 0; None on the others
     whole: Callable[[Solution], Solution | None]
+
+
+class Emitted(NamedTuple):
+    """A QP that ranks have made together, each its share; no process has it whole."""
+
+    variables: int  #: of the whole
+    equality_rows: int  #: of the whole
+    #: puts this rank's operator together, anew each time: called by all ranks
+    share: Callable[[], Share]
+    #: of this rank's slice of a solution, what `harness.verify.over_ranks` takes to
+    #: certify it; None where that needs the whole
+    answer: Callable[[Solution], Any] | None = None
+
+
+#: has all ranks emit a case, family, params and form; None where that is not built
+Emit = Callable[[Mapping[str, Any], Ranks], Emitted | None]
 
 
 @runtime_checkable
@@ -264,4 +351,6 @@ _REDUCTIONS: Mapping[np.ufunc, Callable[[Ranks, Any], Any]] = {
     np.logical_or: lambda ranks, part: bool(ranks.extreme(part, np.max)),
     np.logical_and: lambda ranks, part: bool(ranks.extreme(part, np.min)),
 }
-_COMPONENTWISE = frozenset({np.where, np.clip, np.zeros_like, np.empty_like, np.copy})
+_COMPONENTWISE = frozenset(
+    {np.where, np.clip, np.zeros_like, np.empty_like, np.copy, np.broadcast_to}
+)

@@ -171,6 +171,10 @@ def _named(accepts: Accepts) -> Accepts:
     return is_named
 
 
+def _is_mean_and_largest(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_size, value))
+
+
 def _is_bounds(value: Any) -> bool:
     """As of `harness.verify.verdicts.certified`: they become fields of the record."""
     return _named(lambda v: _maybe(_is_number)(v) or _named(_maybe(_is_number))(v))(
@@ -194,6 +198,9 @@ _MEASURED: Mapping[str, Accepts] = {
     "iterations": _maybe(_is_count),
     "counts": _named(_is_count),
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
+    "rank_seconds": _named(_is_mean_and_largest),
+    "rank_counts": _named(_is_mean_and_largest),
+    "rank_network": _named(_is_mean_and_largest),
     "first_seconds": _is_time,
     "canary_seconds": _is_size,
     **{journal_name(f.name): _cost(f) for f in fields(Measurement)},

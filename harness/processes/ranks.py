@@ -9,6 +9,10 @@ the limit of memory, and all of them end with any of them.
 A solver that can run so says `on_ranks = True`: its `prepare` is called on every rank
 with that rank's share of the QP (`harness.distributed.vectors.Share`), and every rank
 comes to the same solution, in slices.
+
+Copies are what ranks are compared with: each rank solves all of the QP by itself, at
+the same time as the others, with whom it shares nothing but the machine. The slowest
+tells the time.
 """
 
 from __future__ import annotations
@@ -23,16 +27,26 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator
 
 from harness.distributed.mpi import MISSING, mpiexec
-from harness.distributed.vectors import Distributable, Ranks, Share
+from harness.distributed.network import network
+from harness.distributed.vectors import (
+    Distributable,
+    Emit,
+    Emitted,
+    Ranks,
+    Share,
+)
+from harness.errors import InputError
 from harness.files.qpfile import load_qp
 from harness.operators import Maker, SerialisableOperator
 from harness.plugin import Solver
-from harness.qp import QP
+from harness.qp import QP, no_rows
 from harness.solution import Solution
 from harness.verify.measure import memory_mib
 
@@ -88,12 +102,15 @@ def launch(ranks: int, command: Sequence[str]) -> int:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks, on a CPU of our own if there is one for each."""
+    """Join the other ranks, on a CPU of our own if there is one for each.
+
+    How fast they talk to one another is measured at once, before anything is timed.
+    """
     from mpi4py import MPI  # late: whoever starts no ranks needs none
 
-    ranks = Ranks(MPI.COMM_WORLD)
     cpus = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[ranks.rank % len(cpus)]})
+    os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
+    ranks = Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
     print(f"rank {ranks.rank} is process {os.getpid()}", file=sys.stderr, flush=True)
     return ranks
 
@@ -102,23 +119,38 @@ def follow(
     solver: Solver,
     ranks: Ranks,
     operators: Mapping[str, Maker],
+    emit: Emit,
     limit: Callable[[float | None], None],
 ) -> None:
     """Do on this rank what rank 0 orders, until it orders nothing more.
 
+    emit : makes this rank's share of a case
     limit : limits the memory of this process, in MiB
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
+    emitted: Emitted | None = None
     while (order := _next_order(ranks)) is not None:
         try:
-            if "qp" in order:
+            if "case" in order:
+                run = share = emitted = None  # before another one is made
+                with suppress(InputError):  # as on rank 0, which goes on with the whole
+                    emitted = emit(order["case"], ranks)
+                limit(order["memory_limit"])
+            elif "declines" in order and emitted is not None:
+                solver.declines(emitted.share().qp)
+            elif "tol" in order and emitted is not None:
+                share = emitted.share()
+                run = solver.prepare(share.qp, order["tol"])
+                ranks.comm.Barrier()
+            elif "qp" in order:
                 qp, _ = load_qp(Path(order["qp"]), operators=operators)
                 limit(order["memory_limit"])
-                share = _share(qp, ranks)
+                share = _share(qp, ranks, copies=order["copies"])
                 run = solver.prepare(share.qp, order["tol"])
+                ranks.comm.Barrier()
             elif run is not None and share is not None:
-                _whole(run(), share, ranks)
+                _solved(run, share, ranks)
         except BaseException as e:
             if _ordered(ranks, _ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
@@ -145,17 +177,54 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
-class OnRanks:
-    """A solver on rank 0, which has the others do their share."""
+class Spent(NamedTuple):
+    """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
 
-    def __init__(self, solver: Solver, ranks: Ranks) -> None:
+    seconds: Mapping[str, tuple[float, float]] = {}
+    counts: Mapping[str, tuple[float, float]] = {}
+    network: Mapping[str, tuple[float, float]] = {}  #: as each of them measured it
+
+
+class OnRanks:
+    """A solver on rank 0, which has the others do their share, or the same.
+
+    Attributes
+    ----------
+    spent : what the last solve cost the ranks
+
+    """
+
+    def __init__(
+        self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
+    ) -> None:
         self._solver = solver
         self._ranks = ranks
+        self._emit = emit
+        self._emitted: Emitted | None = None
+        self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
+        self.spent = Spent()
+
+    def emits(self, case: Mapping[str, Any], memory_limit: float | None) -> QP | None:
+        """Have all ranks make their shares of the next QP, where its family can.
+
+        Returns
+        -------
+        its sizes, as a QP without content; None where it is to be loaded: it cannot be
+        emitted by ranks, or each solves the whole
+
+        """
+        self._emitted = None
+        if self._copies:
+            return None
+        self._order({"case": dict(case), "memory_limit": memory_limit})
+        with suppress(InputError):  # why it cannot be shared will be said of the whole
+            self._emitted = self._emit(case, self._ranks)
+        return None if self._emitted is None else _sized(self._emitted)
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
-        """Say in which file the next QP is."""
+        """Say in which file the next QP is, unless it is emitted."""
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
@@ -164,8 +233,13 @@ class OnRanks:
 
     def declines(self, qp: QP) -> str | None:
         """Decline what cannot be shared, besides what the solver declines."""
+        if self._copies:
+            return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
+        if self._emitted is not None:
+            self._order({"declines": True})
+            return self._solver.declines(self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
             return "P cannot be shared by ranks; expected a case in subdomains"
@@ -177,20 +251,27 @@ class OnRanks:
         return self._solver.declines(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks."""
-        order = {
-            "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
-        }  # fmt: skip
-        self._order(order)
-        self._ranks.seconds.clear()
-        share = _share(qp, self._ranks)
+        """Prepare on all ranks; it is done when the last one is."""
+        if self._emitted is not None:
+            self._order({"tol": tol})
+            share = self._emitted.share()
+        else:
+            order = {
+                "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+                "copies": self._copies,
+            }  # fmt: skip
+            self._order(order)
+            share = _share(qp, self._ranks, copies=self._copies)
         run = self._solver.prepare(share.qp, tol)
+        self._ranks.comm.Barrier()
 
         def solve() -> Solution:
             self._order({})
-            found = _whole(run(), share, self._ranks)
+            found = _solved(run, share, self._ranks)
             assert found is not None  # this is rank 0
-            return found
+            solution, spent = found
+            self.spent = Spent() if self._copies else spent
+            return solution
 
         return solve
 
@@ -199,23 +280,48 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
-def _share(qp: QP, ranks: Ranks) -> Share:
+def _sized(emitted: Emitted) -> QP:
+    """Make a QP with the sizes of one that no process has; it holds no numbers."""
+    n, m = emitted.variables, emitted.equality_rows
+    nothing = np.broadcast_to(0.0, n)
+    return QP(
+        P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
+        q=nothing, lb=nothing, ub=nothing, G=no_rows(n), h=np.zeros(0),
+        A=csr_array((m, n)), b=np.zeros(m),
+    )  # fmt: skip
+
+
+def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
+    if copies:
+        return Share(qp, lambda solution: solution if ranks.rank == 0 else None)
     product = qp.P.build()
     assert isinstance(product, Distributable)
     return product.share(qp, ranks)
 
 
-def _whole(s: Solution, share: Share, ranks: Ranks) -> Solution | None:
-    """Gather a solution on rank 0, with what each rank has spent."""
+def _solved(
+    run: Callable[[], Solution], share: Share, ranks: Ranks
+) -> tuple[Solution, Spent] | None:
+    """Solve, and gather the solution on rank 0, with what the ranks have spent."""
+    ranks.clear()
+    s = run()
+    seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     found = share.whole(s)
-    told = {**ranks.seconds, "peak": memory_mib("VmHWM") or 0.0}
-    spent = ranks.comm.gather(told)
-    if found is None or spent is None:
+    peak = memory_mib("VmHWM") or 0.0
+    told = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
+    if found is None or told is None:
         return None
-    reported: dict[str, Any] = {"ranks": ranks.size}
-    for name in sorted({name for one in spent for name in one}):
-        values = [one.get(name, 0.0) for one in spent]
-        unit = "mib" if name == "peak" else "seconds"
-        reported[f"rank_{name}_{unit}_largest"] = float(np.max(values))
-        reported[f"rank_{name}_{unit}_mean"] = float(np.mean(values))
-    return replace(found, reported={**found.reported, **reported})
+    *tables, peaks = zip(*told, strict=True)
+    reported = {
+        **found.reported, "ranks": ranks.size,
+        "rank_peak_mib_largest": max(peaks),
+        "rank_peak_mib_mean": sum(peaks) / ranks.size,
+    }  # fmt: skip
+    return replace(found, reported=reported), Spent(*map(_mean_and_largest, tables))
+
+
+def _mean_and_largest(
+    each: Sequence[Mapping[str, float]],
+) -> dict[str, tuple[float, float]]:
+    values = {name: [float(one[name]) for one in each] for name in each[0]}
+    return {name: (sum(v) / len(v), max(v)) for name, v in values.items()}

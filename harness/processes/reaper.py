@@ -83,11 +83,13 @@ def state(process: int, task: int | None = None) -> str:
         return ""
 
 
-def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> list[int]:
-    """Kill every process below `root` but `spared`; return those that are still there.
+def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> None:
+    """Kill every process below `root` but `spared`, and wait until they are gone.
 
     They are stopped first, until there are no new ones: what is stopped cannot fork,
-    and killing one by one would let a process that forks faster escape.
+    and killing one by one would let a process that forks faster escape. One that the
+    kernel holds is waited for `END_SECONDS` at most; none is left without its signal,
+    however slow the machine.
 
     mark : of the tree, to find those that are not below `root` any more
     """
@@ -98,12 +100,14 @@ def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> list[int
             for process in new:
                 _send(process, signal.SIGSTOP)
             stopped |= new
-        if not stopped or time.monotonic() > deadline:
-            return sorted(stopped)
+        if not stopped:
+            return
         for process in stopped:
             _send(process, signal.SIGKILL)
         if root == os.getpid():
             _reap()
+        if time.monotonic() > deadline:
+            return
         time.sleep(0.001)
 
 

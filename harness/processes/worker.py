@@ -7,8 +7,9 @@ It answers the requests of `harness.processes.protocol` with these of its own:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
   writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
   without which the file may hold no operator; ``memory_limit`` in MiB;
-  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence,
-  and whether it ``tightens``: then every step comes with its own tolerance
+  ``sample_seconds``, see `harness.verify.measure`; ``case``, whose QP it is, which
+  ranks may emit themselves (`harness.plugin.Family.emitted`); ``step`` 0, 1, … of a
+  sequence, and whether it ``tightens``: then every step comes with its own tolerance
 * ``{"check": NAME}``: it runs one of `harness.conformance.conformance.CHECKS`
 
 Every measurement loads its QP afresh, so that nothing that a solver did to the last one
@@ -34,14 +35,14 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from harness.distributed.vectors import Ranks
+from harness.distributed.vectors import Emit, Ranks
 from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays
 from harness.operators import NO_MAKERS, Maker
 from harness.plugin import Solver
 from harness.processes.case_folder import content_digest
 from harness.processes.protocol import Events, answer_requests
-from harness.processes.ranks import OnRanks, follow
+from harness.processes.ranks import OnRanks, Spent, follow
 from harness.qp import QP, Vector, no_rows
 from harness.record import finite, journal_name
 from harness.solution import Solution, Status
@@ -56,11 +57,16 @@ def serve(
     reply_fd: int,
     operators: Mapping[str, Maker] = NO_MAKERS,
     ranks: Ranks | None = None,
+    emit: Emit = lambda case, ranks: None,
+    *,
+    copies: bool = False,
 ) -> None:
     """Answer requests until there are no more.
 
     operators : what puts an operator P of a request together, see `harness.operators`
     ranks : that solve together, this process being one of them
+    emit : has ranks emit the case of a request
+    copies : each of them solves by itself instead, all at the same time
     """
     bench = _Bench(solver, operators)
     if ranks is None:
@@ -70,9 +76,9 @@ def serve(
         os.close(request_fd)
         os.close(reply_fd)
         bench.warm_up()
-        follow(solver, ranks, operators, _limit_memory)
+        follow(solver, ranks, operators, emit, _limit_memory)
         return
-    bench.on_ranks = OnRanks(solver, ranks)
+    bench.on_ranks = OnRanks(solver, ranks, emit, copies=copies)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
     bench.on_ranks.end()
 
@@ -119,9 +125,11 @@ class _Bench:
         path, out = Path(request["qp"]), Path(request["out"])
         out.unlink(missing_ok=True)
         self._shift_heap()
-        self._check(path, request.get("digest"))
-        vouched = "digest" in request  # or it may be anybody's
-        qp, _ = load_qp(path, operators=self._operators if vouched else None)
+        qp = self._emitted(request)
+        if qp is None:
+            self._check(path, request.get("digest"))
+            vouched = "digest" in request  # or it may be anybody's
+            qp, _ = load_qp(path, operators=self._operators if vouched else None)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
         if self.on_ranks is not None:
@@ -138,16 +146,26 @@ class _Bench:
         _limit_memory(None)
         s = timed.solution
         _write_new(out, s)
+        spent = Spent() if self.on_ranks is None else self.on_ranks.spent
         return {
             "claimed": s.status,
             "message": s.message,
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
+            "rank_seconds": spent.seconds,
+            "rank_counts": spent.counts,
+            "rank_network": spent.network,
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
+
+    def _emitted(self, request: dict[str, Any]) -> QP | None:
+        """Have ranks emit the case of a request, unless it is a step of a sequence."""
+        if self.on_ranks is None or "case" not in request or "step" in request:
+            return None
+        return self.on_ranks.emits(request["case"], request.get("memory_limit"))
 
     def _shift_heap(self) -> None:
         """Have arrays lie elsewhere than they did during the last measurement.

@@ -30,6 +30,7 @@ DEFAULTS: Mapping[str, Any] = {
     "null_arm": None,
     "tighten": [0],
     "ranks": [1],
+    "copies": False,
     "max_cases": 100_000,
 }
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
@@ -120,7 +121,7 @@ def load_suite(
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
             solvers=_with_null(
-                _on_ranks(_solvers(table["solvers"], solvers), table["ranks"], solvers),
+                _on_ranks(_solvers(table["solvers"], solvers), table, solvers),
                 table["null_arm"],
             ),
             cases=cases,
@@ -188,10 +189,23 @@ def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpe
 
 
 def _on_ranks(
-    specs: tuple[SolverSpec, ...], ranks: object, registry: Mapping[str, Solver]
+    specs: tuple[SolverSpec, ...],
+    table: Mapping[str, Any],
+    registry: Mapping[str, Solver],
 ) -> tuple[SolverSpec, ...]:
-    """Ask every solver that can for each number of ranks; others run on one."""
+    """Ask every solver that can for each number of ranks; others run on one.
+
+    With `copies`, beside several ranks as many independent solves are asked for.
+    """
+    ranks, copies = table["ranks"], table["copies"]
     counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
+    if not isinstance(copies, bool):
+        raise InputError(f"copies = {shown(copies)}; expected true or false")
+    if copies and counts == [1]:
+        raise InputError(
+            "copies = true: what copies reach is compared with ranks; expected several "
+            "of these, such as ranks = [1, 2]"
+        )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
@@ -200,9 +214,12 @@ def _on_ranks(
             f"ranks = {shown(counts)}: none of the solvers runs on several; expected "
             "one that does, or no ranks"
         )
-    return tuple(
-        spec.on(n) for spec in specs for n in (counts if able[spec.label] else [1])
-    )
+    found = []
+    for spec in specs:
+        of_spec = counts if able[spec.label] else [1]
+        found += [spec.on(n) for n in of_spec]
+        found += [spec.copies(n) for n in of_spec if copies and n > 1]
+    return tuple(found)
 
 
 def _spec(entry: object) -> SolverSpec:

@@ -7,15 +7,23 @@ be held, and a mortar row couples several.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, eye_array
+from scipy.sparse import (
+    csc_array,
+    csc_matrix,
+    csr_array,
+    diags_array,
+    eye_array,
+    hstack,
+)
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from harness.mechanics import UNFELT, Extended, Mechanics, Real, felt_first
+from harness.mechanics import UNFELT, Exact, Extended, Mechanics, Real, felt_first
 from harness.qp import Vector
 
 ROUNDS = 20  #: of growing the set of rows
@@ -36,13 +44,60 @@ def admissible(
     """Find û with Bû ≤ c near u, with equality on the rows `closed`; None if none.
 
     û = u − K⁺B_Vᵀμ + Rα,  F_VV μ = (Bu − c)_V + B_V Rα  is nearest in the energy norm
-    with equality on the rows V; these are the closed ones, the violated ones, and those
-    that get violated meanwhile. It aims inside by some units of the last place. Where
-    that does not end, θu with θ < 1 is admissible while c > 0. Rows of friction, which
-    any u satisfies, are held only where they are closed, which means that they stick.
+    with equality on the rows V. Of torn bodies, for which K⁺ is not to be had, it is
+    nearest in the norm of diag(K): then only nodes move that rows touch, but for Rα.
     """
-    contact = mechanics.exact.contact
-    B, c = mechanics.exact.B, mechanics.exact.c
+    exact, moving = mechanics.exact, mechanics.motions
+    if moving.free.shape[1]:
+        u = u - moving.free @ (moving.free.T @ u)
+    if mechanics.tear is None:
+        rows = _Rows(exact.B, exact.c, exact.contact)
+        found = _inside(rows, u, closed, partial(_nearest, mechanics))
+        return None if found is None else found.u
+    at = np.unique(mechanics.rows.indices)
+    softness = 1 / mechanics.primal.P.diagonal()
+    softness[exact.held] = 0
+    R = csr_array(moving.felt)[at].toarray()
+    touched = exact._replace(B=csr_array(exact.B[:, at]))
+    found = inside_at_rows(touched, R.astype(np.float64), softness[at], u[at], closed)
+    if found is None:
+        return None
+    whole = u + moving.felt @ found.u[at.size :] if R.size else u.copy()
+    if found.theta != 1:
+        whole *= found.theta
+    whole[at] = found.u[: at.size]
+    return np.asarray(whole)
+
+
+class _Rows(NamedTuple):
+    """Rows  Bu ≤ c  of the contact, and those of friction, which any u satisfies."""
+
+    B: Any  #: (m, n), extended
+    c: Extended  #: (m,)
+    contact: NDArray[np.bool_]  #: (m,)
+
+
+class Inside(NamedTuple):
+    """A displacement that no row excludes."""
+
+    u: Extended
+    theta: Any = Real(1)  #: of the whole displacement, where it had to be shrunk
+
+
+def _inside(
+    rows: _Rows, u: Extended, closed: NDArray[np.bool_],
+    nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
+) -> Inside | None:  # fmt: skip
+    """Move u inside, with equality on V.
+
+    V are the closed rows, the violated ones, and those that get violated meanwhile. It
+    aims inside by some units of the last place. Where that does not end, θu with θ < 1
+    is admissible while c > 0. Rows of friction are held only where they are closed,
+    which means that they stick.
+
+    nearest : of the rows V, the map from excesses t (v,) to the δ with B_V δ = −t
+    """
+    B, c, contact = rows
     held = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(ROUNDS):
@@ -52,24 +107,23 @@ def admissible(
         inside = _EPS * (reach + 16 * np.abs(c))
         wanted = held | closed | (contact & (gap < 0))
         if not wanted.any():
-            return u
+            return Inside(u)
         if (wanted != held).any():
             held = wanted
-            step = _nearest(mechanics, held)
+            step = nearest(held)
         elif (gap[contact | held] >= 0).all() and (gap[held] <= 4 * inside[held]).all():
-            return moved
+            return Inside(moved)
         assert step is not None
         moved = moved + step((inside - gap)[held].astype(np.float64))
         if not np.isfinite(moved).all():
-            return _shrunk(mechanics, u)
-    inside = (c - B @ moved)[contact]
-    return moved if (inside >= 0).all() else _shrunk(mechanics, u)
+            return _shrunk(rows, u)
+    gap = (c - B @ moved)[contact]
+    return Inside(moved) if (gap >= 0).all() else _shrunk(rows, u)
 
 
-def _shrunk(mechanics: Mechanics, u: Extended) -> Extended | None:
+def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
     """Return θu with the largest θ that is admissible for sure."""
-    contact = mechanics.exact.contact
-    B, c = mechanics.exact.B[contact], mechanics.exact.c[contact]
+    B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
         return None
     reach = B @ u
@@ -77,9 +131,9 @@ def _shrunk(mechanics: Mechanics, u: Extended) -> Extended | None:
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
     for _ in range(8):  # the product may be rounded outwards
         if not (B @ (theta * u) > c).any():
-            return np.asarray(theta * u)
+            return Inside(np.asarray(theta * u), theta)
         theta = theta * (1 - 8 * _EPS)
-    return np.zeros_like(u)
+    return Inside(np.zeros_like(u), Real(0))
 
 
 def _nearest(
@@ -87,12 +141,9 @@ def _nearest(
 ) -> Callable[[Vector], Vector]:
     """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t.
 
-    Smallest in the energy norm, or in that of diag(K) where K⁺ is not to be had: then
-    only nodes move that rows touch.
+    Smallest in the energy norm.
     """
     B_V = mechanics.rows[np.flatnonzero(rows)]
-    if mechanics.tear is not None:
-        return _nearest_at_rows(mechanics, B_V)
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
     felt = mechanics.motions.felt.astype(np.float64)
 
@@ -103,28 +154,52 @@ def _nearest(
     return step
 
 
-def _nearest_at_rows(
-    mechanics: Mechanics, B_V: csr_array
-) -> Callable[[Vector], Vector]:
-    """Return the map from t to δ with  B_V(δ + Rα) = −t,  smallest in the norm of D.
+def inside_at_rows(
+    exact: Exact, R: NDArray[np.float64], softness: Vector, u: Extended,
+    closed: NDArray[np.bool_],
+) -> Inside | None:  # fmt: skip
+    """Move only what rows touch inside, as `_inside` does.
 
-    D is diag(K), infinite where a support holds. The rigid motions R that contact feels
-    cost nothing.
+    Parameters
+    ----------
+    exact : B has columns (w,) of what rows touch only
+    R : (w, p) rigid motions that contact feels there; they cost nothing
+    softness : (w,) 1/Kᵢᵢ, zero where a support holds
+    u : (w,)
+
+    Returns
+    -------
+    u (w + p,) there and how far the motions have moved all
+
     """
-    softness = 1 / mechanics.primal.P.diagonal()
-    softness[mechanics.exact.held] = 0
-    moved = csr_array(diags_array(softness) @ B_V.T)
+    none = csr_array((exact.c.size, R.shape[1]))
+    B = csr_array(hstack([exact.B, none.astype(Real)]))
+    nearest = partial(_nearest_at_rows, exact.B.astype(np.float64), R, softness)
+    start = np.concatenate([u, np.zeros(R.shape[1], dtype=Real)])
+    return _inside(_Rows(B, exact.c, exact.contact), start, closed, nearest)
+
+
+def _nearest_at_rows(
+    B: csr_array, R: NDArray[np.float64], softness: Vector, rows: NDArray[np.bool_]
+) -> Callable[[Vector], Vector]:
+    """Return the map from t to (δ + Rα, α) with  B_V(δ + Rα) = −t,  δ smallest.
+
+    Smallest in the norm of diag(1/softness), infinite where a support holds. The rigid
+    motions R cost nothing.
+    """
+    B_V = csr_array(B[np.flatnonzero(rows)])
+    moved = csr_array((B_V * softness).T)
     S = csc_array(B_V @ moved)
     shift = 1e-13 * S.diagonal().max() + np.finfo(float).tiny
     factor = splu(csc_matrix(S + shift * eye_array(S.shape[0])))
-    R = mechanics.motions.felt.toarray().astype(np.float64)
     G = B_V @ R
     SG = factor.solve(G) if G.size else G
     stiff = np.linalg.pinv(G.T @ SG, hermitian=True)
 
     def step(t: Vector) -> Vector:
         alpha = -(stiff @ (SG.T @ t))
-        return np.asarray(R @ alpha - moved @ factor.solve(t + G @ alpha))
+        delta = R @ alpha - moved @ factor.solve(t + G @ alpha)
+        return np.concatenate([delta, alpha])
 
     return step
 
@@ -213,7 +288,8 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
     """
     exact, motions = mechanics.exact, mechanics.motions
-    if (driven := _driven(mechanics)) is not None:
+    driven = _driven(mechanics) if motions.free.shape[1] else None
+    if driven is not None:
         raise UncertifiableError(driven)
     G = motions.G
     if not G.shape[1]:
@@ -244,7 +320,7 @@ def _driven(mechanics: Mechanics) -> str | None:
     """Say which load nothing can balance; None where there is none."""
     free, f, rigid = mechanics.motions.free, mechanics.exact.f, mechanics.rigid
     along, terms = free.T @ f, abs(free).T @ np.abs(f)
-    largest = abs(free).max(axis=0).toarray().ravel() if free.nnz else terms
+    largest = abs(free).max(axis=0).toarray().ravel()
     rounding = UNFELT * terms + ROUNDED * np.abs(f).sum() * largest
     if (np.abs(along) <= rounding).all():
         return None

@@ -53,7 +53,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mechanics import Extended, Mechanics, Real
+from harness.mechanics import Exact, Extended, Mechanics, Real
 from harness.qp import Vector
 from harness.solution import Solution
 from harness.verify.active_set_refinement import (
@@ -71,7 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import neighbour
+from harness.verify.substructured import Alone, moved_together, neighbour, residual
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -91,7 +91,7 @@ class Certificate:
 
     u: Extended  #: û (n,)
     multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    equilibrium: Extended  #: u_λ (n,); of substructures torn, (N,)
+    off: Vector | Extended  #: û − u_λ (n,); of substructures torn, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
@@ -101,6 +101,11 @@ class Certificate:
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, from the answer to the admissible point
     seminorm: bool  #: whether some body can move rigidly: nothing bounds that
+
+    @property
+    def equilibrium(self) -> Extended:
+        """u_λ (n,) of bodies in one piece."""
+        return np.asarray(self.u - self.off)
 
     @property
     def gap(self) -> float:
@@ -184,27 +189,26 @@ def _least_norm(mechanics: Mechanics) -> float:
 
 def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | str]:
     """Yield what the answer's own pair proves and, if that is mostly work, others."""
-    exact, claimed = mechanics.exact, s.x.astype(Real)
-    u = claimed.copy()
+    exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    states = suggested(mechanics, u, multipliers)
-    tidied = at_bounds(mechanics, states, multipliers), states == CLOSED
+    states = suggested(exact, u, multipliers)
+    tidied = at_bounds(exact, states, multipliers), states == CLOSED
     pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
     if mechanics.tear is not None:
         pairs.reverse()  # of large problems what mostly is enough comes first
     proven = np.inf
     for pair in pairs:
-        found = _proved(mechanics, claimed, u, *pair)
+        found = _proved(mechanics, s.x, u, *pair)
         yield found
-        if _sharp(found):
+        if is_sharp(found):
             return
         proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
     exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
     if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
-        yield _proved(mechanics, claimed, v, mu, states == CLOSED)
+        yield _proved(mechanics, s.x, v, mu, states == CLOSED)
 
 
 def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
@@ -216,7 +220,7 @@ def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
         return str(e)
 
 
-def _sharp(found: Certificate | str) -> bool:
+def is_sharp(found: Certificate | str) -> bool:
     """Whether another pair would not prove much more."""
     return isinstance(found, Certificate) and (
         found.work <= NEARLY * found.distance**2 or found.bound <= GOOD
@@ -224,8 +228,8 @@ def _sharp(found: Certificate | str) -> bool:
 
 
 def proof(
-    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
-    closed: Any,
+    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
+    multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (4) and (3) for the pair that mending u and λ yields.
 
@@ -236,7 +240,7 @@ def proof(
 
     """
     exact, motions = mechanics.exact, mechanics.motions
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     gaps = -exact.motion(feasible)
@@ -256,7 +260,8 @@ def proof(
     )
     middle = (feasible + at_rest) * Real(0.5)
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=at_rest,
+        exact, mechanics.kernel.shape[1] > 0,
+        u=feasible, multipliers=lam, off=feasible - at_rest,
         norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
         apart=apart, left=left, works=works, rounding=rounding,
         from_middle=_length(mechanics, claimed - middle, held),
@@ -265,9 +270,9 @@ def proof(
 
 
 def _certificate(
-    mechanics: Mechanics, *, u: Extended, multipliers: Extended, equilibrium: Extended,
-    norms: list[float], apart: float, left: float, works: Extended, rounding: float,
-    from_middle: float, moved: float,
+    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended,
+    off: Vector | Extended, norms: list[float], apart: float, left: float,
+    works: Extended, rounding: float, from_middle: float, moved: float,
 ) -> Certificate:  # fmt: skip
     """Put the terms of (2) and (3) together.
 
@@ -290,11 +295,11 @@ def _certificate(
     around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
     pair = np.sqrt(2 * gap)
     found = Certificate(
-        u=u, multipliers=multipliers, equilibrium=equilibrium, norm=norms[0],
-        distance=total, work=work, sliding=float(works[~mechanics.exact.contact].sum()),
+        u=u, multipliers=multipliers, off=off, norm=norms[0],
+        distance=total, work=work, sliding=float(works[~exact.contact].sum()),
         rounding=rounding, claimed=from_middle + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
-        moved=moved, seminorm=mechanics.kernel.shape[1] > 0,
+        moved=moved, seminorm=seminorm,
     )  # fmt: skip
     if not np.isfinite(found.error):
         raise UncertifiableError("the answer is too large for arithmetic")
@@ -302,8 +307,8 @@ def _certificate(
 
 
 def _substructured_proof(
-    mechanics: Mechanics, claimed: Extended, u: Extended, multipliers: Extended,
-    closed: Any,
+    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
+    multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (1) and (3) with the u_λ of `harness.verify.substructured`.
 
@@ -313,27 +318,59 @@ def _substructured_proof(
         When u or λ cannot be mended.
 
     """
-    exact, motions, parts = mechanics.exact, mechanics.motions, mechanics.substructures
-    feasible = admissible(mechanics, u - motions.free @ (motions.free.T @ u), closed)
+    exact = mechanics.exact
+    feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
-    near = neighbour(mechanics, feasible, lam)
-    moved = (parts.spread @ (claimed - feasible)).astype(np.float64)
-    stretched = (near.Ku, near.Kd, parts.product(moved))
-    energy = np.array([[v @ Kw for Kw in stretched] for v in (near.u, near.d, moved)])
+    rho, square = residual(mechanics, feasible, lam)
+    near = neighbour(
+        mechanics.substructures, exact.held, rho.astype(np.float64),
+        moved_together(mechanics), Alone(),
+    )  # fmt: skip
+    force = mechanics.substructures.spread.T @ near.Kd
+    moved = mechanics.still(claimed - feasible).astype(np.float64)
+    return torn_certificate(
+        exact, mechanics.kernel.shape[1] > 0, u=feasible, multipliers=lam, off=near.d,
+        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
+        energies=Energies(
+            square, float(mechanics.still(feasible) @ force), float(near.d @ near.Kd),
+            float(moved @ (mechanics.primal.P @ moved)), float(moved @ force),
+            near.left,
+        ),
+    )  # fmt: skip
 
-    def length(*combined: float) -> float:
-        """Return the norm of a combination of Tû, d and T(u − û)."""
-        w = np.array(combined, dtype=Real)
-        return float(np.sqrt(max(float(w @ energy @ w), 0.0)))
+
+class Energies(NamedTuple):
+    """Products in K_T of û, of d = Tû − u_λ, and of u − û from û to the answer."""
+
+    u_u: float
+    u_d: float
+    d_d: float
+    moved_moved: float
+    moved_d: float
+    left: float  #: of what is left of d, with itself
+
+
+def torn_certificate(
+    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended, off: Vector,
+    works: Extended, energies: Energies,
+) -> Certificate:  # fmt: skip
+    """Put the terms of (1) and (3) together, of u_λ = Tû − d."""
+    e = energies
+
+    def length(square: float) -> float:
+        return float(np.sqrt(max(square, 0.0)))
 
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, equilibrium=near.u - near.d,
-        norms=[length(1, 0, 0), length(1, -1, 0), length(1, -0.5, 0)],
-        apart=length(0, 1, 0), left=near.left,
-        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
-        rounding=0.0, from_middle=length(0, 0.5, 1), moved=length(0, 0, 1),
+        exact, seminorm, u=u, multipliers=multipliers, off=off, works=works,
+        norms=[
+            length(e.u_u), length(e.u_u - 2 * e.u_d + e.d_d),
+            length(e.u_u - e.u_d + 0.25 * e.d_d),
+        ],
+        apart=length(e.d_d), left=length(e.left), rounding=0.0,
+        from_middle=length(e.moved_moved + e.moved_d + 0.25 * e.d_d),
+        moved=length(e.moved_moved),
     )  # fmt: skip
 
 

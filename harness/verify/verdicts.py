@@ -17,7 +17,7 @@ from harness.names import CaseId
 from harness.plugin import Case
 from harness.qp import QP
 from harness.record import Record, Verdict
-from harness.registry import SolverSpec
+from harness.registry import COPIES, SolverSpec
 from harness.solution import Solution, Status
 from harness.verify.certificate import UncertifiableError, certify
 from harness.verify.kkt import kkt_residuals, verdict
@@ -52,6 +52,8 @@ def new_record(
         identity += [mode, accuracy]
     if spec.ranks > 1:
         identity += [{"ranks": spec.ranks}]
+    if spec.role == COPIES:
+        identity += [COPIES]
     text = json.dumps(identity, sort_keys=True)
     return Record(
         run_id=hex_digest([text.encode()]),

@@ -36,6 +36,15 @@ class ContactPair(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class ContactSides:
+    """The sides of bodies that may touch, and nothing else of the bodies."""
+
+    mesh: Mesh  #: their nodes, without cells, m
+    pairs: tuple[ContactPair, ...]
+    force: float  #: F₀, N/m, as of `Bodies`
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Bodies:
     """Bodies numbered one after another, their supports, load and contact sides.
 
@@ -112,7 +121,7 @@ class Bodies:
     @property
     def elasticity(self) -> NDArray[np.float64]:
         """Elasticity matrix of each body, (bodies, 3, 3), Pa."""
-        return _elasticity_matrices(self.materials, self.plane)
+        return elasticity_matrices(self.materials, self.plane)
 
 
 def assemble(
@@ -139,7 +148,7 @@ def assemble(
 
     """
     length, force = units
-    D = _elasticity_matrices(materials, plane)
+    D = elasticity_matrices(materials, plane)
     return Bodies(
         mesh=mesh, body=body, names=names, materials=materials, plane=plane,
         length=length, force=force, K=stiffness(mesh, D * (length / force), body),
@@ -191,7 +200,8 @@ def supported(bodies: Bodies) -> GeneralisedInverse:
     return supported_inverse(bodies.K, free, bodies.rigid, interface)
 
 
-def _elasticity_matrices(
+def elasticity_matrices(
     materials: tuple[Material, ...], plane: Plane
 ) -> NDArray[np.float64]:
+    """Return the elasticity matrix of each material, (k, 3, 3), Pa."""
     return np.stack([elasticity_matrix(m, plane) for m in materials])

@@ -24,7 +24,7 @@ import numpy as np
 
 from harness import Friction, Vector
 from harness.mechanics import NO_FRICTION
-from problems.contact.bodies import Bodies
+from problems.contact.bodies import Bodies, ContactSides
 from problems.contact.node_to_segment import ContactRows
 
 
@@ -53,7 +53,7 @@ def law_of(params: Mapping[str, Any]) -> FrictionLaw:
 
 
 def friction_of(
-    bodies: Bodies,
+    bodies: Bodies | ContactSides,
     rows: ContactRows,
     laws: Sequence[FrictionLaw],
     before: Vector,

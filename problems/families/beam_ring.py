@@ -21,6 +21,7 @@ from problems.ranges import (
     at_most,
     deformed,
     doubled,
+    emitted_on_ranks,
     fits,
     one_of,
     rough,
@@ -30,6 +31,7 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from harness.distributed.vectors import Emitted, Ranks
 
 MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
@@ -90,6 +92,17 @@ class BeamRing(Family):
             return None
         without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
+
+    def emitted(
+        self, form: str, params: Mapping[str, Value], ranks: Ranks
+    ) -> Emitted | None:
+        """Have each rank make its share of the dual of a single load step."""
+        if form != "dual" or not emitted_on_ranks(params):
+            return None
+        from problems.feti.emission import emitted
+        from problems.models.beam_ring import structured_problem
+
+        return emitted(structured_problem(params), ranks)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -12,7 +12,7 @@ its constant BᵀDB exactly, as the Jacobian determinant is linear.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,14 +42,103 @@ class Mesh:
         return self.points.size
 
 
+@dataclass(frozen=True, eq=False)
+class StructuredGrid:
+    """Rows and columns of nodes, of which any block can be had without the others.
+
+    Node (row j, column i) has the number  j·(columns) + i;  cells are numbered alike.
+    """
+
+    columns: Vector  #: (nx + 1,) parameter of each column of nodes
+    rows: Vector  #: (ny + 1,) parameter of each row of nodes
+    #: parameters of some columns (k,) and rows (l,) → points (l, k, 2)
+    place: Callable[[Vector, Vector], NDArray[np.float64]]
+    names: tuple[str, str, str, str]  #: of the sides, anticlockwise from row 0
+
+    @property
+    def divisions(self) -> tuple[int, int]:
+        """Cells along rows and along columns, nx and ny."""
+        return self.columns.size - 1, self.rows.size - 1
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes there are."""
+        return self.columns.size * self.rows.size
+
+    @property
+    def sides(self) -> Mapping[str, Nodes]:
+        """Nodes of the four sides, as chains of a mesh."""
+        nx, ny = self.divisions
+        across, up = np.arange(nx + 1), (nx + 1) * np.arange(ny + 1)
+        chains = across, up + nx, (up[-1] + across)[::-1], up[::-1]
+        return dict(zip(self.names, chains, strict=True))
+
+    def block(self, columns: slice, rows: slice) -> NDArray[np.float64]:
+        """Return the points (l·k, 2) of some rows and columns of nodes, row by row."""
+        points = self.place(self.columns[columns], self.rows[rows])
+        return np.asarray(np.ascontiguousarray(points.reshape(-1, 2)))
+
+    def side(self, name: str) -> NDArray[np.float64]:
+        """Return the points of a side in the order of its chain, (k, 2)."""
+        at, all_, last = self.names.index(name), slice(None), slice(-1, None)
+        if at in (0, 2):
+            points = self.block(all_, last if at else slice(1))
+        else:
+            points = self.block(last if at == 1 else slice(1), all_)
+        return np.asarray(points if at < 2 else points[::-1])
+
+    def prefixed(self, prefix: str) -> StructuredGrid:
+        """Put `prefix` before the names of the sides."""
+        first, second, third, fourth = (prefix + name for name in self.names)
+        return replace(self, names=(first, second, third, fourth))
+
+    def mesh(self) -> Mesh:
+        """Connect all points."""
+        return _structured(self.place(self.columns, self.rows), self.names)
+
+
+def cells_of_block(columns: int, rows: int) -> Nodes:
+    """List the cells (E, 4) of so many columns and rows of nodes, row by row."""
+    i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
+    corners = i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]
+    return np.stack(corners, axis=-1).reshape(-1, 4)
+
+
+def rectangle_grid(corner: tuple[float, float], size: tuple[float, float],
+                   divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
+    """Divide a rectangle into nx × ny equal cells; sides bottom, right, top, left."""
+    nx, ny = divisions
+    return StructuredGrid(
+        columns=corner[0] + size[0] * np.arange(nx + 1) / nx,
+        rows=corner[1] + size[1] * np.arange(ny + 1) / ny,
+        place=lambda x, y: np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1),
+        names=("bottom", "right", "top", "left"),
+    )
+
+
+def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
+                   divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
+    """Divide the upper half of a ring by equal angles × equal layers.
+
+    Sides: outer (from angle 0 to π), left_foot, inner, right_foot.
+    """
+    angles, layers = divisions
+
+    def place(theta: Vector, r: Vector) -> NDArray[np.float64]:
+        direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+        return np.asarray(np.asarray(centre) + r[:, None, None] * direction)
+
+    return StructuredGrid(
+        columns=np.pi * np.arange(angles + 1) / angles,
+        rows=radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers,
+        place=place, names=("outer", "left_foot", "inner", "right_foot"),
+    )  # fmt: skip
+
+
 def rectangle(corner: tuple[float, float], size: tuple[float, float],
               divisions: tuple[int, int]) -> Mesh:  # fmt: skip
     """Mesh a rectangle by nx × ny equal cells; boundaries bottom, right, top, left."""
-    nx, ny = divisions
-    x = corner[0] + size[0] * np.arange(nx + 1) / nx
-    y = corner[1] + size[1] * np.arange(ny + 1) / ny
-    grid = np.stack(np.meshgrid(x, y, indexing="xy"), axis=-1)
-    return _structured(grid, ("bottom", "right", "top", "left"))
+    return rectangle_grid(corner, size, divisions).mesh()
 
 
 def half_ring(centre: tuple[float, float], radii: tuple[float, float],
@@ -58,12 +147,7 @@ def half_ring(centre: tuple[float, float], radii: tuple[float, float],
 
     Boundaries: outer (from angle 0 to π), left_foot, inner, right_foot.
     """
-    angles, layers = divisions
-    theta = np.pi * np.arange(angles + 1) / angles
-    r = radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers
-    direction = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    grid = np.asarray(centre) + r[:, None, None] * direction
-    return _structured(grid, ("outer", "left_foot", "inner", "right_foot"))
+    return half_ring_grid(centre, radii, divisions).mesh()
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
@@ -110,6 +194,16 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     return Mesh(points, np.concatenate(cells), boundaries), body
 
 
+def joined_sides(grids: Sequence[StructuredGrid]) -> Mapping[str, Nodes]:
+    """Return the sides of grids with the numbers that `join` gives their nodes."""
+    starts = np.cumsum([0] + [grid.nodes for grid in grids])
+    return {
+        name: nodes + start
+        for grid, start in zip(grids, starts, strict=False)
+        for name, nodes in grid.sides.items()
+    }
+
+
 def prefixed(mesh: Mesh, prefix: str) -> Mesh:
     """Put `prefix` before the name of each boundary, so that equal shapes can join."""
     return replace(
@@ -142,11 +236,10 @@ def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
     """Connect a (rows, columns, 2) grid of points; names from row 0 anticlockwise."""
     rows, columns = grid.shape[:2]
     i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
-    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
     sides = (i[0], i[:, -1], i[-1, ::-1], i[::-1, 0])
     return Mesh(
         np.ascontiguousarray(grid.reshape(-1, 2)),
-        cells.reshape(-1, 4),
+        cells_of_block(columns, rows),
         dict(zip(names, sides, strict=True)),
     )
 

@@ -8,20 +8,24 @@ others get its multiplier before they multiply, and send what they add to it:
 
 Nothing of the size of the whole is anywhere: a rank has the columns of B, and the rows
 of all vectors, that its subdomains touch. Subdomains go to ranks so that these do
-alike much work and share few rows, by graph partitioning (METIS).
+alike much work and share few rows, by graph partitioning (METIS). Of a kind that
+several ranks have, one forms the explicit blocks, and sends them to the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 
 from harness import QP, InputError, Solution, Vector, no_rows
+from harness.digest import hex_digest
+from harness.distributed.factor import Touched, local_factor, touched_rows
 from harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
@@ -32,12 +36,15 @@ from harness.distributed.vectors import (
 from harness.operators import Product
 from problems.fem.mesh import Nodes
 from problems.feti.operators import (
+    ROUNDING,
+    SHIFT,
     DualOperator,
+    Group,
     gram_inverse,
     touched,
     uncoupled,
 )
-from problems.feti.torn import Dense, Subdomains
+from problems.feti.torn import Condensed, Dense, Subdomains
 
 
 class Parts(NamedTuple):
@@ -58,21 +65,27 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
 
     """
     S = domains.kind.size
-    if S < ranks:
-        raise InputError(
-            f"{ranks} ranks for {S} subdomains; expected at most one rank for each"
-        )
     rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
     sub = np.searchsorted(domains.start, B.indices, side="right") - 1
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
     touches.data[:] = 1
-    rank = _balanced(touches, _work(B, domains), ranks)
+    rank = balanced(csr_array(touches.T @ touches), _work(B, domains), ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
+    reach.sort_indices()
     reach.data[:] = 1
-    turn = np.arange(B.shape[0]) % np.diff(reach.indptr)
-    return Parts(rank, reach, reach.indices[reach.indptr[:-1] + turn].astype(np.int64))
+    return Parts(rank, reach, owners(np.arange(B.shape[0]), reach))
+
+
+def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
+    """Choose one of the ranks that touch each of some rows (t,), in turn.
+
+    rows : their numbers
+    reach : (t, ranks) the ranks that touch them, ascending
+    """
+    turn = rows % np.diff(reach.indptr)
+    return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
@@ -81,15 +94,23 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.kind]
 
 
-def _balanced(
-    touches: csr_array, work: NDArray[np.int64], ranks: int
+def balanced(
+    graph: csr_array, work: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
-    """Partition the graph of subdomains that share rows, by work."""
+    """Partition the graph of subdomains that share rows, by work (S,).
+
+    graph : (S, S) how many rows they share
+    """
+    if work.size < ranks:
+        raise InputError(
+            f"{ranks} ranks for {work.size} subdomains; expected at most one rank for "
+            "each"
+        )
     if ranks == 1:
         return np.zeros(work.size, dtype=np.int64)
     import pymetis  # late: one process needs none
 
-    graph = csr_array(touches.T @ touches)
+    graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
     unit = max(int(work.min()), 1)
@@ -120,11 +141,18 @@ class Halo:
     lends: NDArray[np.int64]  #: (ranks,) how many go to each
     borrows: NDArray[np.int64]  #: (ranks,) how many come from each
 
+    @property
+    def is_shared(self) -> NDArray[np.bool_]:
+        """Which of its rows other ranks touch, too."""
+        shared = np.zeros(self.rows.size, dtype=bool)
+        shared[self.borrowed] = shared[self.own[self.lent]] = True
+        return shared
+
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
-        found = np.empty(self.rows.size)
-        found[self.own] = x
         with self.ranks.clocked("exchange"):
+            found = np.empty(self.rows.size)
+            found[self.own] = x
             found[self.borrowed] = self.ranks.exchanged(
                 x[self.lent], self.lends, self.borrows
             )
@@ -132,33 +160,33 @@ class Halo:
 
     def added(self, y: Vector) -> Vector:
         """Add up what all ranks have for the rows that this one owns (o,)."""
-        found = y[self.own]
         with self.ranks.clocked("exchange"):
+            found = y[self.own]
             come = self.ranks.exchanged(y[self.borrowed], self.borrows, self.lends)
-        np.add.at(found, self.lent, come)
+            np.add.at(found, self.lent, come)
         return found
 
 
-def halo_of(parts: Parts, ranks: Ranks) -> Halo:
-    """Find what this rank exchanges with the others."""
-    me = ranks.rank
-    reach, owner = parts.reach.tocsc(), parts.owner
-    reached = [
-        np.sort(reach.indices[reach.indptr[r] : reach.indptr[r + 1]])
-        for r in range(ranks.size)
-    ]
-    rows = reached[me]
-    mine = np.flatnonzero(owner == me)
-    lent = [
-        np.searchsorted(mine, theirs[owner[theirs] == me]) if r != me else theirs[:0]
-        for r, theirs in enumerate(reached)
-    ]
-    borrowed = [
-        np.flatnonzero(owner[rows] == r) if r != me else rows[:0]
-        for r in range(ranks.size)
-    ]
+def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) -> Halo:
+    """Find what this rank exchanges with the others.
+
+    Parameters
+    ----------
+    rows : (t,) all that its subdomains touch, ascending
+    reach : (t, ranks) which ranks touch them
+    owner : (t,) rank of each
+
+    """
+    me, touched_by = ranks.rank, reach.tocsc()
+    own = np.flatnonzero(owner == me)
+    lent, borrowed = [], []
+    for r in range(ranks.size):
+        theirs = touched_by.indices[touched_by.indptr[r] : touched_by.indptr[r + 1]]
+        needed = np.sort(theirs[(owner[theirs] == me) & (r != me)])
+        lent.append(np.searchsorted(own, needed))
+        borrowed.append(np.flatnonzero((owner == r) & (r != me)))
     return Halo(
-        ranks=ranks, rows=rows, own=np.searchsorted(rows, mine),
+        ranks=ranks, rows=rows, own=own,
         lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
         lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
     )  # fmt: skip
@@ -190,7 +218,7 @@ class RankOperator:
     def _over(self, x: Dense, local: Product) -> DistributedVector:
         ranks = self.halo.ranks
         touched_x = self.halo.gathered(np.asarray(x))
-        with ranks.clocked("product"):
+        with ranks.clocked("products"):
             y = local(touched_x)
         return distributed(self.halo.added(y), ranks)
 
@@ -213,38 +241,150 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Make x ↦ (B W Bᵀ)⁻¹x of the sum of all ranks' parts, on owned rows.
 
-        Contact rows, and those that are coupled with others (none if gluing is
-        orthonormal), are solved for by all ranks alike.
+        Most equations are coupled with no other row, all of them if gluing is
+        orthonormal; all ranks alike solve for those that are. Contact rows are coupled
+        along the contact. They are solved for rank by rank, unless ranks share many.
         """
-        at, ranks = self.halo, self.halo.ranks
+        at, equalities = self.halo, self.local.equalities
         diagonal = at.added(part.diagonal())
-        entries = part.tocoo()
-        told = at.rows[entries.row], at.rows[entries.col], entries.data
-        beside = (entries.row != entries.col) & (entries.data != 0)
-        contact = at.rows[at.rows >= self.local.equalities]
-        mine = np.union1d(told[0][beside], contact)
-        known = np.unique(np.concatenate(ranks.comm.allgather(mine)))
-        of_known = np.isin(told[0], known) & np.isin(told[1], known)
-        rows, columns, data = map(
-            np.concatenate,
-            zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
-        )
-        places = np.searchsorted(known, rows), np.searchsorted(known, columns)
-        gram = csr_array((data, places), shape=(known.size,) * 2)
-        gram.sum_duplicates()
-        equalities = int(np.searchsorted(known, self.local.equalities))
-        inverse = gram_inverse(uncoupled(gram, equalities), equalities)
-        place, own = np.intersect1d(known, at.rows[at.own], return_indices=True)[1:]
+        is_contact = at.rows >= equalities
+        coupled = np.isin(at.rows, _coupled(part, at, diagonal, ~is_contact))
+        contact = touched_rows(at.rows[is_contact], at.ranks)
+        solves = []
+        if contact.few_shared:
+            of_contact = csc_array(part[is_contact][:, is_contact])
+            solves.append(_rank_by_rank(of_contact, contact, at, diagonal))
+        else:
+            coupled |= is_contact
+        if at.ranks.extreme(float(coupled.any()), np.max):
+            solves.append(_alike(part, coupled, at, equalities))
 
         def solve(x: Dense) -> Dense:
             x = np.asarray(x)
             y = x / diagonal
-            whole = np.zeros(known.size)
-            whole[place] = x[own]
-            y[own] = inverse(ranks.total(whole))[place]
+            for owned, inverse in solves:
+                y[owned] = inverse(x[owned])
             return np.asarray(y)
 
         return solve
+
+
+def _coupled(
+    part: csr_array, at: Halo, diagonal: Vector, some: NDArray[np.bool_]
+) -> Nodes:
+    """Find which of some rows (t,) the sum of all parts couples beyond rounding."""
+    row, column = part.tocoo().coords
+    size = np.sqrt(at.gathered(diagonal))
+    share = part.tocoo().data / (size[row] * size[column])
+    beside = (row != column) & some[row] & some[column] & (share != 0)
+    between = at.is_shared[row] & at.is_shared[column]
+    found = [at.rows[row[beside & ~between & (np.abs(share) > ROUNDING)]]]
+    told = [v[beside & between] for v in (at.rows[row], at.rows[column], share)]
+    rows, columns, shares = map(
+        np.concatenate, zip(*at.ranks.comm.allgather(told), strict=True)
+    )
+    pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
+    total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
+    return np.concatenate([*found, pairs[0, total > ROUNDING]])
+
+
+def _rank_by_rank(
+    part: csc_array, rows: Touched, at: Halo, diagonal: Vector
+) -> tuple[Nodes, Callable[[Dense], Dense]]:
+    """Invert the sum of the ranks' parts (k, k) of B W Bᵀ on some rows.
+
+    Returns the places of these among the owned rows (o,), whose sum has this diagonal,
+    and the inverse for what is there.
+    """
+    size = 1 / np.sqrt(at.gathered(diagonal)[np.searchsorted(at.rows, rows.rows)])
+    unit = csc_array(diags_array(size) @ part @ diags_array(size))
+    unit += csc_array(diags_array(SHIFT * unit.diagonal()))
+    factor = local_factor(unit, rows).completed()
+    _, mine, owned = np.intersect1d(rows.rows, at.rows[at.own], return_indices=True)
+
+    def inverse(x: Dense) -> Dense:
+        t = np.zeros(rows.rows.size)
+        t[mine] = size[mine] * x
+        return np.asarray(factor(t))[mine] * size[mine]
+
+    return owned, inverse
+
+
+def _alike(
+    part: csr_array, some: NDArray[np.bool_], at: Halo, equalities: int
+) -> tuple[Nodes, Callable[[Dense], Dense]]:
+    """Do as `_rank_by_rank`, the same on all ranks.
+
+    some : (t,) which of the touched rows
+    """
+    ranks, entries = at.ranks, part.tocoo()
+    known = np.unique(np.concatenate(ranks.comm.allgather(at.rows[some])))
+    told = at.rows[entries.row], at.rows[entries.col], entries.data
+    of_known = np.isin(told[0], known) & np.isin(told[1], known)
+    row, column, data = map(
+        np.concatenate,
+        zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
+    )
+    places = np.searchsorted(known, row), np.searchsorted(known, column)
+    gram = csr_array((data, places), shape=(known.size,) * 2)
+    gram.sum_duplicates()
+    first = int(np.searchsorted(known, equalities))
+    solve = gram_inverse(uncoupled(gram, first), first)
+    _, place, owned = np.intersect1d(known, at.rows[at.own], return_indices=True)
+
+    def inverse(x: Dense) -> Dense:
+        whole = np.zeros(known.size)
+        whole[place] = x
+        return np.asarray(solve(ranks.total(whole))[place])
+
+    return owned, inverse
+
+
+def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]:
+    """Form the blocks of equal groups on one of the ranks that have them.
+
+    Largest first, each goes to the rank that has the least to do so far (Graham 1969).
+    """
+    names = [_name(group) for group in groups]
+    work = {
+        n: g.kind.K.nnz * g.touched.size for n, g in zip(names, groups, strict=True)
+    }
+    have = ranks.comm.allgather(work)
+    loads, maker = [0] * ranks.size, dict[str, int]()
+    everyones = {name: size for one in have for name, size in one.items()}
+    for name in sorted(everyones, key=lambda name: (-everyones[name], name)):
+        able = [r for r, one in enumerate(have) if name in one]
+        maker[name] = min(able, key=loads.__getitem__)
+        loads[maker[name]] += everyones[name]
+    found, sent = dict[str, Condensed](), []
+    ours = dict(zip(names, groups, strict=True))
+    for name, rank in maker.items():
+        if rank == ranks.rank:
+            group = ours[name]
+            found[name] = group.kind.condensed(group.touched)
+            blocks = np.stack(found[name])
+            to = [r for r, one in enumerate(have) if name in one and r != rank]
+            sent += [(ranks.comm.Isend(blocks, dest=r), blocks) for r in to]
+    for name, rank in maker.items():
+        if name in ours and rank != ranks.rank:
+            n = ours[name].touched.size
+            blocks = np.empty((2, n, n))
+            with ranks.clocked("waiting"):
+                ranks.comm.Recv(blocks, source=rank)
+            found[name] = Condensed(*blocks)
+    for request, _ in sent:
+        request.wait()
+    return [found[name] for name in names]
+
+
+def _name(group: Group) -> str:
+    """Name what the blocks of a group depend on by its content."""
+    kind = group.kind
+    parts = (
+        kind.K.data, kind.K.indices, kind.K.indptr, kind.R, kind.fixing, kind.boundary,
+        group.touched,
+    )  # fmt: skip
+    return hex_digest((np.ascontiguousarray(part).tobytes() for part in parts), 32)
 
 
 def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
@@ -258,7 +398,9 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     """
     B, domains = operator.B, operator.domains
     parts = partition(B, domains, ranks.size)
-    at = halo_of(parts, ranks)
+    touched_here = np.flatnonzero(parts.reach[:, [ranks.rank]].toarray())
+    reach = csr_array(parts.reach[touched_here])
+    at = halo(ranks, touched_here, reach, parts.owner[touched_here])
     mine = np.flatnonzero(parts.rank == ranks.rank)
     kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
     columns = np.concatenate(
@@ -269,6 +411,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         Subdomains(tuple(domains.kinds[k] for k in kinds), kind),
         operator.explicit[kinds],
         operator.equalities,
+        partial(condensed_by_ranks, ranks=ranks),
     )
     own = at.rows[at.own]
     q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))
@@ -278,13 +421,20 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         A=DistributedColumns(csr_array(qp.A[:, own]), ranks), b=np.array(qp.b),
     )  # fmt: skip
 
+    return Share(part, gathered_on_one(at, qp.q.size))
+
+
+def gathered_on_one(at: Halo, count: int) -> Callable[[Solution], Solution | None]:
+    """Make what gathers a solution of so many multipliers on rank 0."""
+
     def whole(s: Solution) -> Solution | None:
-        found = ranks.comm.gather((own, np.asarray(s.x), np.asarray(s.z_box)))
+        told = at.rows[at.own], np.asarray(s.x), np.asarray(s.z_box)
+        found = at.ranks.comm.gather(told)
         if found is None:
             return None
-        x, z_box = np.empty(qp.q.size), np.empty(qp.q.size)
+        x, z_box = np.empty(count), np.empty(count)
         for rows, x_part, z_part in found:
             x[rows], z_box[rows] = x_part, z_part
         return replace(s, x=x, z_box=z_box)
 
-    return Share(part, whole)
+    return whole

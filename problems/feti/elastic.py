@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
-from harness import QP, Friction, Value, Vector
+from harness import QP, Friction, Value, Vector, no_rows
 from harness.mechanics import NO_FRICTION, contact_rows
-from problems.contact.bodies import Bodies
-from problems.fem.elasticity import rigid_modes, stiffness
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    ContactSides,
+    elasticity_matrices,
+)
+from problems.contact.friction import FrictionLaw, friction_of
+from problems.contact.linearise import linearisation
+from problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes
-from problems.fem.mesh import Mesh, boundary_edges, dofs_of
+from problems.fem.mesh import Mesh, Nodes, StructuredGrid, boundary_edges, dofs_of
+from problems.feti.emission import Contact, StructuredBodies
 from problems.feti.gluing import glue
+from problems.feti.structured import Layout
 from problems.feti.tearing import Decomposition, Part, decompose
 from problems.feti.torn import Kind, Torn
 
@@ -87,3 +98,102 @@ def torn(
         supports=csr_array(primal.A), supported=primal.b, contact=contact, c=c,
         E=bodies.moduli[bodies.body_of_node], rows=rows,
     )  # fmt: skip
+
+
+Side = tuple[int, str]  #: a body, and the name of a side of its grid
+
+
+def structured(
+    grids: tuple[StructuredGrid, ...],
+    most: int | tuple[int, int],
+    *,
+    materials: tuple[Material, ...],
+    plane: Plane,
+    units: tuple[float, float],
+    fixed: Nodes,
+    load: tuple[Nodes, Vector],
+    pairs: Sequence[tuple[Side, Side]],
+    method: tuple[str, Any],
+    laws: Sequence[FrictionLaw],
+    glue: str,
+) -> StructuredBodies:
+    """Describe the first load step of elastic bodies on grids, one after another.
+
+    It is the problem of `problems.contact.bodies.assemble` and `torn`, of which every
+    rank can emit its share (`problems.feti.emission`).
+
+    Parameters
+    ----------
+    most : cells along a side of a subdomain, or along each
+    materials, plane, units, fixed : as of `assemble`
+    load : components with a force, and the forces, N/m; each component once
+    pairs : slave and master of each contact
+    method : the keys contact and basis, see `problems.contact.linearise`
+    laws : of friction with a given bound, one per pair
+
+    """
+    length, force = units
+    layout = Layout.of(grids, most)
+    D = elasticity_matrices(materials, plane) * (length / force)
+    E = np.array([m.E for m in materials]) * (length / force)
+    return StructuredBodies(
+        layout=layout, components=2, material=layout.block.body,
+        kind=partial(elastic_kind, D=D, E=E), E=E, held=fixed,
+        load=forces_at(load[0], load[1] / force), glue=glue,
+        contact=_contact_of_sides(layout, pairs, method, laws, units),
+    )  # fmt: skip
+
+
+def forces_at(component: Nodes, force: Vector) -> Callable[[Nodes], Vector]:
+    """Make what looks forces up by components; zero elsewhere."""
+    order = np.argsort(component)
+    known = component[order]
+
+    def of(asked: Nodes) -> Vector:
+        found = np.zeros(asked.size)
+        loaded = np.isin(asked, known)
+        found[loaded] = force[order[np.searchsorted(known, asked[loaded])]]
+        return found
+
+    return of
+
+
+def _contact_of_sides(
+    layout: Layout,
+    pairs: Sequence[tuple[Side, Side]],
+    method: tuple[str, Any],
+    laws: Sequence[FrictionLaw],
+    units: tuple[float, float],
+) -> Contact:
+    """Linearise contact at rest from the nodes of the sides alone."""
+    n = 2 * int(layout.node_start[-1])
+    if not pairs:
+        return Contact(no_rows(n), np.zeros(0), np.zeros(0))
+    length, force = units
+    sides = list(dict.fromkeys(side for pair in pairs for side in pair))
+    chain = {
+        (b, name): layout.grids[b].sides[name] + layout.node_start[b]
+        for b, name in sides
+    }
+    node, first = np.unique(
+        np.concatenate([chain[side] for side in sides]), return_index=True
+    )
+    points = np.concatenate([layout.grids[b].side(name) for b, name in sides])
+    bodies = ContactSides(
+        mesh=Mesh(points[first], np.zeros((0, 4), dtype=np.int64), {}),
+        pairs=tuple(
+            ContactPair(*(np.searchsorted(node, chain[side]) for side in pair))
+            for pair in pairs
+        ),
+        force=force,
+    )  # fmt: skip
+    at_rest = np.zeros(bodies.mesh.dofs)
+    rows = linearisation(bodies, *method, laws)(at_rest)
+    pressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
+    friction = friction_of(bodies, rows, laws, at_rest, pressed)
+    B = csr_array(vstack([rows.B, friction.T])) if friction.bound.size else rows.B
+    of_whole = csr_array(
+        (B.data, dofs_of(node)[B.indices], B.indptr), shape=(B.shape[0], n)
+    )
+    c = np.append(rows.c / length, friction.start)
+    return Contact(of_whole, c, friction.bound)

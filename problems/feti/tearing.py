@@ -11,7 +11,7 @@ each is the best one in the sense of least squares (Kabsch 1976).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -127,27 +127,62 @@ def decompose(
         own = node[start[s] : start[s + 1]]
         return Part(points[own], corner[mine], material[by_label[mine]])
 
-    alike: dict[tuple[bytes, bytes], list[int]] = {}
-    for s in range(S):
+    def key(s: int) -> tuple[bytes, bytes]:
         mine = part(s)
-        alike.setdefault((mine.cells.tobytes(), mine.material.tobytes()), []).append(s)
-    first, kind = list[int](), np.empty(S, dtype=np.int64)
-    rotation = np.empty((S, points.shape[1], points.shape[1]))
-    for group in alike.values():
-        left = np.array(group)
-        while left.size:
-            own = start[left][:, None] + np.arange(start[left[0] + 1] - start[left[0]])
-            same, turn = _images(points[node[own]])
-            kind[left[same]], rotation[left[same]] = len(first), turn[same]
-            first.append(int(left[0]))
-            left = left[~same]
+        return mine.cells.tobytes(), mine.material.tobytes()
+
+    torn = np.split(points[node], start[1:-1])
+    first, kind, rotation = classify(map(key, range(S)), torn)
     return Decomposition(
-        node=node, nodes=n, start=start, parts=tuple(part(s) for s in first),
+        node=node, nodes=n, start=start, parts=tuple(map(part, first)),
         kind=kind, rotation=rotation,
     )  # fmt: skip
 
 
-def _images(
+def classify(
+    keys: Iterable[Hashable], points: Sequence[NDArray[np.float64]]
+) -> tuple[list[int], NDArray[np.int64], NDArray[np.float64]]:
+    """Find which of S subdomains are images of one another by a rigid motion.
+
+    Parameters
+    ----------
+    keys : what is the same of all subdomains of one kind: cells and materials
+    points : (n_s, dim) of each; of those with one key equally many
+
+    Returns
+    -------
+    first subdomain of each kind, kind (S,) of each subdomain, and rotations
+    (S, dim, dim) of it against the first one
+
+    """
+    alike: dict[Hashable, list[int]] = {}
+    for s, key in enumerate(keys):
+        alike.setdefault(key, []).append(s)
+    S, dim = len(points), points[0].shape[1]
+    first, kind = list[int](), np.empty(S, dtype=np.int64)
+    rotation = np.empty((S, dim, dim))
+    for group in alike.values():
+        left = np.array(group)
+        spread = np.array([_spread(points[s]) for s in group])
+        # of images, ‖x − x̄‖ differs by no more than their points do
+        off = 2 * ALIKE * np.sqrt(points[group[0]].size)
+        while left.size:
+            near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
+            same, turn = images(np.stack([points[s] for s in left[near]]))
+            found = left[near[same]]
+            kind[found], rotation[found] = len(first), turn[same]
+            first.append(int(left[0]))
+            others = np.delete(np.arange(left.size), near[same])
+            left, spread = left[others], spread[others]
+    return first, kind, rotation
+
+
+def _spread(points: NDArray[np.float64]) -> float:
+    """Return ‖x − x̄‖."""
+    return float(np.linalg.norm(points - points.mean(axis=0)))
+
+
+def images(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Say which of equally many points (g, n, dim) are images of the first, and how.

@@ -164,7 +164,8 @@ class Subdomains:
         """Apply K⁺ to a torn vector (N,)."""
         v = np.empty_like(b)
         for kind, place in zip(self.kinds, self.places(), strict=True):
-            v[place] = kind.inverse(b[place])
+            own = b[place]
+            v[place] = kind.inverse(own) if own.any() else 0.0
         return v
 
 

@@ -29,8 +29,17 @@ from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material, Plane
 from problems.fem.inverse import GeneralisedInverse
-from problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.fem.mesh import (
+    Nodes,
+    StructuredGrid,
+    dofs_of,
+    half_ring_grid,
+    join,
+    joined_sides,
+    rectangle_grid,
+)
+from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
+from problems.feti.emission import StructuredBodies
 from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
@@ -45,8 +54,7 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     bodies = model(*geometry)
     method = (p["contact"], p["basis"])
-    sides = bodies.mesh.boundaries
-    tip = dofs_of(np.intersect1d(sides["top"], sides["right"]))
+    tip = _tip(bodies.mesh.boundaries)
 
     def tip_of(s: Solution) -> dict[str, Any]:
         return {"tip": (s.x[tip] * LENGTH).tolist()}
@@ -78,18 +86,46 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
 @lru_cache(maxsize=4)
 def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     """Mesh and assemble beam (8Nr × Nr) and ring (12Nh × radial)."""
-    beam = rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr))
-    ring = half_ring((1.0, 0.0), (0.3, 0.49), (12 * Nh, radial))
-    mesh, body = join((beam, ring))
+    mesh, body = join(tuple(grid.mesh() for grid in _grids(Nr, Nh, radial)))
     sides = mesh.boundaries
-    clamps = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
     load = np.zeros(mesh.dofs)
-    load[2 * np.intersect1d(sides["top"], sides["right"]) + 1] = -LOAD
+    load[_tip(sides)[1]] = -LOAD
     return assemble(
         mesh, body, names=("beam", "ring"), materials=(BEAM, RING), plane=plane,
-        units=(LENGTH, LOAD), fixed=np.concatenate(clamps), load=load,
+        units=(LENGTH, LOAD), fixed=_clamps(sides), load=load,
         pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
+
+
+def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+    """Describe the dual of a single linear load step, in subdomains."""
+    p: Any = params
+    grids = _grids(p["Nr"], p["Nh"], p["radial"])
+    sides = joined_sides(grids)
+    return structured(
+        grids, p["feti"], materials=(BEAM, RING), plane=p["plane"],
+        units=(LENGTH, LOAD), fixed=_clamps(sides),
+        load=(_tip(sides)[1:], np.array([-LOAD])),
+        pairs=[((1, "outer"), (0, "bottom"))],
+        method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+    )  # fmt: skip
+
+
+def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGrid]:
+    return (
+        rectangle_grid((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr)),
+        half_ring_grid((1.0, 0.0), (0.3, 0.49), (12 * Nh, radial)),
+    )
+
+
+def _clamps(sides: Mapping[str, Nodes]) -> Nodes:
+    clamped = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
+    return np.concatenate(clamped)
+
+
+def _tip(sides: Mapping[str, Nodes]) -> Nodes:
+    """Return both components of the upper right corner of the beam."""
+    return dofs_of(np.intersect1d(sides["top"], sides["right"]))
 
 
 @lru_cache(maxsize=4)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from harness.registry import COPIES
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import clean, tolerance
 from reports.statistics.intervals import PowerLaw, power_law
@@ -72,8 +73,12 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
     name is held fixed within a series if cases of equal n differ in it (the load step,
     say); the others are what makes a case larger.
     """
-    sized = [(o, n) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
-    held = _held(sized)
+    sized = [
+        (o, n)
+        for o in evidence.flat
+        if o.verified and o.first.role != COPIES and (n := o.size("dofs"))
+    ]
+    held = held_keys(sized)
     groups: dict[tuple[Any, ...], dict[int, dict[str, Outcome]]] = {}
     for o, n in sized:
         kept = tuple((k, o.first.params.get(k)) for k in held[o.first.family])
@@ -101,7 +106,8 @@ def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
     for o in evidence.flat:
         params = dict(o.first.params)
         value = params.pop(key, 0)
-        if o.verified and isinstance(value, int) and value > 0:
+        counts = o.verified and o.first.role != COPIES
+        if counts and isinstance(value, int) and value > 0:
             case = "/".join(
                 part
                 for part in o.first.case.split("/")
@@ -119,7 +125,7 @@ def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
     ]  # fmt: skip
 
 
-def _held(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
+def held_keys(sized: Sequence[tuple[Outcome, int]]) -> dict[str, tuple[str, ...]]:
     """Name, per family, the keys in which cases of equal size differ."""
     seen: dict[tuple[str, int, str], set[Any]] = {}
     for o, n in sized:

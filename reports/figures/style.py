@@ -18,13 +18,14 @@ GUIDE = Look(colour=INK, width=0.6)  #: lines to compare with
 LEGEND_LINE = 0.21  #: height of a line of a legend, inches
 
 
-def legible(label: str) -> str:
+def legible(label: str, limit: int = 32) -> str:
     """Make a foreign name fit for a figure: letters that the font has, no mathematics.
 
     matplotlib reads $…$ as a formula and hides labels that begin with an underscore.
     """
     known = "".join(
-        c if c.isascii() or "\u00a0" < c <= "\u00ff" else "?" for c in clean(label, 32)
+        c if c.isascii() or "\u00a0" < c <= "\u00ff" or c == "…" else "?"
+        for c in clean(label, limit)
     )
     escaped = known.replace("$", r"\$")
     return f" {escaped}" if escaped.startswith("_") else escaped

@@ -9,7 +9,8 @@ from reports.data.evidence import Outcome
 from reports.data.size_series import SIZES as SERIES
 from reports.data.size_series import SizeSeries, Sweep
 from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
-from reports.document.layout import Cell, Section, Table
+from reports.document.layout import Cell, Picture, Section, Table
+from reports.figures.steps import steps_figure, torn_figure
 from reports.statistics.growth import LEVEL, SIZES, Growth, growth_of
 from reports.statistics.intervals import PowerLaw
 
@@ -184,6 +185,7 @@ def _predicted(fit: Growth | None, n: int) -> Cell:
 
 
 #: what is read before other counts; the rest in a solver's own order
+MOST_DRAWN = 8  #: pictures of counts; all are tabulated
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 
 
@@ -211,6 +213,29 @@ def steps(found: Sequence[SizeSeries], torn: Sequence[Sweep]) -> Section | None:
             "number of multipliers.",
         ),
         tables=tuple(tables),
+        pictures=_step_pictures(found, torn),
+    )
+
+
+def _step_pictures(
+    found: Sequence[SizeSeries], torn: Sequence[Sweep]
+) -> tuple[Picture, ...]:
+    """Draw the counts that tables hold, those against size first."""
+    drawn = [
+        (f"Counts of {clean(solver, 40)} against size: {series.title}. Dashed: c·nᵖ; "
+         "p with its 95 % interval", steps_figure(series, solver))
+        for series in found
+        for solver in series.solvers
+        if len(series.curve(solver)) >= SERIES
+    ] + [
+        (f"Counts of {clean(s.solver, 40)} against H/h: {s.title}", torn_figure(s))
+        for s in torn
+    ]  # fmt: skip
+    known = [(caption, figure) for caption, figure in drawn if figure is not None]
+    rest = f" The first {MOST_DRAWN} of {len(known)}." * (len(known) > MOST_DRAWN)
+    return tuple(
+        Picture(name=f"steps-{i}", caption=f"{caption}.{rest}", figure=figure)
+        for i, (caption, figure) in enumerate(known[:MOST_DRAWN], 1)
     )
 
 

@@ -228,6 +228,21 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
     return result
 
 
+cdef double FLAT = 10.0  # ratio of Ritz values of one size
+
+cdef enum:
+    FEW = 5
+
+
+cdef bint is_flat(const double[::1] diagonal, const double[::1] off) except -1:
+    """Whether all Ritz values of the first FEW steps are of one size."""
+    cdef double[::1] theta = np.array(diagonal[:FEW]), between = np.array(off[:FEW])
+    cdef double none
+    cdef int order = FEW, one = 1, info = 0
+    dstev(b"N", &order, &theta[0], &between[0], &none, &one, &none, &info)
+    return theta[0] >= theta[FEW - 1] / FLAT
+
+
 def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int steps):
     """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`."""
     cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
@@ -261,6 +276,8 @@ def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int step
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
+            break
+        if kept == FEW and is_flat(told, offs):
             break
     if not kept:
         return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
@@ -473,6 +490,8 @@ cdef class Solver:
     cdef double *box_upper
     cdef double *piece
     cdef double *piece2
+    cdef double *x0
+    cdef double *g0
     cdef double *Cv
     cdef double *Cw
     cdef double *y
@@ -513,7 +532,7 @@ cdef class Solver:
         self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
         self.lower, self.upper = pointer(self.least), pointer(self.most)
         self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
-        self.room = np.zeros(17 * n + 2 * self.r + (9 + k) * (k + 3))
+        self.room = np.zeros(19 * n + 2 * self.r + (9 + k) * (k + 3))
         cdef double *at = pointer(self.room)
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -523,7 +542,8 @@ cdef class Solver:
         at += 4 * n
         self.box_lower, self.box_upper, self.rhs = at, at + n, at + 2 * n
         self.piece, self.piece2 = at + 3 * n, at + 4 * n
-        at += 5 * n
+        self.x0, self.g0 = at + 5 * n, at + 6 * n
+        at += 7 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
         self.slope2, self.c, self.Cv = at + 4 * k, at + 5 * k, at + 6 * k
         self.Cw = self.Cv + self.r
@@ -798,7 +818,8 @@ cdef class Solver:
         self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
         return 1
 
-    cdef int expand(self, double cg, double feasible, bint is_first) except -1:
+    cdef int expand(self, double cg, double feasible, bint is_first, long most,
+                    double enough, bytearray trace) except -1:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
@@ -814,7 +835,7 @@ cdef class Solver:
                 memcpy(self.g, self.g2, n * sizeof(double))
                 return b"e"
         if self.expansion == MODEL:
-            return self.expand_by_model(cg, feasible, is_first)
+            return self.expand_by_model(cg, feasible, is_first, most, enough, trace)
         self.to(feasible, self.p, self.Hp)
         self.split()
         for i in range(n):
@@ -823,8 +844,9 @@ cdef class Solver:
         self.gradient(self.x, self.g)
         return b"f" if self.expansion == MIXED else b"e"
 
-    cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
-        """Project x − α_cg p on the box in the metric of the model."""
+    cdef int expand_by_model(self, double cg, double feasible, bint is_first, long most,
+                             double enough, bytearray trace) except -1:
+        """Project z, where CG leads beyond the box, on it in the metric of the model."""
         cdef Py_ssize_t i, n = self.n
         cdef double *p = self.p
         cdef double *Hp = self.Hp
@@ -832,9 +854,12 @@ cdef class Solver:
         cdef double *Hs = self.Hs
         cdef double *lower = self.box_lower
         cdef double *upper = self.box_upper
-        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
-        cdef bint held, release = is_first and self.B.k > 0
-        change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, tau = self.B.tau
+        cdef double change = -feasible * self.told[2] + 0.5 * feasible**2 * self.told[3]
+        cdef double least = self.reduced_square / (2 * tau)
+        cdef bint held, is_flat = not self.B.k, release = is_first and not is_flat
+        memcpy(self.x0, self.x, n * sizeof(double))
+        memcpy(self.g0, self.g, n * sizeof(double))
         self.to(feasible, p, Hp)
         for i in range(n):
             held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
@@ -843,7 +868,9 @@ cdef class Solver:
             upper[i] = self.x[i] if held else self.upper[i]
             self.x2[i] = self.x[i] - beyond * p[i]
             self.g2[i] = self.g[i] - beyond * Hp[i]
-        tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
+        if beyond and is_flat:
+            self.minimise_beyond(most, enough, trace)
+        self.B.tau = tau / self.alpha
         self.step_of_model(self.B, self.x2, self.g2, lower, upper, s)
         self.B.tau = tau
         within(self.x2, self.x, lower, upper, s, n)
@@ -851,20 +878,63 @@ cdef class Solver:
             if lower[i] == upper[i] and not release:
                 s[i] = 0.0
         if dot(self.g, s, n) >= 0:
-            beyond = 0.0
+            memcpy(self.x2, self.x, n * sizeof(double))
+            memcpy(self.g2, self.g, n * sizeof(double))
             self.step_of_model(self.B, self.x, self.g, lower, upper, s)
         length = self.searched(s, Hs)
-        if length == 0:
-            return b"e"
         if isinf(length):
             return 0
-        if -self.told[2] + 0.5 * self.told[3] + change < 0:
-            length = fmax(length, 1.0)
-        self.to(length, s, Hs)
-        add(-beyond, p, s, n)
-        add(-beyond, Hp, Hs, n)
-        self.B = self.raised(self.B, s, dot(s, Hs, n))
+        if length:
+            if -self.told[2] + 0.5 * self.told[3] + change < 0:
+                length = fmax(length, 1.0)
+            change += -length * self.told[2] + 0.5 * length**2 * self.told[3]
+            for i in range(n):  # x + s − z and its product
+                self.x2[i] = self.x[i] - s[i] - self.x2[i]
+                self.g2[i] = self.g[i] - Hs[i] - self.g2[i]
+            self.to(length, s, Hs)
+            self.B = self.raised(self.B, self.x2, dot(self.x2, self.g2, n))
+        if is_flat and -change < least:
+            return self.project_gradient(tau)
         return b"e"
+
+    cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
+        """Go on with CG from z on the face as if it had no bounds."""
+        cdef Py_ssize_t i, n = self.n
+        cdef long step
+        cdef double curvature = dot(self.p, self.Hp, n), length
+        for step in range(most):
+            for i in range(n):
+                self.phi[i] = self.free[i] * self.g2[i]
+            if dot(self.phi, self.phi, n) <= enough:
+                break
+            turn(self.phi, dot(self.phi, self.Hp, n) / curvature, self.p, n)
+            self.H(self.p, self.Hp)
+            trace.append(c'b')
+            curvature = dot(self.p, self.Hp, n)
+            if curvature <= 0:
+                break
+            length = dot(self.phi, self.p, n) / curvature
+            add(-length, self.p, self.x2, n)
+            add(-length, self.Hp, self.g2, n)
+        return 0
+
+    cdef int project_gradient(self, double tau) except -1:
+        """Take the step of plain gradient projection from where the expansion began."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double length
+        memcpy(self.x, self.x0, n * sizeof(double))
+        memcpy(self.g, self.g0, n * sizeof(double))
+        for i in range(n):
+            self.s[i] = fmin(
+                fmax(self.x[i] - self.free[i] * self.g[i] / tau, self.lower[i]),
+                self.upper[i],
+            ) - self.x[i]
+        length = self.searched(self.s, self.Hs)
+        if length == 0 or isinf(length):
+            return 0
+        self.B = self.raised(self.B, self.s, dot(self.s, self.Hs, n))
+        self.to(length, self.s, self.Hs)
+        return b"f"
 
     cdef int gradient(self, const double *x, double *g) except -1:
         """g ← Hx − b; one product."""
@@ -875,19 +945,20 @@ cdef class Solver:
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
                       long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
-        cdef long steps = 0, idle = 0
+        cdef long idle = 0, inside = 0  # CG steps in this face
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
-        cdef double weight
+        cdef double weight, began
         self.split()
         self.enter_face()
+        began = self.phi_square
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
                 return 1
-            if steps >= most:
+            if len(trace) >= most:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
@@ -905,17 +976,20 @@ cdef class Solver:
                 if self.told[0] <= self.told[1]:
                     self.minimise_along_p()
                     self.tell(b"c", trace, note)
-                    steps += 1
+                    inside += 1
                     continue
-                letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                letter = self.expand(
+                    self.told[0], self.told[1], not has_expanded, max(inside, 1), began,
+                    trace,
+                )
                 has_expanded = True
             if not letter:
                 return 0
             self.split()
             self.enter_face()
+            inside, began = 0, self.phi_square
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
-            steps += 1
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
@@ -995,12 +1069,18 @@ cdef class Solver:
     def begin(self, const double[::1] x, const double[::1] mu, double rho):
         """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
         cdef Py_ssize_t i, n = self.n
-        start, gradient = np.empty(n), np.empty(n)
+        start, gradient = np.empty(n), np.zeros(n)
+        cdef bint moved = False
         cdef double[::1] nu = start, g = gradient
         self.rho = rho
         for i in range(n):
             nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
-        self.H(pointer(nu), pointer(g))
+            moved = moved or nu[i] + self.x_tilde[i] != 0
+        if moved:
+            self.H(pointer(nu), pointer(g))
+        else:  # PFPν = 0
+            self.infeasibility(pointer(nu))
+            add_combination(rho, first(self.C), self.Cv, pointer(g), self.r, n)
         add(-1.0, self.b, pointer(g), n)
         for i in range(self.r):
             add(mu[i], &self.C[i, 0], pointer(g), n)

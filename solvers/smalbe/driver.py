@@ -38,7 +38,9 @@ from solvers.smalbe.projected import (
 from solvers.smalbe.rows import DenseRows, Rows, is_sparse
 from solvers.smalbe.spectrum import random_start
 
-STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
+STEPS = {
+    "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
+}  # fmt: skip
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
@@ -173,7 +175,7 @@ def _start(
     slip go on slipping when their friction changes.
     """
     C = problem.rows.C
-    x, mu = np.zeros(problem.b.size), np.zeros(len(C))
+    x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))

@@ -12,6 +12,10 @@ independent. A model of the penalty ρCᵀC for steps over the box comes with ea
 G_F G_Fᵀ + κGGᵀ on a face F. These differ from (1 + κ)GGᵀ in rows that bounded
 components touch, and in contact few subdomains have any: with those rows c last, only
 the Schur complement of GGᵀ on them is factorised anew (`_Bordered`).
+
+On several ranks this is the *coarse problem*, with a row for each rigid mode of all
+subdomains. Each rank eliminates the rows of its own (`_OverRanks`), unless it shares
+many with others: then all ranks do the same.
 """
 
 from __future__ import annotations
@@ -29,7 +33,14 @@ from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
 from harness import Matrix, Vector, too_large
-from harness.distributed.vectors import DistributedColumns
+from harness.distributed.factor import (
+    DependentRowsError,
+    LocalFactor,
+    SummedFactor,
+    local_factor,
+    touched_rows,
+)
+from harness.distributed.vectors import DistributedColumns, distributed
 from solvers.smalbe import compiled
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
@@ -89,6 +100,11 @@ class Rows(ABC):
         projected: Vector = v - self.C.T @ (self.C @ v)
         return projected
 
+    @property
+    def no_multipliers(self) -> Vector:
+        """Multipliers a (r,) of Cx = Cx̃ that are zero."""
+        return np.zeros(len(self.C))
+
     @abstractmethod
     def error(self, nu: Vector, Cnu: Vector) -> Vector:
         """Return Gν (m,), from Cν where that is less work."""
@@ -130,9 +146,11 @@ class SparseRows(Rows):
     """Sparse, independent equality rows, of which GGᵀ is factorised."""
 
     unit: SparseColumns  #: (r, n) the rows of G divided by their norms
-    gram: csc_matrix  #: (r, r) of these
-    factor: Factor  #: of their Gram matrix
-    bordered: _Bordered | None  #: None where most rows touch bounded components
+    gram: GramFactor  #: of these
+
+    @property
+    def no_multipliers(self) -> Vector:
+        return self.C @ np.zeros_like(self.x_tilde)
 
     def error(self, nu: Vector, Cnu: Vector) -> Vector:
         return np.asarray(self.G @ nu)
@@ -146,17 +164,112 @@ class SparseRows(Rows):
         return PenaltyModel(tau, self, rho - tau)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        solve = self.factor_in(free, FREE_RANK)
+        solve = self.gram.in_face(free, FREE_RANK)
         y = -solve(self.unit @ np.where(free, r, 0.0))
-        return _forward(self.factor, self.gram @ y)
+        return self.gram.forward(self.gram.product(y))
 
-    def factor_in(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return solves with G_F G_Fᵀ + shift·GGᵀ of the normalised rows."""
+
+class GramFactor(Protocol):
+    """GGᵀ = LLᵀ (r, r) of sparse, normalised rows G."""
+
+    def product(self, y: Vector) -> Vector:
+        """Return GGᵀy."""
+
+    def forward(self, t: Vector) -> Vector:
+        """Return L⁻¹t."""
+
+    def backward(self, a: Vector) -> Vector:
+        """Return L⁻ᵀa."""
+
+    def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return solves with G_F G_Fᵀ + shift·GGᵀ."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Whole:
+    """One factor of all rows; on several ranks the same on each."""
+
+    unit: SparseColumns  #: G
+    matrix: csc_matrix  #: GGᵀ
+    factor: Factor
+    bordered: _Bordered | None  #: None where most rows touch bounded components
+
+    def product(self, y: Vector) -> Vector:
+        return np.asarray(self.matrix @ y)
+
+    def forward(self, t: Vector) -> Vector:
+        t = self.factor.apply_P(t)
+        return np.asarray(self.factor.solve_L(t, use_LDLt_decomposition=False))
+
+    def backward(self, a: Vector) -> Vector:
+        x = self.factor.solve_Lt(a, use_LDLt_decomposition=False)
+        return np.asarray(self.factor.apply_Pt(x))
+
+    def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         if self.bordered is not None:
             return self.bordered.solver(~free, shift)
         held = _gram(self.unit, ~free)
-        factor = self.factor.cholesky(_csc((1 + shift) * self.gram - held))
+        factor = self.factor.cholesky(_csc((1 + shift) * self.matrix - held))
         return lambda t: np.asarray(factor(t))
+
+
+@dataclass(frozen=True, eq=False)
+class _OverRanks:
+    """Each rank has the rows that its columns touch, see `harness.distributed.factor`.
+
+    What a face holds changes the rows that bounded components touch, the *changing*
+    ones.
+    """
+
+    matrix: csc_array  #: G_p G_pᵀ of the columns of this rank
+    local: LocalFactor
+    factor: SummedFactor
+    bounded: Mask  #: (n_p,) its bounded components
+    touching: csc_array  #: of G_p, rows on the border and bounded components
+
+    def product(self, y: Vector) -> Vector:
+        return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
+
+    def forward(self, t: Vector) -> Vector:
+        return self.factor.forward(t)
+
+    def backward(self, a: Vector) -> Vector:
+        return self.factor.backward(a)
+
+    def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
+        with self.local.at.ranks.clocked("coarse"):
+            held = self.touching[:, ~np.asarray(free)[self.bounded]]
+            return self.local.completed(1 + shift, (held @ held.T).toarray())
+
+
+@dataclass(frozen=True, eq=False)
+class _LocalRows:
+    """The rows of distributed columns that a rank touches: products are additive."""
+
+    part: csr_array  #: (k, n_p)
+    transposed: csr_array  #: (n_p, k), by rows: it is multiplied with as often
+    columns: DistributedColumns
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.part.shape
+        return rows, columns
+
+    @property
+    def T(self) -> _LocalRowsTransposed:
+        return _LocalRowsTransposed(self)
+
+    def __matmul__(self, v: Vector) -> Vector:
+        return distributed(self.part @ np.asarray(v), self.columns.ranks)
+
+
+@dataclass(frozen=True, eq=False)
+class _LocalRowsTransposed:
+    rows: _LocalRows
+
+    def __matmul__(self, y: Vector) -> Vector:
+        part = self.rows.transposed @ np.asarray(y)
+        return distributed(part, self.rows.columns.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +341,14 @@ class PenaltyModel:
         G, gram, tau, w = self.rows.unit, self.rows.gram, self.tau, self.w
 
         def at(y: Vector) -> Tilted:
-            return tilted(x, g + G.T @ y, tau, bounds, lambda s: G @ s - gram @ y / w)
+            return tilted(
+                x, g + G.T @ y, tau, bounds, lambda s: G @ s - gram.product(y) / w
+            )
 
         def newton(slope: Vector, free: Mask) -> Vector:
-            return np.asarray(tau * self.rows.factor_in(free, tau / w)(slope))
+            return tau * gram.in_face(free, tau / w)(slope)
 
-        s = minimised(at, newton, len(self.rows.C))
+        s = minimised(at, newton, G.shape[0])
         return Model.of_norm(tau + w, x.size).step(x, g, bounds) if s is None else s
 
     def raised(self, s: Vector, sHs: float) -> BoxModel:
@@ -255,7 +370,7 @@ class PenaltyModel:
 
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
         """Return v → B_FF⁻¹v_F, zero off the face F."""
-        G, solve = self.rows.unit, self.rows.factor_in(free, self.tau / self.w)
+        G, solve = self.rows.unit, self.rows.gram.in_face(free, self.tau / self.w)
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
@@ -269,13 +384,14 @@ class _Factored:
     """C = L⁻¹G of normalised rows G (r, n) with the Cholesky factor L of GGᵀ."""
 
     unit: SparseColumns
-    factor: Factor
+    gram: GramFactor
+    count: int  #: r
 
     def __len__(self) -> int:
-        return int(self.unit.shape[0])
+        return self.count
 
     def __matmul__(self, v: Vector) -> Vector:
-        return _forward(self.factor, self.unit @ v)
+        return self.gram.forward(self.unit @ v)
 
     @property
     def T(self) -> _FactoredTransposed:
@@ -287,18 +403,8 @@ class _FactoredTransposed:
     C: _Factored
 
     def __matmul__(self, a: Vector) -> Vector:
-        found: Vector = self.C.unit.T @ _backward(self.C.factor, a)
+        found: Vector = self.C.unit.T @ self.C.gram.backward(a)
         return found
-
-
-def _forward(factor: Factor, t: Vector) -> Vector:
-    """Return L⁻¹t."""
-    return np.asarray(factor.solve_L(factor.apply_P(t), use_LDLt_decomposition=False))
-
-
-def _backward(factor: Factor, a: Vector) -> Vector:
-    """Return L⁻ᵀa."""
-    return np.asarray(factor.apply_Pt(factor.solve_Lt(a, use_LDLt_decomposition=False)))
 
 
 def is_sparse(G: Matrix) -> bool:
@@ -323,12 +429,14 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    of_ranks = isinstance(G, DistributedColumns)
-    rows = sparse_rows(G if of_ranks else csr_array(G), e, bounded)
+    if isinstance(G, DistributedColumns):
+        rows = rows_over_ranks(G, e, bounded)
+        if rows is None:
+            raise ValueError("the equality rows depend on each other")
+        return rows
+    rows = sparse_rows(csr_array(G), e, bounded)
     if rows is not None:
         return rows
-    if of_ranks:
-        raise ValueError("the equality rows depend on each other")
     m, n = G.shape
     if reason := too_large(max(m, n), 3 * min(m, n) / max(m, n)):
         raise ValueError(f"the equality rows depend on each other, and {reason}")
@@ -350,11 +458,57 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
     least = float(factor.D().min())  # pivots may be negative, too
     if least <= RANK:
         return None
+    whole = _Whole(unit, gram, factor, _bordered(unit, gram, bounded))
     return SparseRows(
-        G=G, C=_Factored(unit, factor), e_size=float(np.linalg.norm(e)),
+        G=G, C=_Factored(unit, whole, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
-        multipliers=lambda a: _backward(factor, a) / size,
-        unit=unit, gram=gram, factor=factor, bordered=_bordered(unit, gram, bounded),
+        multipliers=lambda a: whole.backward(a) / size,
+        unit=unit, gram=whole,
+    )  # fmt: skip
+
+
+def rows_over_ranks(
+    G: DistributedColumns, e: Vector, bounded: Mask
+) -> SparseRows | None:
+    """Factorise GGᵀ of G (m, n) rank by rank; None where rows depend on each other.
+
+    e : (m,) the same on all ranks
+    """
+    ranks, part = G.ranks, G.part
+    size = np.sqrt(ranks.total(part.power(2).sum(axis=1)))
+    if not (size > 0).all():
+        return None
+    with ranks.clocked("coarse"):
+        at = touched_rows(np.flatnonzero(np.diff(part.indptr)), ranks)
+        if not at.few_shared:
+            return sparse_rows(G, e, bounded)
+        rows, here = at.rows, np.asarray(bounded)
+        unit = csr_array(diags_array(1 / size[rows]) @ part[rows])
+        of_bounded = csc_array(unit)[:, here]
+        changing = np.bincount(of_bounded.indices, minlength=rows.size) > 0
+        matrix = csc_array(unit @ unit.T)
+        try:
+            local = local_factor(matrix, at, changing & ~at.is_shared)
+            factor = local.completed()
+        except DependentRowsError:
+            return None
+        if factor.least_pivot <= np.sqrt(RANK):
+            return None
+        gram = _OverRanks(
+            matrix, local, factor, here,
+            csc_array(csr_array(of_bounded)[local.border]),
+        )  # fmt: skip
+
+    def multipliers(a: Vector) -> Vector:
+        whole = np.zeros(e.size)
+        whole[rows] = np.asarray(factor.backward(a)) / at.touching
+        return ranks.total(whole) / size
+
+    own = _LocalRows(unit, csr_array(unit.T), G)
+    return SparseRows(
+        G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
+        least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
+        x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
     )  # fmt: skip
 
 

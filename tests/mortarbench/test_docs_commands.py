@@ -67,6 +67,7 @@ SHORTER = {
         "mortarbench run suites/scaling-feti.toml --case 'membranes/S=[24]/*' "
         "--repeats 1"
     ),
+    "mortarbench run ranks": ("mortarbench run ranks --case '*Nr=48/*' --repeats 1"),
     "mortarbench run finite-strain": (
         "mortarbench run finite-strain --solver smalbe --repeats 1 "
         "--case '*/step=1/*/dual'"

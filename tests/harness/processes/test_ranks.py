@@ -14,6 +14,7 @@ import pytest
 import mortarbench as mb
 from harness.distributed import mpi
 from harness.errors import InputError
+from harness.record import Record
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import ROOT, SUPPORT
@@ -26,6 +27,7 @@ CASES = (
 CASE = "membranes/S=2/n=4/dual"
 SOLVE = ["solve", CASE, "--solver", "smalbe"]
 TOL = 1e-8
+LANCZOS = 8  #: products with F before the solve, at most
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
@@ -91,6 +93,24 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
     assert first.record.run_id != alone.record.run_id
 
 
+def test_records_tell_what_ranks_spent_on_the_solve(answers):
+    first, *_ = answers
+    seconds, counts = first.record.rank_seconds, first.record.rank_counts
+
+    assert set(seconds) == {"products", "exchange", "coarse", "waiting"}
+    for mean, largest in [*seconds.values(), *counts.values()]:
+        assert 0 < mean <= largest
+    # the parts do not overlap, so that no rank has spent more than all of it
+    assert sum(mean for mean, _ in seconds.values()) < first.record.solve_seconds
+    products = first.record.counts["P_products"]
+    applies = first.record.counts["preconditioner_applies"]
+    # to its one neighbour, and back; those of preparing are not counted
+    assert 0 <= 2 * (products + applies) - counts["messages"][0] <= 2 * LANCZOS
+    assert counts["bytes"][1] % 8 == 0
+    read = Record.from_json(first.record.to_json())
+    assert (read.rank_seconds, read.rank_counts) == (seconds, counts)
+
+
 def test_the_same_number_of_ranks_gives_the_same_bits(answers):
     first, again, _ = answers
     assert np.array_equal(first.solution.x, again.solution.x)
@@ -98,7 +118,8 @@ def test_the_same_number_of_ranks_gives_the_same_bits(answers):
 
 def test_journal_lines_of_one_rank_are_as_they_were(answers):
     *_, alone = answers
-    assert "ranks" not in json.loads(alone.record.to_json())
+    line = json.loads(alone.record.to_json())
+    assert not {"ranks", "rank_seconds", "rank_counts"} & line.keys()
 
 
 def test_more_ranks_than_subdomains_are_declined():
@@ -156,16 +177,24 @@ params = { S = 2, n = 4 }
 """
 
 
-def test_a_suite_asks_those_that_can_for_each_number_of_ranks(tmp_path):
+def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_path):
     suite = tmp_path / "ranks.toml"
-    suite.write_text(SUITE)
+    suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))
 
     results = mb.run(suite, out=tmp_path / "out")
 
     found = {r.solver: r for r in results.records}
-    ranks = {name: r.ranks for name, r in found.items()}
-    assert ranks == {"smalbe": 1, "smalbe ranks=2": 2, "clarabel": 1}
+    asked = {name: (r.ranks, r.role) for name, r in found.items()}
+    assert asked == {
+        "smalbe": (1, ""), "smalbe ranks=2": (2, ""), "clarabel": (1, ""),
+        "smalbe copies=2": (2, "copies"),
+    }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
+    # a copy does what one process alone does, to the last bit
+    assert found["smalbe copies=2"].verdict == "verified"
+    alone, copies = found["smalbe"], found["smalbe copies=2"]
+    assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
+    assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
 
 
 @pytest.mark.parametrize(
@@ -174,6 +203,8 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks(tmp_path):
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
+        ("ranks = [1]\ncopies = true", "copies = true: what copies reach is compared"),
+        ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )
 def test_wrong_ranks_of_a_suite_are_refused(tmp_path, line, message):

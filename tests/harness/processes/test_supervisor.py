@@ -1,15 +1,20 @@
 import json
 import os
 import signal
+import subprocess
 import sys
+import time
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from select import select
+from types import SimpleNamespace
 
 import pytest
 
 from harness import Verdict
 from harness.files.qpfile import save_qp
-from harness.processes import supervisor
+from harness.processes import reaper, supervisor
 from harness.processes.reaper import descendants
 from harness.processes.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
 from harness.registry import load_plugin
@@ -222,6 +227,25 @@ def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     os.waitpid(parent, 0)
 
     assert soon(lambda: not running(worker))
+
+
+def test_a_machine_that_stands_still_meanwhile_spares_no_process(monkeypatch):
+    clock = count(0, 1000)
+    standing = SimpleNamespace(monotonic=lambda: next(clock), sleep=time.sleep)
+    monkeypatch.setattr(reaper, "time", standing)
+    shell = subprocess.Popen(["sh", "-c", "sleep 3600 & sleep 3600 & wait"])
+    try:
+        while len(below := descendants(shell.pid)) < 2:
+            pass
+        reaper.end_all(shell.pid)
+
+        assert shell.wait(timeout=10) == 0  # it waits for both
+        assert not any(map(running, below))
+    finally:
+        for process in [shell.pid, *below]:
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        shell.wait()
 
 
 @pytest.mark.parametrize(

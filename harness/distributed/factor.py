@@ -1,0 +1,273 @@
+"""A Cholesky factor of a sum of matrices over ranks, A = Σ_p A_p = LLᵀ.
+
+Every rank p has a symmetric, positive semidefinite A_p on the rows that it *touches*.
+No entry couples rows that one rank alone touches, its *inner* ones, with those of
+another: each rank eliminates its own. The Schur complements on the *shared* rows are
+summed over the ranks, and that sum is factorised by all of them alike (substructuring;
+Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A solve is one
+reduction of shared rows; all else is work of each rank on its own rows.
+
+A vector of rows is held in one of three ways, each of them a `DistributedVector`:
+
+* additive: the sum over ranks is meant, as of G_p v with the columns G_p of a rank
+* consistent: each rank has the entries of the rows that it touches
+* orthonormal: in the order of L, inner rows on their rank; of each shared entry all P
+  ranks hold 1/√P
+
+An additive times a consistent one, and two orthonormal ones, give the inner product of
+the whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, cho_factor
+from scipy.sparse import csc_array, csc_matrix, diags_array
+from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
+
+from harness.distributed.vectors import DistributedVector, Ranks, distributed
+
+Rows = NDArray[np.int64]
+Dense = NDArray[np.float64]
+FILL = 8  #: entries for each row of A that the dense factor of the shared rows may have
+
+
+@dataclass(frozen=True, eq=False)
+class Touched:
+    """The rows of A that a rank touches."""
+
+    ranks: Ranks
+    rows: Rows  #: (k,) ascending
+    touching: Rows  #: (k,) how many ranks touch each
+    shared: Rows  #: (s,) rows that several ranks touch, the same on all of them
+
+    @cached_property
+    def is_shared(self) -> NDArray[np.bool_]:
+        """Which of its rows are."""
+        return self.touching > 1
+
+    @cached_property
+    def place(self) -> Rows:
+        """Places in `shared` of its shared rows, ascending."""
+        return np.searchsorted(self.shared, self.rows[self.is_shared])
+
+    @property
+    def few_shared(self) -> bool:
+        """Whether so few are shared that their dense factor is the lesser work."""
+        inner = self.ranks.total(np.array([float(np.count_nonzero(~self.is_shared))]))
+        s = self.shared.size
+        return s**2 <= FILL * (s + float(inner[0]))
+
+    def additive(self, t: Dense) -> DistributedVector:
+        """Make what every rank has of its rows (k,) a vector that is summed."""
+        return distributed(t / self.touching, self.ranks)
+
+
+def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
+    """Tell the others which rows this rank touches, and learn which are shared."""
+    every, count = np.unique(
+        np.concatenate(ranks.comm.allgather(rows)), return_counts=True
+    )
+    touching = count[np.searchsorted(every, rows)]
+    return Touched(ranks, rows, touching, every[count > 1])
+
+
+class DependentRowsError(ValueError):
+    """A is singular; raised on all ranks alike."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalFactor:
+    """A_p with its unchanging inner rows eliminated, once.
+
+    Rows that may change, and shared ones, are its *border*.
+    """
+
+    at: Touched
+    order: Rows  #: (k,) of its rows: unchanging, changing, shared
+    changing: int  #: how many there are
+    factor: (
+        Factor | None
+    )  #: of A_p in that order; shared rows raised. None without rows
+    L_bb: Dense  #: of it, the border's
+
+    @property
+    def border(self) -> Rows:
+        """Its border, as places in its rows, (b,)."""
+        return self.order[self.order.size - len(self.L_bb) :]
+
+    @cached_property
+    def complement(self) -> Dense:
+        """The Schur complement of A_p on the border, (b, b)."""
+        T = self.L_bb @ self.L_bb.T
+        T[np.arange(self.changing, len(T)), np.arange(self.changing, len(T))] -= 1
+        return T
+
+    def reduced(self, t: Dense) -> tuple[Dense, Dense]:
+        """Eliminate in an additive t (k,): L_aa⁻¹t_a, and what is left of t_b."""
+        if self.factor is None:
+            return np.zeros(0), np.zeros(0)
+        u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
+        first = u.size - len(self.L_bb)
+        return u[:first], self.L_bb @ u[first:]
+
+    def extended(self, u: Dense, x_b: Dense) -> Dense:
+        """Return the x (k,) with  L_aaᵀx_a + L_baᵀx_b = u  and x_b on the border."""
+        y = np.empty(self.order.size)
+        if self.factor is not None:
+            u = np.concatenate([u, self.L_bb.T @ x_b])
+            y[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
+        return y
+
+    def completed(self, scale: float = 1.0, less: Dense | None = None) -> SummedFactor:
+        """Factorise scale·A − Σ_p `less`_p, which differs from scale·A on borders.
+
+        less : (b, b)
+
+        Raises
+        ------
+        DependentRowsError
+            Where that is not positive definite.
+
+        """
+        ranks, c, place = self.at.ranks, self.changing, self.at.place
+        T = scale * self.complement if less is None else scale * self.complement - less
+        s = self.at.shared.size
+        S = np.zeros((s, s))
+        try:
+            L_cc = _cholesky(T[:c, :c])
+            L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
+            S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
+            fails = 0.0
+        except np.linalg.LinAlgError:  # to be said by all ranks alike
+            fails = 1.0
+        told = ranks.total(np.append(S.ravel(), fails))
+        try:
+            if told[-1]:
+                raise np.linalg.LinAlgError
+            L_ss = _cholesky(told[:-1].reshape(s, s))
+        except np.linalg.LinAlgError:
+            raise DependentRowsError("the rows depend on each other") from None
+        return SummedFactor(self, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
+
+
+@dataclass(frozen=True, eq=False)
+class SummedFactor:
+    """LLᵀ = scale·A − Σ_p less_p over ranks."""
+
+    local: LocalFactor
+    root: float  #: √scale
+    L_cc: Dense  #: of the changing rows of this rank
+    L_sc: Dense  #: of its shared rows
+    L_ss: Dense  #: (s, s) on all ranks
+
+    @property
+    def least_pivot(self) -> float:
+        """The least diagonal entry of L, of all ranks; inf where there are no rows."""
+        factor, inner = self.local.factor, self.local.order.size - len(self.local.L_bb)
+        of_inner = np.zeros(0) if factor is None else factor.L().diagonal()[:inner]
+        own = np.concatenate([
+            self.root * of_inner, np.diag(self.L_cc), np.diag(self.L_ss),
+        ])  # fmt: skip
+        return self.local.at.ranks.extreme(float(own.min(initial=np.inf)), np.min)
+
+    def forward(self, t: Dense) -> DistributedVector:
+        """Take an additive t (k,) to L⁻¹t, orthonormal."""
+        ranks = self.local.at.ranks
+        with ranks.clocked("coarse"):
+            u, r = self.local.reduced(np.asarray(t))
+            c = len(self.L_cc)
+            z_c = _solved(self.L_cc, r[:c])
+            z_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            z_s /= np.sqrt(ranks.size)
+            return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
+
+    def backward(self, a: Dense) -> DistributedVector:
+        """Take an orthonormal a to L⁻ᵀa (k,), consistent."""
+        ranks, a = self.local.at.ranks, np.asarray(a)
+        with ranks.clocked("coarse"):
+            c, s = len(self.L_cc), len(self.L_ss)
+            u, z_c, z_s = np.split(a, [a.size - c - s, a.size - s])
+            x_s = _solved(self.L_ss, np.sqrt(ranks.size) * z_s, transposed=True)
+            x_s = x_s[self.local.at.place]
+            x_c = _solved(self.L_cc, z_c - self.L_sc.T @ x_s, transposed=True)
+            y = self.local.extended(u / self.root, np.concatenate([x_c, x_s]))
+            return distributed(y, ranks)
+
+    def __call__(self, t: Dense) -> DistributedVector:
+        """Solve for the consistent y (k,) of an additive t (k,)."""
+        local, c = self.local, len(self.L_cc)
+        with local.at.ranks.clocked("coarse"):
+            u, r = local.reduced(np.asarray(t))
+            z_c = _solved(self.L_cc, r[:c])
+            x_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            x_s = _solved(self.L_ss, x_s, transposed=True)[local.at.place]
+            x_c = _solved(self.L_cc, z_c - x_s @ self.L_sc, transposed=True)
+            y = local.extended(u / self.root**2, np.concatenate([x_c, x_s]))
+            return distributed(y, local.at.ranks)
+
+    def _gathered(self, r: Dense) -> Dense:
+        """Add what all ranks have for the shared rows (s,)."""
+        shared = np.zeros(len(self.L_ss))
+        shared[self.local.at.place] = r
+        return self.local.at.ranks.total(shared)
+
+
+def local_factor(
+    A: csc_array, at: Touched, changing: NDArray[np.bool_] | None = None
+) -> LocalFactor:
+    """Eliminate the unchanging inner rows of this rank's A_p (k, k).
+
+    A : of rows whose diagonal entries, summed over the ranks, are about one
+    changing : (k,) inner rows that may change; none unless given
+
+    Raises
+    ------
+    DependentRowsError
+        Where the inner rows of any rank depend on each other.
+
+    """
+    changes = np.zeros(at.rows.size, bool) if changing is None else changing
+    first = np.flatnonzero(~changes & ~at.is_shared)
+    second = np.flatnonzero(changes & ~at.is_shared)
+    if first.size:
+        first = first[analyze(_int32(A[first][:, first]), use_long=False).P()]
+    order = np.concatenate([first, second, np.flatnonzero(at.is_shared)])
+    factor, L_bb, fails = None, np.zeros((0, 0)), 0.0
+    if order.size:
+        raised = np.where(at.is_shared[order], 1.0, 0.0)  # A_p may be singular there
+        M = _int32(csc_array(A[order][:, order]) + diags_array(raised))
+        factor = analyze(M, ordering_method="natural", use_long=False)
+        try:
+            factor.cholesky_inplace(M)
+            L_bb = factor.L()[first.size :, first.size :].toarray()
+        except CholmodNotPositiveDefiniteError:
+            fails = 1.0
+    if at.ranks.extreme(fails, np.max):
+        raise DependentRowsError("the rows depend on each other")
+    return LocalFactor(at, order, second.size, factor, np.asarray(L_bb))
+
+
+def _cholesky(M: Dense) -> Dense:
+    """Return L with LLᵀ = M, its upper triangle not to be read."""
+    if not len(M):
+        return np.zeros((0, 0), order="F")
+    return np.asfortranarray(cho_factor(M, lower=True)[0])
+
+
+def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
+    """Return L⁻¹x or L⁻ᵀx."""
+    if not x.size:
+        return x
+    return np.asarray(blas.dtrsv(L, x, lower=1, trans=int(transposed)))
+
+
+def _int32(M: csc_array) -> csc_matrix:
+    """Have entries numbered by 32-bit integers, as the factor does."""
+    M = csc_matrix(M)
+    M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
+    return M

@@ -1,0 +1,488 @@
+"""The dual of structured bodies, made by the ranks that hold it.
+
+Each rank builds its own subdomains only: their meshes, stiffness, loads and the rows of
+B that touch them. What is numbered in the whole follows from tables as long as the
+sides of the grids (`problems.feti.structured`), contact rows from the sides alone. So
+no rank has anything of the size of the whole but what a coarse problem has: a few
+numbers for each subdomain.
+
+What ranks tell one another: a representative of each kind of subdomain, so that
+subdomains of one kind have one frame on all ranks; and what they add to rows that
+another one owns, of the right side q and of RᵀBᵀ.
+
+The QP is that of `problems.feti.gluing` and `problems.duality.torn_dual`, row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from harness import QP, Vector, no_rows
+from harness.distributed.vectors import (
+    DistributedColumns,
+    Emitted,
+    Ranks,
+    Share,
+    distributed,
+)
+from problems.fem.mesh import Nodes, cells_of_block
+from problems.feti.distributed import (
+    RankOperator,
+    balanced,
+    gathered_on_one,
+    halo,
+    owners,
+)
+from problems.feti.gluing import GLUE
+from problems.feti.operators import DualOperator, explicit_kinds
+from problems.feti.own_bodies import answers
+from problems.feti.structured import Integers, Layout, Places
+from problems.feti.tearing import Part, classify, images
+from problems.feti.torn import Kind, Subdomains
+
+
+class Contact(NamedTuple):
+    """Rows of contact, then of friction, of the whole; no longer than the sides."""
+
+    rows: csr_array  #: (m_I, n) columns are components of the whole
+    c: Vector  #: (m_I,)
+    bound: Vector  #: (k,) of the last rows, those of friction with a given bound
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StructuredBodies:
+    """A contact problem on structured grids, without dimensions, before it is torn."""
+
+    layout: Layout  #: the grids of the bodies, and their subdomains, S in all
+    components: int  #: of a node: 2 of displacements, 1 of heights
+    material: Integers  #: (S,) of each subdomain
+    kind: Callable[[Part], Kind]  #: assembles a floating subdomain
+    E: Vector  #: (bodies,) stiffness that rows are scaled by
+    load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
+    held: Nodes  #: components of the whole that are zero, in the order of their rows
+    contact: Contact
+    glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
+
+
+class Entries(NamedTuple):
+    """Entries of B in own columns, and who else has entries in the same rows."""
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    value: Vector
+    reached: NDArray[np.int64]  #: (k, 2) pairs: a row of B, and a rank that touches it
+
+
+@dataclass(frozen=True, eq=False)
+class OwnSubdomains:
+    """What one rank holds of torn bodies."""
+
+    problem: StructuredBodies
+    ranks: Ranks
+    rank: NDArray[np.int64]  #: (S,) of each subdomain
+
+    @cached_property
+    def number(self) -> NDArray[np.int64]:
+        """Its subdomains among all, (S_p,)."""
+        return np.flatnonzero(self.rank == self.ranks.rank)
+
+    @cached_property
+    def nodes(self) -> _OwnNodes:
+        """Its torn nodes, (M_p,)."""
+        layout = self.problem.layout
+        torn = layout.torn_nodes(self.number)
+        return _OwnNodes(
+            torn.block, torn.at, torn.copy, torn.start,
+            layout.number(torn.at), layout.times(torn.at),
+        )  # fmt: skip
+
+    @property
+    def component(self) -> Nodes:
+        """Component of the whole that each torn unknown is a copy of, (N_p,)."""
+        d = self.problem.components
+        return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
+
+    @property
+    def times(self) -> NDArray[np.int64]:
+        """How many copies it has on all ranks together, (N_p,)."""
+        return np.repeat(self.nodes.times, self.problem.components)
+
+    @cached_property
+    def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
+        """Sort subdomains into kinds, which have the same frame on all ranks."""
+        problem, of = self.problem, self.problem.layout
+        left, low, columns, rows = of.corner(self.number)
+        body = of.block.body[self.number]
+        material = problem.material[self.number]
+        points = [
+            of.grids[b].block(slice(i, i + k), slice(j, j + n))
+            for b, i, j, k, n in zip(body, left, low, columns, rows, strict=True)
+        ]
+        keys: list[Hashable] = [
+            (int(k), int(n), int(m))
+            for k, n, m in zip(columns, rows, material, strict=True)
+        ]
+        first, kind, rotation = classify(keys, points)
+        told = [(int(self.number[s]), keys[s], points[s]) for s in first]
+        of_all = chain.from_iterable(self.ranks.comm.allgather(told))
+        known = sorted(of_all, key=lambda one: one[0])
+        leader, group, _ = classify(
+            [key for _, key, _ in known], [at for *_, at in known]
+        )
+        place = {number: k for k, (number, *_) in enumerate(known)}
+        kinds = []
+        for k, s in enumerate(first):
+            number, (wide, high, m), at = known[
+                leader[group[place[int(self.number[s])]]]
+            ]
+            if number != self.number[s]:
+                mine = np.flatnonzero(kind == k)
+                turn = images(np.stack([at, *(points[s] for s in mine)]))[1]
+                rotation[mine] = turn[1:]
+            cells = cells_of_block(wide, high)
+            kinds.append(problem.kind(Part(at, cells, np.full(len(cells), m))))
+        return Subdomains(tuple(kinds), kind), rotation
+
+    @property
+    def domains(self) -> Subdomains:
+        """Its subdomains on their own."""
+        return self._classified[0]
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(S_p, 2, 2) turns each from the axes of its kind to those of the whole."""
+        return self._classified[1]
+
+    @property
+    def coarse(self) -> int:
+        """How many rigid motions all subdomains have together."""
+        return self.rank.size * int(self.domains.kinds[0].R.shape[1])
+
+    @cached_property
+    def f(self) -> Vector:
+        """Its part of the load, (N_p,) in the axes of subdomains."""
+        d = self.problem.components
+        found = self.problem.load(self.component) / self.times
+        if d > 1:
+            loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
+            turn = self.rotation[self.nodes.block[loaded]]
+            shared = found.reshape(-1, d)
+            shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
+        return np.asarray(found)
+
+    def resultants(
+        self, unknown: Nodes, value: Vector
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return Rᵀ of single forces: coarse numbers and values, both (k, r).
+
+        unknown, value : torn unknowns and the forces there, (k,)
+        """
+        domains = self.domains
+        modes = domains.kinds[0].R.shape[1]
+        of = np.searchsorted(domains.start, unknown, side="right") - 1
+        R = np.concatenate([kind.R for kind in domains.kinds])
+        first = np.cumsum([0, *(kind.R.shape[0] for kind in domains.kinds)])
+        at = first[domains.kind[of]] + unknown - domains.start[of]
+        number = modes * self.number[of][:, None] + np.arange(modes)
+        return number, R[at] * value[:, None]
+
+    @cached_property
+    def rows(self) -> _Rows:
+        """Its rows of B."""
+        return _rows(self)
+
+
+class _OwnNodes(NamedTuple):
+    """As `problems.feti.structured.TornNodes`, with what is known of the whole."""
+
+    block: Integers
+    at: Places
+    copy: Integers
+    start: NDArray[np.int64]
+    number: Nodes  #: (M,) of the whole
+    times: NDArray[np.int64]  #: (M,) copies of it on all ranks together
+
+
+class _Rows(NamedTuple):
+    """The rows of B that touch subdomains of this rank."""
+
+    number: Nodes  #: (t,) ascending
+    B: csr_array  #: (t, N_p)
+    reach: csr_array  #: (t, ranks) which ranks touch them
+    c: Vector  #: (t,)
+    lower: Vector  #: (t,) bounds of the multipliers
+    upper: Vector  #: (t,)
+    equalities: int  #: of all rows of the whole
+    total: int  #: rows of the whole
+
+
+def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
+    """Make this rank's share of the dual; called by all ranks.
+
+    Raises
+    ------
+    InputError
+        Where there are fewer subdomains than ranks.
+
+    """
+    own = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    rows, domains = own.rows, own.domains
+    at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
+    mine = at.own
+    q = rows.c[mine] - at.added(rows.B @ domains.inverse(own.f))
+    lower, upper = rows.lower[mine], rows.upper[mine]
+    G, b = _coarse_rows(own, at.rows[mine]), _resultants(own)
+    explicit, kinds = explicit_kinds(rows.B, domains), domains.kinds
+    B, kind, equalities, total = rows.B, domains.kind, rows.equalities, rows.total
+
+    def share() -> Share:
+        anew = Subdomains(tuple(map(replace, kinds)), kind)  # without any factor
+        local = DualOperator(B, anew, explicit, equalities)
+        part = QP(
+            P=RankOperator(local, at), q=distributed(q, ranks),
+            lb=distributed(lower, ranks), ub=distributed(upper, ranks),
+            G=no_rows(q.size), h=np.zeros(0),
+            A=DistributedColumns(G, ranks), b=b,
+        )  # fmt: skip
+        return Share(part, gathered_on_one(at, total))
+
+    answer = answers(own, at, _contact_scale(problem))
+    return Emitted(total, b.size, share, answer)
+
+
+def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
+    """Give subdomains to ranks (S,), so that these do alike much and share few rows.
+
+    Raises
+    ------
+    InputError
+        Where there are fewer subdomains than ranks.
+
+    """
+    of, d = problem.layout, problem.components
+    S = of.count
+    one, other, nodes = of.shared_sides()
+    graph = coo_array((d * nodes, (one, other)), shape=(S, S))
+    touched = of.glued()
+    node = np.unique(np.concatenate([problem.held, problem.contact.rows.indices]) // d)
+    at = of.places(node)
+    single = of.times(at) == 1
+    block = of.holder(at, np.zeros_like(node))
+    touched += np.bincount(block[single], minlength=S)
+    entries = problem.contact.rows.tocoo()
+    block = of.holder(of.places(entries.col // d), np.zeros_like(entries.col))
+    touches = csr_array(
+        (np.ones(block.size, dtype=np.int64), (entries.row, block)),
+        shape=(entries.shape[0], S),
+    )
+    touches.data[:] = 1
+    graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
+    return balanced(csr_array(graph), (d * touched) ** 2, ranks)
+
+
+def _rows(own: OwnSubdomains) -> _Rows:
+    """Fill the rows of B, numbered as by `problems.feti.gluing.glue`."""
+    problem, ranks = own.problem, own.ranks
+    parts = [_supports(own), _glued(own), _contact(own)]
+    row, column, value = (np.concatenate(p) for p in list(zip(*parts, strict=True))[:3])
+    number, place = np.unique(row, return_inverse=True)
+    B = csr_array((value, (place, column)), shape=(number.size, own.component.size))
+    pairs = np.concatenate([part.reached for part in parts])
+    pairs = pairs[np.isin(pairs[:, 0], number)]
+    reach = csr_array(
+        (
+            np.ones(len(pairs), dtype=np.int32),
+            (np.searchsorted(number, pairs[:, 0]), pairs[:, 1]),
+        ),
+        shape=(number.size, ranks.size),
+    )
+    reach.sort_indices()
+    reach.data[:] = 1
+    contact, scale = problem.contact, _contact_scale(problem)
+    rubbing = contact.bound.size  # the last rows, of which both bounds are finite
+    bound = contact.bound / scale[scale.size - rubbing :]
+    below = np.concatenate([np.zeros(scale.size - rubbing), -bound])
+    above = np.concatenate([np.full(scale.size - rubbing, np.inf), bound])
+    E = _equalities(problem)
+    touching = number >= E
+    c, lower, upper = (np.full(number.size, x) for x in (0.0, -np.inf, np.inf))
+    for whole, part in ((scale * contact.c, c), (below, lower), (above, upper)):
+        part[touching] = whole[number[touching] - E]
+    return _Rows(number, B, reach, c, lower, upper, E, E + scale.size)
+
+
+def _supports(own: OwnSubdomains) -> Entries:
+    """One row for each copy of a component that is held, the last copy first."""
+    problem, d = own.problem, own.problem.components
+    node, k = np.divmod(problem.held, d)
+    at = problem.layout.places(node)
+    times = problem.layout.times(at)
+    copies = _own_copies(own, at)
+    of = copies.node[copies.mine]
+    row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
+    value = np.sqrt(problem.E[at.body[of]])
+    reached = np.stack([row, np.full(row.size, own.ranks.rank)], axis=1)
+    return Entries(*_turned(own, row, copies.torn, k[of], value), reached)
+
+
+class _Copies(NamedTuple):
+    """The copies of some nodes on all ranks, node by node."""
+
+    node: NDArray[np.int64]  #: (k,) place in the list of nodes
+    copy: NDArray[np.int64]  #: (k,) which one it is, from 0 on
+    rank: NDArray[np.int64]  #: (k,) that holds it
+    mine: NDArray[np.int64]  #: (l,) places of those that this rank holds
+    torn: NDArray[np.int64]  #: (l,) which of the own torn nodes they are
+
+
+def _own_copies(own: OwnSubdomains, at: Places) -> _Copies:
+    of, start = own.problem.layout, own.nodes.start
+    times = of.times(at)
+    node = np.repeat(np.arange(times.size), times)
+    copy = np.arange(node.size) - np.repeat(np.cumsum(times) - times, times)
+    every = Places(*(x[node] for x in at))
+    block = of.holder(every, copy)
+    rank = own.rank[block]
+    mine = np.flatnonzero(rank == own.ranks.rank)
+    left, low, columns, _ = of.corner(block[mine])
+    within = (every.row[mine] - low) * columns + every.column[mine] - left
+    torn = start[np.searchsorted(own.number, block[mine])] + within
+    return _Copies(node, copy, rank, mine, torn)
+
+
+def _glued(own: OwnSubdomains) -> Entries:
+    """Rows of nodes with few copies first, and among these node by node."""
+    problem, nodes, of = own.problem, own.nodes, own.problem.layout
+    d = problem.components
+    held = np.sort(problem.held)
+    held_times = of.times(of.places(held // d))
+    base = int(held_times.sum())
+    found = []
+    for m in (2, 4):
+        W = GLUE[problem.glue](m)
+        held_m = held[held_times == m]
+        several = np.flatnonzero(nodes.times == m)
+        at = Places(*(x[several] for x in nodes.at))
+        before = of.before(at)
+        ranks = np.stack(
+            [own.rank[of.holder(at, np.full(several.size, p))] for p in range(m)],
+            axis=1,
+        )
+        for k in range(d):
+            component = d * nodes.number[several] + k
+            free = ~np.isin(component, held_m)
+            first = d * before + k - np.searchsorted(held_m, component)
+            for r, weights in enumerate(W):
+                mine = np.flatnonzero(free & (weights[nodes.copy[several]] != 0))
+                row = base + first[mine] * len(W) + r
+                node = several[mine]
+                value = weights[nodes.copy[node]]
+                entries = _turned(
+                    own, row, node, np.full(node.size, k),
+                    np.sqrt(problem.E[nodes.at.body[node]]) * value,
+                )  # fmt: skip
+                there = ranks[mine][:, weights != 0]
+                reached = np.stack(
+                    [np.repeat(row, there.shape[1]), there.ravel()], axis=1
+                )
+                found.append(Entries(*entries, reached))
+        base += len(W) * (d * of.having(m) - held_m.size)
+    return Entries(*(np.concatenate(p) for p in zip(*found, strict=True)))
+
+
+def _contact(own: OwnSubdomains) -> Entries:
+    """Rows of contact and friction, which act on the average of copies."""
+    problem, d = own.problem, own.problem.components
+    entries = problem.contact.rows.tocoo()
+    node, k = np.divmod(entries.col.astype(np.int64), d)
+    at = problem.layout.places(node)
+    copies = _own_copies(own, at)
+    row = _equalities(problem) + entries.row.astype(np.int64)
+    reached = np.stack([row[copies.node], copies.rank], axis=1)
+    share = (
+        _contact_scale(problem)[entries.row] * entries.data / problem.layout.times(at)
+    )
+    of = copies.node[copies.mine]
+    return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
+
+
+def _turned(
+    own: OwnSubdomains,
+    row: NDArray[np.int64],
+    node: NDArray[np.int64],
+    k: NDArray[np.int64],
+    value: Vector,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
+    """Give entries in the axes of subdomains, of components k of torn nodes."""
+    d = own.problem.components
+    if d == 1:
+        return row, node, value
+    turn = own.rotation[own.nodes.block[node], k]  # row k of Q: u_k = Σ Q_kq v_q
+    kept = turn != 0
+    column = d * node[:, None] + np.arange(d)
+    rows = np.broadcast_to(row[:, None], kept.shape)
+    return rows[kept], column[kept], (turn * value[:, None])[kept]
+
+
+def _equalities(problem: StructuredBodies) -> int:
+    """Count the rows of supports and gluing."""
+    of, d = problem.layout, problem.components
+    times = of.times(of.places(problem.held // d))
+    glued = sum(
+        len(GLUE[problem.glue](m)) * (d * of.having(m) - int((times == m).sum()))
+        for m in (2, 4)
+    )
+    return int(times.sum()) + glued
+
+
+def _contact_scale(problem: StructuredBodies) -> Vector:
+    """Return √(E/‖B_i‖²) of each contact row, E of the softest body that it touches."""
+    rows, of = problem.contact.rows, problem.layout
+    if not rows.shape[0]:
+        return np.zeros(0)
+    at = of.places(rows.indices // problem.components)
+    norm2 = np.add.reduceat(rows.data**2 / of.times(at), rows.indptr[:-1])
+    softest = np.minimum.reduceat(problem.E[at.body], rows.indptr[:-1])
+    return np.asarray(np.sqrt(softest / norm2))
+
+
+def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
+    """Return the columns of RᵀBᵀ that belong to own rows, (3S, o)."""
+    ranks, rows = own.ranks, own.rows
+    B, t = rows.B, rows.number.size
+    unknown, place = np.unique(B.indices, return_inverse=True)
+    coarse, value = own.resultants(unknown, np.ones(unknown.size))
+    r, modes = own.coarse, coarse.shape[1]
+    ends = modes * np.arange(unknown.size + 1)
+    R = csr_array((value.ravel(), coarse.ravel(), ends), shape=(unknown.size, r))
+    touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
+    part = csr_array(touched @ R)
+    owner = owners(rows.number, rows.reach)
+    told: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
+    for one in set(range(ranks.size)) - {ranks.rank}:
+        theirs = np.flatnonzero(owner == one)
+        entries = coo_array(part[theirs])
+        told[one] = rows.number[theirs][entries.row], entries.col, entries.data
+    found = csr_array(part[np.flatnonzero(owner == ranks.rank)])
+    for row, column, data in filter(None, ranks.comm.alltoall(told)):
+        places = np.searchsorted(mine, row), column
+        found += csr_array((data, places), shape=found.shape)
+    return csr_array(found.T)
+
+
+def _resultants(own: OwnSubdomains) -> Vector:
+    """Return Rᵀf (3S,) of all subdomains."""
+    loaded = np.flatnonzero(own.f)
+    coarse, value = own.resultants(loaded, own.f[loaded])
+    found = np.zeros(own.coarse)
+    for number, part in own.ranks.comm.allgather((coarse, value)):
+        np.add.at(found, number, part)
+    return found

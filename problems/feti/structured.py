@@ -1,0 +1,261 @@
+"""Structured grids cut into blocks: what is numbered in the whole, without the whole.
+
+A block knows its place among the others, so everything that tearing and gluing number
+(`problems.feti.tearing`, `problems.feti.gluing`) can be counted from tables that are as
+long as the sides of the grids. With aᵢ = 2 for a column of nodes where two blocks meet,
+otherwise 1, and bⱼ alike for rows, node (i, j) has aᵢbⱼ copies; the copies are numbered
+as their blocks are, from left to right and from below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from problems.fem.mesh import Nodes, StructuredGrid
+from problems.feti.tearing import blocks
+
+Integers = NDArray[np.integer[Any]]
+
+
+class Places(NamedTuple):
+    """Nodes by their places in the grids."""
+
+    body: Integers  #: (k,)
+    column: Integers  #: (k,) i
+    row: Integers  #: (k,) j
+
+
+class TornNodes(NamedTuple):
+    """The nodes of some blocks, block after block and row by row."""
+
+    block: Integers  #: (M,) place in the list of blocks
+    at: Places
+    copy: Integers  #: (M,) which of the copies of its node it is, from 0 on
+    start: NDArray[np.int64]  #: (blocks + 1,) first of each block, and M
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Structured grids, one after another, in blocks."""
+
+    grids: tuple[StructuredGrid, ...]
+    #: of each grid: the lines of nodes where blocks begin and end, of columns and rows
+    cuts: tuple[tuple[Nodes, Nodes], ...]
+
+    @classmethod
+    def of(
+        cls, grids: tuple[StructuredGrid, ...], most: int | tuple[int, int]
+    ) -> Layout:
+        """Cut grids into the blocks of `problems.feti.tearing.structured_bodies`.
+
+        most : cells along a side of a block, or along each
+        """
+        sides = np.broadcast_to(most, 2)
+
+        def lines(cells: int, side: int) -> Nodes:
+            along = blocks((cells,), side)
+            return np.append(np.flatnonzero(np.diff(along, prepend=-1)), cells)
+
+        cuts = [
+            tuple(lines(c, int(m)) for c, m in zip(grid.divisions, sides, strict=True))
+            for grid in grids
+        ]
+        return cls(grids, tuple((x, y) for x, y in cuts))
+
+    @cached_property
+    def node_start(self) -> NDArray[np.int64]:
+        """First node of each grid, and how many there are."""
+        return np.cumsum([0, *(grid.nodes for grid in self.grids)])
+
+    @cached_property
+    def block_start(self) -> NDArray[np.int64]:
+        """First block of each grid, and how many there are."""
+        counts = [(x.size - 1) * (y.size - 1) for x, y in self.cuts]
+        return np.cumsum([0, *counts])
+
+    @property
+    def count(self) -> int:
+        """How many blocks there are, S."""
+        return int(self.block_start[-1])
+
+    @cached_property
+    def block(self) -> Places:
+        """Each block (S,): its grid, its column and its row among blocks."""
+        body = np.repeat(np.arange(len(self.grids)), np.diff(self.block_start))
+        row, column = np.divmod(
+            np.arange(self.count) - self.block_start[body], self._wide[body]
+        )
+        return Places(body, column, row)
+
+    @cached_property
+    def _wide(self) -> NDArray[np.int64]:
+        """Blocks along the rows of each grid."""
+        return np.array([x.size - 1 for x, _ in self.cuts])
+
+    @cached_property
+    def _columns(self) -> _Lines:
+        return _lines([x for x, _ in self.cuts])
+
+    @cached_property
+    def _rows(self) -> _Lines:
+        return _lines([y for _, y in self.cuts])
+
+    def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
+        """Return of blocks the first column and row, and how many of both (k,)."""
+        at = Places(*(x[block] for x in self.block))
+        first, last = (
+            [
+                lines.cut[lines.cut_start[at.body] + place + end]
+                for lines, place in (
+                    (self._columns, at.column), (self._rows, at.row),
+                )
+            ]
+            for end in (0, 1)
+        )  # fmt: skip
+        return first[0], first[1], last[0] - first[0] + 1, last[1] - first[1] + 1
+
+    def torn_nodes(self, block: Nodes) -> TornNodes:
+        """List the nodes of some blocks."""
+        left, low, columns, rows = self.corner(block)
+        start = np.concatenate([[0], np.cumsum(columns * rows)])
+        of = np.repeat(np.arange(block.size), columns * rows)
+        row, column = np.divmod(np.arange(start[-1]) - start[of], columns[of])
+        at = Places(self.block.body[block][of], left[of] + column, low[of] + row)
+        second = [
+            (place[block][of] > lines.first[lines.start[at.body] + line]).astype(int)
+            for lines, place, line in (
+                (self._columns, self.block.column, at.column),
+                (self._rows, self.block.row, at.row),
+            )
+        ]
+        across = self._columns.times[self._columns.start[at.body] + at.column]
+        copy = (second[1] * across + second[0]).astype(np.int8)
+        small = [x.astype(np.int32) for x in (of, *at)]  # there are many of them
+        return TornNodes(small[0], Places(*small[1:]), copy, start)
+
+    def places(self, node: Nodes) -> Places:
+        """Find nodes by their numbers."""
+        body = np.searchsorted(self.node_start, node, side="right") - 1
+        wide = np.array([grid.columns.size for grid in self.grids])
+        row, column = np.divmod(node - self.node_start[body], wide[body])
+        return Places(body, column, row)
+
+    def number(self, at: Places) -> Nodes:
+        """Return the numbers of nodes."""
+        wide = np.array([grid.columns.size for grid in self.grids])
+        return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
+
+    def times(self, at: Places) -> NDArray[np.int64]:
+        """Count the copies of nodes."""
+        return np.asarray(
+            self._columns.times[self._columns.start[at.body] + at.column]
+            * self._rows.times[self._rows.start[at.body] + at.row]
+        )
+
+    def holder(self, at: Places, copy: Integers) -> Nodes:
+        """Find the block of a copy of each node."""
+        column = self._columns.start[at.body] + at.column
+        row = self._rows.start[at.body] + at.row
+        up, right = np.divmod(copy, self._columns.times[column])
+        across = self._columns.first[column] + right
+        return np.asarray(
+            self.block_start[at.body]
+            + (self._rows.first[row] + up) * self._wide[at.body]
+            + across
+        )
+
+    def before(self, at: Places) -> NDArray[np.int64]:
+        """Count, of each node, those before it that have as many copies."""
+        columns, rows = self._columns, self._rows
+        column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
+        m = columns.times[column] * rows.times[row]
+        in_row = columns.before[columns.times[column] - 1, column]
+        found = np.zeros(m.size, dtype=np.int64)
+        for times, (in_rows, _) in self._counts.items():
+            of = m == times
+            found[of] = in_rows[row[of]] + in_row[of]
+        return found
+
+    def having(self, times: int) -> int:
+        """Count the nodes with so many copies."""
+        return self._counts[times][1]
+
+    @cached_property
+    def _counts(self) -> dict[int, tuple[NDArray[np.int64], int]]:
+        """By number of copies: nodes in all rows before each row, and in all."""
+        columns, rows = self._columns, self._rows
+        body = np.repeat(np.arange(len(self.grids)), np.diff(rows.start))
+        of_columns = [
+            np.add.reduceat(columns.times == a, columns.start[:-1])[body]
+            for a in (1, 2)
+        ]
+        once, twice = (rows.times == b for b in (1, 2))
+        in_row = {
+            1: once * of_columns[0],
+            2: once * of_columns[1] + twice * of_columns[0],
+            4: twice * of_columns[1],
+        }
+        return {
+            m: (np.cumsum(count) - count, int(count.sum()))
+            for m, count in in_row.items()
+        }
+
+    def shared_sides(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+        """List pairs of blocks that share a side, and how many nodes (k,) are on it."""
+        body, column, row = self.block
+        all_ = np.arange(self.count)
+        _, _, columns, rows = self.corner(all_)
+        deep = np.array([y.size - 1 for _, y in self.cuts])
+        right, up = column + 1 < self._wide[body], row + 1 < deep[body]
+        above = all_ + self._wide[body]
+        return (
+            np.concatenate([all_[right], all_[up]]),
+            np.concatenate([all_[right] + 1, above[up]]),
+            np.concatenate([rows[right], columns[up]]),
+        )
+
+    def glued(self) -> NDArray[np.int64]:
+        """Count the nodes (S,) of each block that have copies in others."""
+        left, low, columns, rows = self.corner(np.arange(self.count))
+        alone = []
+        for lines, first, count in (
+            (self._columns, left, columns), (self._rows, low, rows),
+        ):  # fmt: skip
+            at = lines.start[self.block.body] + first
+            ends = (lines.times[at] == 2).astype(int) + (
+                lines.times[at + count - 1] == 2
+            )
+            alone.append(count - ends)
+        return np.asarray(columns * rows - alone[0] * alone[1])
+
+
+class _Lines(NamedTuple):
+    """Columns, or rows, of all grids one after another."""
+
+    start: NDArray[np.int64]  #: first of each grid, and how many there are
+    times: NDArray[np.int64]  #: how many blocks meet there along this direction, 1 or 2
+    first: NDArray[np.int64]  #: the first block that has it
+    before: NDArray[np.int64]  #: (2, k) of one grid, before it, with times 1 and 2
+    cut: NDArray[np.int64]  #: the lines where blocks begin and end
+    cut_start: NDArray[np.int64]  #: first of these of each grid
+
+
+def _lines(cuts: list[Nodes]) -> _Lines:
+    times, first, before = [], [], []
+    for cut in cuts:
+        line = np.arange(cut[-1] + 1)
+        of = np.ones_like(line)
+        of[cut[1:-1]] = 2
+        times.append(of)
+        first.append(np.searchsorted(cut[1:], line))
+        before.append([np.cumsum(of == a) - (of == a) for a in (1, 2)])
+    return _Lines(
+        start=np.cumsum([0, *map(len, times)]), times=np.concatenate(times),
+        first=np.concatenate(first), before=np.concatenate(before, axis=1),
+        cut=np.concatenate(cuts), cut_start=np.cumsum([0, *map(len, cuts)]),
+    )  # fmt: skip

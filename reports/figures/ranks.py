@@ -1,0 +1,280 @@
+"""One solve on several ranks: speed-up, its model, parts of the time, weak scaling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from reports.data.evidence import Outcome
+from reports.data.rank_series import PHASES, StrongSeries, WeakSeries, rank_parts
+from reports.document.figure import (
+    INK,
+    Area,
+    Axis,
+    Figure,
+    Intervals,
+    Key,
+    Look,
+    Mark,
+    Panel,
+    Row,
+    Rule,
+    Segments,
+    Series,
+    Text,
+    categories,
+)
+from reports.figures.style import (
+    COLOURS,
+    DASHED,
+    DOTTED,
+    GUIDE,
+    LEGEND_LINE,
+    below,
+    legible,
+    log,
+    look,
+    run_ids,
+)
+from reports.statistics.intervals import Interval
+
+_BAND = 0.18  #: opacity
+_PALE = "#a9cde6"  #: a band in the first colour, in a legend
+_LONG = 72  #: letters of a name in a legend of one column
+_BAR = 9.0  #: width of a bar, points
+_BEYOND = 1.5  #: times the values that an axis goes on for intervals
+_REST = "#9aa2ad"  #: time that no part is told of
+_EDGE = Look(colour=INK, width=0.8, dash=DOTTED)  #: between measured and model
+
+
+def strong_figure(found: Sequence[StrongSeries]) -> Figure:
+    """Draw speed-up against ranks, a panel for each phase, beside what copies reach."""
+    shown = sorted({n for s in found for n in s.answers})
+    panels, keys = [], []
+    for phase in PHASES:
+        marks: list[Mark] = [_ideal(shown)]
+        for i, s in enumerate(found):
+            marks += _speed_ups(s, phase, look(i))
+        panels.append(
+            Panel(
+                x=_ranks_axis(shown), y=_times_axis("speed-up", marks),
+                title=phase, marks=tuple(marks),
+            )
+        )  # fmt: skip
+    for i, s in enumerate(found):
+        label = legible(s.title, _LONG)
+        keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
+    if any(s.copies for s in found):
+        keys.append(Key(label="as many copies at once", look=_copies_look(INK)))
+    if any(s.crowded(n) for s in found for n in s.several):
+        crowded = replace(look(0), dash=None, fill="none")
+        keys.append(Key(label="more ranks than CPUs: they took turns", look=crowded))
+    keys.append(Key(label="as many times as ranks", look=GUIDE))
+    return _figure(panels, keys, columns=1)
+
+
+def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
+    first = Interval(1.0, 1.0, 1.0, 1.0, 1)
+    measured = [(1, first, s.answers[1])] + [
+        (n, ratio, s.answers[n])
+        for n in s.several
+        if (ratio := s.speed_up(n, phase)) is not None
+    ]
+    copied = [(1, first, s.answers[1])] + [
+        (n, ratio, s.copies[n])
+        for n in s.several
+        if (ratio := s.reach(n, phase)) is not None
+    ]
+    free = [point for point in measured if not s.crowded(point[0])]
+    crowded = [point for point in measured if s.crowded(point[0])]
+    curves = [_curve(free, _line(style), s.solver)]
+    if crowded:
+        hollow = replace(style, dash=None, fill="none")
+        curves.append(_curve(crowded, hollow, s.solver))
+    if len(copied) > 1:
+        curves.insert(0, _curve(copied, _copies_look(style.colour), s.solver))
+    return curves
+
+
+def _curve(
+    points: Sequence[tuple[int, Interval, Outcome]], style: Look, solver: str
+) -> Series:
+    ranks, values, outcomes = zip(*points, strict=True)
+    low, high = tuple(v.low for v in values), tuple(v.high for v in values)
+    return Series(
+        x=tuple(map(float, ranks)), y=tuple(v.value for v in values), look=style,
+        solver=solver, intervals=Intervals(low=low, high=high),
+        runs=tuple(run_ids(o.records) for o in outcomes),
+    )  # fmt: skip
+
+
+def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
+    """Draw the speed-up that the model says beyond the measured ranks, never within.
+
+    found : series with a model, each with the ranks that it is asked about
+    """
+    panels = []
+    for i, (s, asked) in enumerate(found):
+        assert s.model is not None
+        last = s.model.measured[-1]
+        beyond = [(n, s.model.speed_up(n)) for n in (last, *asked)]
+        ranks = tuple(float(n) for n, _ in beyond)
+        colour = look(i).colour
+        measured = [(n, v, s.answers[n]) for n in s.model.measured[1:]
+                    if (v := s.speed_up(n, "solve")) is not None]  # fmt: skip
+        first = (1, Interval(1.0, 1.0, 1.0, 1.0, 1), s.answers[1])
+        marks: list[Mark] = [
+            _ideal([1, *asked]),
+            Area(x=ranks, low=tuple(v.low for _, v in beyond),
+                 high=tuple(v.high for _, v in beyond), colour=colour, opacity=_BAND,
+                 solver=s.solver),
+            Series(x=ranks, y=tuple(v.value for _, v in beyond), solver=s.solver,
+                   look=Look(colour=colour, dash=DASHED, width=1.4)),
+            _curve([first, *measured], _line(look(i)), s.solver),
+        ]  # fmt: skip
+        panels.append(
+            Panel(
+                x=_ranks_axis([1, *s.model.measured[1:], *asked]),
+                y=_times_axis("speed-up of the solve", marks),
+                title=legible(s.case, 44), marks=tuple(marks),
+                rules=(Rule(axis="x", at=float(last), look=_EDGE),),
+                texts=(
+                    Text(text="model, not measured", place=(0.97, 0.06),
+                         inside=(True, True), align=("right", "center")),
+                ),
+            )
+        )  # fmt: skip
+    keys = (
+        Key(label="measured", look=_line(look(0))),
+        Key(label="model, not measured",
+            look=Look(colour=COLOURS[0], dash=DASHED, width=1.4)),
+        Key(label="band of the fit",
+            look=Look(colour=_PALE, width=6.0)),
+        Key(label="as many times as ranks", look=GUIDE),
+    )  # fmt: skip
+    return _figure(panels, keys, columns=4)
+
+
+def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
+    """Draw a bar for each solve on several ranks, of its parts; means of the ranks."""
+    parts = [rank_parts(s.answers[n]) for s, n in found]
+    named = list(dict.fromkeys(name for of in parts for name in of))
+    colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(named)}
+    marks = []
+    for i, ((s, n), of) in enumerate(zip(found, parts, strict=True)):
+        o, start = s.answers[n], 0.0
+        whole = t.value if (t := o.seconds("solve")) is not None else 0.0
+        told = {name: part.mean for name, part in of.items()}
+        for name, taken in {**told, "rest": whole - sum(told.values())}.items():
+            if taken > 0:
+                marks.append(
+                    Segments(
+                        ends=((start, -float(i), start + taken, -float(i)),),
+                        colour=colours.get(name, _REST), width=_BAR, solver=s.solver,
+                        runs=(run_ids(o.records),),
+                    )
+                )  # fmt: skip
+                start += taken
+    keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
+    keys.append(Key(label="rest", look=_bar(_REST)))
+    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in found]
+    panel = Panel(
+        x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
+        marks=tuple(marks), grid="x",
+    )  # fmt: skip
+    return replace(
+        _figure([panel], keys, columns=6), height=0.9 + LEGEND_LINE + 0.26 * len(found)
+    )
+
+
+def weak_figure(found: Sequence[WeakSeries]) -> Figure:
+    """Draw the time against ranks that have equally much, a panel for each phase."""
+    shown = sorted({m.ranks for s in found for m in s.members})
+    panels = []
+    for phase in PHASES:
+        marks: list[Mark] = []
+        for i, s in enumerate(found):
+            first = s.members[0].answer
+            beside = {m.ranks for m in s.members}
+            copied = [(1, first)]
+            copied += [(n, o) for n, o in sorted(s.copies.items()) if n in beside]
+            if len(copied) > 1:
+                marks += _times(copied, phase, _copies_look(look(i).colour), s.solver)
+            answers = [(m.ranks, m.answer) for m in s.members]
+            marks += _times(answers, phase, _line(look(i)), s.solver)
+        panels.append(
+            Panel(
+                x=_ranks_axis(shown), y=log("time in s"), title=phase,
+                marks=tuple(marks),
+            )
+        )  # fmt: skip
+    keys = [
+        Key(label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs of a rank",
+            look=_line(look(i)), solver=s.solver)
+        for i, s in enumerate(found)
+    ]  # fmt: skip
+    if any(s.copies for s in found):
+        keys.append(Key(label="copies of the first at once", look=_copies_look(INK)))
+    return _figure(panels, keys, columns=1)
+
+
+def _times(
+    of: Sequence[tuple[int, Outcome]], phase: str, style: Look, solver: str
+) -> list[Series]:
+    timed = [(n, t, o) for n, o in of if (t := o.seconds(phase)) is not None]
+    return [_curve(timed, style, solver)] if timed else []
+
+
+def _ideal(ranks: Sequence[int]) -> Series:
+    ends = float(min(ranks)), float(max(ranks))
+    return Series(x=ends, y=ends, look=GUIDE)
+
+
+def _ranks_axis(ranks: Sequence[int]) -> Axis:
+    low, high = float(min(ranks)), float(max(ranks))
+    return Axis(
+        label="ranks $N$", log=True, low=low / 1.15, high=high * 1.15,
+        ticks=tuple((float(n), str(n)) for n in sorted(set(ranks))),
+    )  # fmt: skip
+
+
+def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
+    """Make a logarithmic axis whose ticks are powers of two.
+
+    Intervals may leave it where they are wide: values are what it is to show.
+    """
+    curves = [m for m in marks if isinstance(m, Series)]
+    shown = [v for m in curves for v in m.y]
+    least, most = min(shown) / _BEYOND, max(shown) * _BEYOND
+    ends = [
+        v for m in curves if m.intervals for v in (*m.intervals.low, *m.intervals.high)
+    ]
+    ends += [v for m in marks if isinstance(m, Area) for v in (*m.low, *m.high)]
+    shown += [min(max(v, least), most) for v in ends]
+    low, high = min([0.9, *shown]), max([2.0, *shown])
+    ticks = [2.0**k for k in range(-6, 13) if low <= 2.0**k <= 1.1 * high]
+    return Axis(
+        label=label, log=True, low=low / 1.1, high=high * 1.15,
+        ticks=tuple((v, f"{v:g}") for v in ticks),
+    )  # fmt: skip
+
+
+def _line(style: Look) -> Look:
+    return replace(style, dash=())
+
+
+def _copies_look(colour: str) -> Look:
+    return Look(colour=colour, marker="o", dash=DOTTED, fill="none", width=0.9)
+
+
+def _bar(colour: str) -> Look:
+    return Look(colour=colour, width=6.0)
+
+
+def _figure(panels: Sequence[Panel], keys: Sequence[Key], *, columns: int) -> Figure:
+    rows = [Row(panels=tuple(panels[i : i + 2])) for i in range(0, len(panels), 2)]
+    lines = -(-len(keys) // columns)
+    return Figure(
+        rows=tuple(rows), height=0.4 + 2.5 * len(rows) + LEGEND_LINE * lines,
+        legend=below(keys, columns),
+    )  # fmt: skip

@@ -1,0 +1,173 @@
+"""What solvers count, each kind apart, against size and against H/h; and κ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from reports.data.evidence import Outcome
+from reports.data.size_series import SizeSeries, Sweep
+from reports.document.figure import (
+    Axis,
+    Figure,
+    Key,
+    Look,
+    Mark,
+    Panel,
+    Row,
+    Series,
+    numbers,
+)
+from reports.document.formatting import exponent
+from reports.figures.style import (
+    COLOURS,
+    DASHED,
+    LEGEND_LINE,
+    MARKERS,
+    below,
+    legible,
+    log,
+    run_ids,
+)
+from reports.statistics.intervals import PowerLaw
+
+#: panels of counts, whose names are those of SMALBE; others are in the tables
+PANELS = (
+    ("products", ("P_products", "preconditioner_applies")),
+    ("steps", ("cg", "expansion", "proportioning")),
+)
+KAPPA = "kappa"  #: condition numbers among the quantities begin so
+_FITTED = 24  #: points of a curve of a fit
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Curve:
+    """One count, or κ, against size."""
+
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    answers: tuple[Outcome, ...]
+    law: PowerLaw | None = None
+
+
+def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
+    """Draw the counts of one solver against dofs with fits c·nᵖ; None without any."""
+    points = [(float(n), o) for n, o in series.curve(solver)]
+    laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
+    return _figure(points, log("degrees of freedom $n$"), laws, solver)
+
+
+def torn_figure(sweep: Sweep) -> Figure | None:
+    """Draw the counts of one solver against H/h; None where none is known."""
+    points = [(float(value), o) for value, o in sweep.answers]
+    shown = tuple((x, f"{x:g}") for x, _ in points)
+    low, high = points[0][0] / 1.15, points[-1][0] * 1.15
+    axis = Axis(label="cells $H/h$", log=True, low=low, high=high, ticks=shown)
+    return _figure(points, axis, {}, sweep.solver)
+
+
+def _figure(
+    points: Sequence[tuple[float, Outcome]],
+    x: Axis,
+    laws: dict[str, PowerLaw | None],
+    solver: str,
+) -> Figure | None:
+    panels: list[Panel] = []
+    keys: list[Key] = []
+    groups = [
+        *((title, [*_counts(points, names, laws)]) for title, names in PANELS),
+        ("condition number", [*_condition_numbers(points)]),
+    ]
+    for title, curves in groups:
+        if not curves:
+            continue
+        marks: list[Mark] = []
+        for curve in curves:
+            i = len(keys)
+            colour = COLOURS[i % len(COLOURS)]
+            style = Look(colour=colour, marker=MARKERS[i % len(MARKERS)], dash=None)
+            joined = Look(colour=colour, marker=MARKERS[i % len(MARKERS)])
+            label = curve.label
+            if curve.law is not None:
+                marks.append(_fit(curve, colour))
+                label += f",  p = {exponent(curve.law)}"
+            chosen = joined if curve.law is None else style
+            marks.append(
+                Series(
+                    x=curve.x, y=curve.y, look=chosen, solver=solver,
+                    runs=tuple(run_ids(o.records) for o in curve.answers),
+                )
+            )  # fmt: skip
+            keys.append(Key(label=label, look=chosen))
+        most = max(max(curve.y) for curve in curves)
+        panels.append(
+            Panel(
+                x=x, y=Axis(low=0.0, high=1.12 * most or 1.0, integers=True, most=6),
+                title=title, marks=tuple(marks),
+            )
+        )  # fmt: skip
+    if not panels:
+        return None
+    (low, *_), (high, *_) = points[0], points[-1]
+    if len(panels) > 2 and x.ticks is None and high >= 10 * low:
+        panels = [replace(p, x=replace(p.x, most=4)) for p in panels]  # has less room
+    return Figure(
+        rows=(Row(panels=tuple(panels)),),
+        height=2.5 + LEGEND_LINE * -(-len(keys) // 2),
+        legend=below(keys, 2),
+    )
+
+
+def _counts(
+    points: Sequence[tuple[float, Outcome]],
+    names: Sequence[str],
+    laws: dict[str, PowerLaw | None],
+) -> list[_Curve]:
+    found = []
+    for name in names:
+        counted = [(x, c, o) for x, o in points if (c := o.counted(name)) is not None]
+        if len(counted) == len(points):
+            x, y, answers = zip(*counted, strict=True)
+            found.append(
+                _Curve(
+                    label=legible(name.replace("_", " ")),
+                    x=x,
+                    y=y,
+                    answers=answers,
+                    law=laws.get(name),
+                )
+            )
+    return found
+
+
+def _condition_numbers(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
+    """Take what every answer has of κ, without its error bounds."""
+    names = [
+        name
+        for name, value in points[0][1].quantities.items()
+        if (name == KAPPA or name.startswith(f"{KAPPA}_"))
+        and not name.endswith("_error")
+        and isinstance(value, int | float)
+    ]
+    return [
+        _Curve(
+            label=rf"$\kappa${legible(name.removeprefix(KAPPA).replace('_', ' '))}",
+            x=tuple(x for x, _ in points),
+            y=tuple(float(o.quantities[name]) for _, o in points),
+            answers=tuple(o for _, o in points),
+        )
+        for name in names
+        if all(isinstance(o.quantities.get(name), int | float) for _, o in points)
+    ]
+
+
+def _fit(curve: _Curve, colour: str) -> Series:
+    assert curve.law is not None
+    n = np.geomspace(min(curve.x), max(curve.x), _FITTED)
+    return Series(
+        x=numbers(n), y=numbers(curve.law.factor * n**curve.law.exponent),
+        look=Look(colour=colour, dash=DASHED, width=0.9),
+    )  # fmt: skip

@@ -1,0 +1,203 @@
+"""Strong and weak scaling and their model, of records whose times are manufactured."""
+
+from pathlib import Path
+
+import pytest
+
+from reports.data.evidence import Evidence, arrange
+from reports.data.rank_series import (
+    rank_counts,
+    rank_memory,
+    rank_parts,
+    strong_series,
+    weak_series,
+)
+from reports.data.size_series import size_series
+from reports.document.figure import Area, Series
+from reports.folder import compose
+from reports.sections.ranks import predicted, ranks
+from reports.statistics.cost_model import CostModel
+from tests.support.manufactured_ranks import (
+    ALIKE,
+    BYTE,
+    BYTES,
+    MESSAGE,
+    MESSAGES,
+    REDUCTION,
+    REDUCTIONS,
+    SLOWDOWN,
+    SPENT,
+    WORK,
+    copies_seconds,
+    rank_records,
+    solve_seconds,
+)
+
+DOFS = 100_000
+
+
+def evidence(records, cpus=None):
+    machine = {"machine": {"usable_cores": cpus}} if cpus else {}
+    return Evidence(
+        directory=Path(), records=arrange(list(records)), environment=machine
+    )
+
+
+@pytest.fixture(scope="module")
+def manufactured():
+    return evidence(rank_records(), cpus=4)
+
+
+@pytest.fixture(scope="module")
+def strong(manufactured):
+    (found,) = (s for s in strong_series(manufactured) if s.case.endswith("S=100/dual"))
+    return found
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_speed_up_is_the_time_on_one_rank_over_that_on_several(strong, n):
+    true = solve_seconds(DOFS, 1) / solve_seconds(DOFS, n)
+    assert strong.speed_up(n, "solve").value == pytest.approx(true)
+    assert strong.efficiency(n, "solve").value == pytest.approx(true / n)
+    assert strong.speed_up(n, "prepare").value == pytest.approx(n / SLOWDOWN)
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_copies_reach_as_much_as_their_slow_down_leaves(strong, n):
+    assert strong.reach(n, "solve").value == pytest.approx(n / SLOWDOWN)
+    true = copies_seconds(DOFS) / (n * solve_seconds(DOFS, n))
+    assert strong.against_copies(n, "solve").value == pytest.approx(true)
+    # preparing shares all and is as slow as copies are: as good as independent
+    assert strong.against_copies(n, "prepare").value == pytest.approx(1.0)
+
+
+def test_equal_times_have_no_interval_and_scattered_ones_hold_the_truth(strong):
+    at = strong.speed_up(2, "solve")
+    assert at.low == pytest.approx(at.high)
+    noisy = evidence(rank_records(sizes=[DOFS], repeats=8, scatter=0.03))
+    (series,) = strong_series(noisy)
+    at = series.speed_up(4, "solve")
+    assert at.low < solve_seconds(DOFS, 1) / solve_seconds(DOFS, 4) < at.high
+
+
+def test_one_run_has_a_value_and_no_interval():
+    (series,) = strong_series(evidence(rank_records(sizes=[DOFS], repeats=1)))
+    assert series.speed_up(2, "solve").samples == 1
+    assert series.model.seconds(8).samples == 1
+
+
+def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
+    model = strong.model
+    assert model.work == pytest.approx(WORK * DOFS)
+    assert model.alike == pytest.approx(ALIKE)
+    assert model.slowdown == pytest.approx(SLOWDOWN)
+    on_four = 2 * REDUCTIONS * REDUCTION, 3 * MESSAGES * MESSAGE, BYTES * BYTE
+    assert model.communication == pytest.approx(on_four)
+    assert model.misfit < 1e-9
+    assert model.seconds(64).value == pytest.approx(solve_seconds(DOFS, 64))
+
+
+def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
+    slow = [
+        r.but(solve_seconds=10 * r.solve_seconds) if r.ranks == 4 else r
+        for r in rank_records(sizes=[DOFS])
+    ]
+    (series,) = strong_series(evidence(slow, cpus=2))
+    assert series.crowded(4)
+    assert series.model.measured == (1, 2)
+    assert series.model.seconds(64).value == pytest.approx(solve_seconds(DOFS, 64))
+
+
+def test_records_that_do_not_say_what_was_sent_have_no_model():
+    silent = (r.but(rank_counts={}) for r in rank_records(sizes=[DOFS]))
+    (series,) = strong_series(evidence(silent))
+    assert series.model is None
+
+
+def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(manufactured):
+    found = {s.members[0].dofs: s for s in weak_series(manufactured)}
+    assert [(m.ranks, m.dofs) for m in found[50_000].members] == [
+        (1, 50_000), (2, 100_000), (4, 200_000),
+    ]  # fmt: skip
+    assert [(m.ranks, m.dofs) for m in found[100_000].members] == [
+        (1, 100_000), (2, 200_000),
+    ]  # fmt: skip
+    last = found[50_000].members[-1]
+    true = solve_seconds(50_000, 1) / solve_seconds(200_000, 4)
+    assert found[50_000].efficiency(last, "solve").value == pytest.approx(true)
+    of = found[50_000].against_copies(last, "solve")
+    assert of.value == pytest.approx(copies_seconds(50_000) / solve_seconds(200_000, 4))
+
+
+def test_cases_of_other_sizes_are_no_weak_scaling():
+    found = weak_series(evidence(rank_records(sizes=[50_000, 120_000, 150_000])))
+    assert found == []
+
+
+def test_answers_that_were_not_verified_are_left_out():
+    wrong = (
+        r.but(verdict="wrong") if r.ranks == 2 and not r.role else r
+        for r in rank_records(sizes=[DOFS])
+    )
+    (series,) = strong_series(evidence(wrong))
+    assert tuple(series.answers) == (1, 4)
+
+
+def test_parts_are_medians_of_means_and_of_the_largest(strong):
+    parts, whole = rank_parts(strong.answers[2]), solve_seconds(DOFS, 2)
+    assert {k: p.mean / whole for k, p in parts.items()} == pytest.approx(SPENT)
+    assert parts["coarse"].largest == pytest.approx(1.1 * parts["coarse"].mean)
+    assert rank_counts(strong.answers[2])["bytes"].mean == BYTES
+    assert rank_memory(strong.answers[2]) == (90.0, 99.0)
+    assert rank_parts(strong.answers[1]) == {}
+    assert rank_memory(strong.answers[1]) is None
+
+
+def test_copies_are_no_solver_of_a_series_of_sizes(manufactured):
+    (series,) = size_series(manufactured)
+    assert not any("copies" in solver for solver in series.solvers)
+
+
+def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
+    manufactured,
+):
+    section = ranks(manufactured)
+    (model,) = (p for p in section.pictures if p.name == "ranks-model")
+    assert model.caption.startswith("Model, not measured")
+    for panel in model.figure.panels:
+        assert any(t.text == "model, not measured" for t in panel.texts)
+        (edge,) = panel.rules
+        dashed = [m for m in panel.marks if isinstance(m, Area)]
+        dashed += [m for m in panel.marks if isinstance(m, Series) and not m.runs
+                     and m.solver]  # fmt: skip
+        assert len(dashed) == 2
+        assert all(min(m.x) == edge.at for m in dashed)
+        (measured,) = (m for m in panel.marks if isinstance(m, Series) and m.runs)
+        assert max(measured.x) == edge.at
+    told = [t.caption for t in section.tables if "odel" in t.caption]
+    assert len(told) == 2
+    assert all("not measured" in caption for caption in told)
+
+
+def test_a_model_that_does_not_fit_is_not_asked_about_more_ranks():
+    worse = (  # slower on two ranks than the model can be on any
+        r.but(solve_seconds=9 * r.solve_seconds) if r.ranks == 2 and not r.role else r
+        for r in rank_records(sizes=[DOFS], ranks=[1, 2])
+    )
+    (series,) = strong_series(evidence(worse))
+    assert isinstance(series.model, CostModel)
+    assert series.model.misfit > 0.2
+    assert predicted(series) == ()
+
+
+def test_no_more_ranks_than_subdomains_are_predicted(strong):
+    assert predicted(strong) == (8, 16, 32, 64)
+
+
+def test_a_report_without_ranks_says_what_they_need(manufactured):
+    alone = evidence(r for r in manufactured.records if r.ranks == 1)
+    page = compose(alone)
+    assert "ranks" not in [s.name for s in page.sections]
+    (absent,) = (s for s in page.sections if s.name == "absent")
+    assert any("ranks = [1, 2]" in point for point in absent.points)
+    assert "ranks" in [s.name for s in compose(manufactured).sections]

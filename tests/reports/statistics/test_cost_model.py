@@ -1,0 +1,108 @@
+"""The model of a solve on ranks, against times that were made by known parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reports.statistics.cost_model import Communication, cost_model, growth
+
+SENT = Communication(
+    ranks=2, reductions=300, messages=120, sent=4e6,
+    reduction_seconds=5e-6, message_seconds=2e-6, seconds_per_byte=5e-10,
+)  # fmt: skip
+
+
+def sent_on(N):
+    """Send the same on more ranks: deeper trees, more neighbours."""
+    depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
+    return replace(
+        SENT, ranks=N, reduction_seconds=5e-6 * depth, messages=120 * neighbours
+    )
+
+
+def modelled(N, work=2.0, alike=0.1, slowdown=1.0, sent=SENT):
+    """Do the sum of the model by hand."""
+    depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
+    waits = 300 * 5e-6 * depth + 120 * 2e-6 * neighbours + (N > 1) * 4e6 / 2e9
+    return (slowdown if N > 1 else 1.0) * (work / N + alike) + waits
+
+
+@pytest.mark.parametrize("ranks", [(1, 2), (1, 2, 4), (1, 2, 3, 5, 8)])
+def test_known_work_is_recovered_and_predicted_beyond(ranks):
+    found = cost_model({N: [modelled(N)] * 3 for N in ranks}, {}, [sent_on(ranks[-1])])
+    assert found.work == pytest.approx(2.0)
+    assert found.alike == pytest.approx(0.1)
+    assert found.misfit < 1e-12
+    assert found.seconds(64).value == pytest.approx(modelled(64))
+    assert found.speed_up(64).value == pytest.approx(2.1 / modelled(64))
+
+
+def test_ranks_that_slow_one_another_down_are_told_by_copies():
+    times = {N: [modelled(N, slowdown=1.25)] * 3 for N in (1, 2, 4)}
+    copies = {N: [1.25 * 2.1] * 3 for N in (2, 4)}
+    found = cost_model(times, copies, [sent_on(4)])
+    assert (found.work, found.alike) == pytest.approx((2.0, 0.1))
+    assert found.slowdown == pytest.approx(1.25)
+    assert found.seconds(16).value == pytest.approx(modelled(16, slowdown=1.25))
+
+
+def test_communication_is_what_was_counted_times_what_it_takes():
+    assert SENT.seconds == pytest.approx([300 * 5e-6, 120 * 2e-6, 4e6 / 2e9])
+    assert (growth(1, 2) == 0).all()
+    assert (growth(2, 2) == 1).all()
+    # a tree of depth six, six neighbours instead of one, and as many bytes
+    assert growth(64, 2) == pytest.approx([6, 6, 1])
+
+
+def test_a_network_whose_speed_is_not_known_widens_the_band():
+    slow = replace(SENT, reduction_seconds=5e-3)
+    times = {N: [modelled(N)] * 4 for N in (1, 2)}
+    at = cost_model(times, {}, [SENT, slow, SENT, slow]).seconds(16)
+    assert at.high > 1.2 * at.low
+
+
+def test_what_was_sent_on_other_ranks_is_no_basis():
+    with pytest.raises(ValueError, match="what 4 ranks have sent"):
+        cost_model({N: [modelled(N)] for N in (1, 2, 4)}, {}, [SENT])
+
+
+def test_better_than_shared_work_is_never_negative_work():
+    faster = cost_model({1: [1.0] * 2, 2: [0.3] * 2}, {}, [SENT])  # super-linear
+    assert faster.alike == 0
+    slower = cost_model({1: [1.0] * 2, 2: [3.0] * 2}, {}, [SENT])
+    assert slower.work == 0
+    assert slower.speed_up(16).value < 1
+
+
+def test_the_band_of_equal_times_holds_the_fit_and_of_noisy_ones_the_truth():
+    rng = np.random.default_rng(3)
+    held = 0
+    for _ in range(100):
+        times = {N: modelled(N) * rng.lognormal(0, 0.02, 5) for N in (1, 2, 4)}
+        at = cost_model(times, {}, [sent_on(4)]).seconds(16)
+        assert at.low <= at.value <= at.high
+        held += at.low <= modelled(16) <= at.high
+    assert held >= 85  # 95 % of a hundred
+
+
+def test_one_run_each_has_no_band():
+    found = cost_model({1: [2.0], 2: [1.2]}, {}, [SENT]).seconds(8)
+    assert found.low == found.value == found.high
+    assert found.samples == 1
+
+
+def test_half_of_the_ranks_are_lost_where_what_is_alike_takes_as_long():
+    free = Communication(
+        ranks=2, reductions=0, messages=0, sent=0, reduction_seconds=1e-6,
+        message_seconds=1e-6, seconds_per_byte=1e-9,
+    )  # fmt: skip
+    found = cost_model({1: [1.1] * 2, 2: [0.6] * 2}, {}, [free])  # W = 1, C = 0.1
+    # speed-up 1.1/(1/N + 0.1) ≥ N/2 up to N = 12
+    assert found.ranks_at(0.5) == 8
+
+
+@pytest.mark.parametrize("ranks", [(1,), (2, 4), ()])
+def test_it_takes_one_rank_and_several(ranks):
+    with pytest.raises(ValueError, match="one rank and on several"):
+        cost_model({N: [1.0] for N in ranks}, {}, [SENT])

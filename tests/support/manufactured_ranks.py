@@ -1,0 +1,118 @@
+"""Records of solves on ranks whose every time is made by the model of their cost.
+
+    python -m tests.support.manufactured_ranks DIR [SCATTER]
+
+writes a result folder of them.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from harness import Record, Verdict
+
+WORK, ALIKE = 4e-6, 0.02  #: s for a dof, and of each rank
+SLOWDOWN = 1.25  #: of ranks by one another
+REDUCTIONS, MESSAGES, BYTES = 300, 100, 2e6
+REDUCTION, MESSAGE, BYTE = 5e-6, 3e-6, 5e-10  #: s
+PREPARED = 2e-6  #: s for a dof, of which ranks share all
+SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}  #: parts
+
+
+def sent_seconds(ranks: int) -> float:
+    """Add up what messages take; a tree of ranks, and at most six neighbours."""
+    if ranks == 1:
+        return 0.0
+    tree, neighbours = int(np.ceil(np.log2(ranks))), min(ranks - 1, 6)
+    return (
+        tree * REDUCTIONS * REDUCTION + neighbours * MESSAGES * MESSAGE + BYTES * BYTE
+    )
+
+
+def solve_seconds(dofs: int, ranks: int) -> float:
+    """Give the time of a solve on ranks."""
+    slow = SLOWDOWN if ranks > 1 else 1.0
+    return slow * (WORK * dofs / ranks + ALIKE) + sent_seconds(ranks)
+
+
+def copies_seconds(dofs: int) -> float:
+    """Give the time of as many solves at once as there are ranks, whatever these."""
+    return SLOWDOWN * (WORK * dofs + ALIKE)
+
+
+def rank_records(
+    sizes: Sequence[int] = (50_000, 100_000, 200_000),
+    ranks: Sequence[int] = (1, 2, 4),
+    repeats: int = 3,
+    scatter: float = 0.0,
+) -> Iterator[Record]:
+    """Yield the records of one solver on cases of these dofs, on ranks and copied.
+
+    scatter : standard deviation of the logarithms of times
+    """
+    random = np.random.default_rng(7)
+    for dofs in sizes:
+        for repeat in range(repeats):
+            for n in ranks:
+                told = SLOWDOWN * PREPARED * dofs / n if n > 1 else PREPARED * dofs
+                times = told, solve_seconds(dofs, n)
+                label = f"smalbe ranks={n}" if n > 1 else "smalbe"
+                noisy = np.array(times) * random.lognormal(0, scatter, 2)
+                yield _record(dofs, n, repeat, label, "", noisy)
+                if n > 1:
+                    copied = SLOWDOWN * PREPARED * dofs, copies_seconds(dofs)
+                    noisy = np.array(copied) * random.lognormal(0, scatter, 2)
+                    yield _record(
+                        dofs, n, repeat, f"smalbe copies={n}", "copies", noisy
+                    )
+
+
+def _record(dofs, n, repeat, label, role, times):
+    prepare, solve = map(float, times)
+    on_ranks = n > 1 and not role
+    tree, neighbours = int(np.ceil(np.log2(n))), min(n - 1, 6)
+    counts = {"reductions": REDUCTIONS, "messages": MESSAGES * neighbours,
+              "bytes": BYTES}  # fmt: skip
+    network = {"reduction_seconds": REDUCTION * tree, "message_seconds": MESSAGE,
+               "seconds_per_byte": BYTE}  # fmt: skip
+    return Record(
+        run_id=f"{dofs:06d}{n:02d}{len(role):01d}{repeat:02d}abc",
+        case=f"membranes/S={dofs // 1000}/dual", family="membranes",
+        params={"S": dofs // 1000}, form="dual", solver=label, options={}, tol=1e-6,
+        repeat=repeat, block=repeat, session="one", verdict=Verdict.VERIFIED,
+        claimed="solved", iterations=20, counts={"P_products": 24, "cg": 14},
+        sizes={"variables": dofs // 50, "equalities": 10, "inequalities": 0,
+               "bounds": 10},
+        reported={"rank_peak_mib_mean": 90.0, "rank_peak_mib_largest": 99.0}
+        if on_ranks else {},
+        prepare_seconds=prepare, solve_seconds=solve, total_seconds=prepare + solve,
+        peak_mib=100.0 * n, primal=1e-8, dual=1e-8, complementarity=1e-8, gap=1e-8,
+        objective=-1.0, threads=1, cpu=0, ranks=n, role=role,
+        rank_seconds={name: (part * solve, 1.1 * part * solve)
+                      for name, part in SPENT.items()} if on_ranks else {},
+        rank_counts={name: (c, c) for name, c in counts.items()} if on_ranks else {},
+        rank_network={name: (c, c) for name, c in network.items()} if on_ranks else {},
+        quantities={"dofs": dofs, "equality_rows": 10, "contact_rows": 10,
+                    "subdomains": 64},
+        environment="8c2f9a56e00f",
+        started=f"2026-11-22T06:{repeat:02d}:00.000+00:00",
+    )  # fmt: skip
+
+
+def write(folder: Path, scatter: float = 0.02) -> Path:
+    """Write journal, environment and suite; return the folder."""
+    journal = folder / "journal" / "ranks.jsonl"
+    journal.parent.mkdir(parents=True, exist_ok=True)
+    records = rank_records(ranks=(1, 2, 4, 8), repeats=5, scatter=scatter)
+    journal.write_text("".join(r.to_json() + "\n" for r in records))
+    machine = {"cpu": "a processor", "usable_cores": 4, "memory_mib": 8192}
+    (folder / "environment.json").write_text(json.dumps({"machine": machine}))
+    (folder / "suite.toml").write_text('name = "manufactured"\nrepeats = 5\n')
+    return folder
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]), *map(float, sys.argv[2:]))
