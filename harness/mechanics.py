@@ -67,6 +67,9 @@ class Substructures(Protocol):
     def weight(self) -> Vector:
         """Relative stiffness (N,) of the copies, one for all components of a node."""
 
+    def diagonal(self, at: NDArray[np.int64]) -> Vector:
+        """Return the diagonal of K at components `at` (k,) of the whole."""
+
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,), in its precision."""
 

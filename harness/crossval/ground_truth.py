@@ -114,7 +114,8 @@ def _best_certified(
     c, g = min(found, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
         u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
-        states=suggested(mechanics, c.u, c.multipliers), norm=c.norm, bound=c.bound,
+        states=suggested(mechanics.exact, c.u, c.multipliers),
+        norm=c.norm, bound=c.bound,
     )  # fmt: skip
     return point, _who(g)
 

@@ -17,8 +17,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    runtime_checkable,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +38,9 @@ from harness.solution import Solution
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 FEW = 64  #: numbers that are added in the order of the ranks
 
@@ -198,6 +210,24 @@ def inner_products(
     return (*sums.tolist(), *found[:, len(products) :].min(axis=0).tolist())
 
 
+def on_slices(function: Callable[P, R]) -> Callable[P, R]:
+    """Have what acts component by component act on slices: one pass, wrapped once.
+
+    function : takes vectors (n,), and gives one or a tuple of them
+    """
+
+    @wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        ranks = next((a.ranks for a in args if isinstance(a, DistributedVector)), None)
+        if ranks is None:
+            return function(*args, **kwargs)
+        plain: Any = [_slice(a) for a in args]
+        found: R = _again(ranks, function(*plain, **kwargs))
+        return found
+
+    return wrapped
+
+
 def _slice(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, DistributedVector) else value
 
@@ -283,6 +313,9 @@ class Emitted(NamedTuple):
     equality_rows: int  #: of the whole
     #: puts this rank's operator together, anew each time: called by all ranks
     share: Callable[[], Share]
+    #: of this rank's slice of a solution, what `harness.verify.over_ranks` takes to
+    #: certify it; None where that needs the whole
+    answer: Callable[[Solution], Any] | None = None
 
 
 #: has all ranks emit a case, family, params and form; None where that is not built
@@ -318,4 +351,6 @@ _REDUCTIONS: Mapping[np.ufunc, Callable[[Ranks, Any], Any]] = {
     np.logical_or: lambda ranks, part: bool(ranks.extreme(part, np.max)),
     np.logical_and: lambda ranks, part: bool(ranks.extreme(part, np.min)),
 }
-_COMPONENTWISE = frozenset({np.where, np.clip, np.zeros_like, np.empty_like, np.copy})
+_COMPONENTWISE = frozenset(
+    {np.where, np.clip, np.zeros_like, np.empty_like, np.copy, np.broadcast_to}
+)

@@ -76,26 +76,20 @@ def measured(
         was not started or was killed before its solve, a full disk, a lost file.
 
     """
-    asked = {
-        "family": record.family,
-        "params": dict(record.params),
-        "form": record.form,
-    }
-    emitted = {"case": asked} if record.ranks > 1 else {}
-    limited = {} if isinf(memory_limit) else {"memory_limit": memory_limit}
+    request = {**request, "tol": record.asked_tol}
+    if record.ranks > 1:  # these may emit the QP themselves
+        request["case"] = {
+            "family": record.family, "params": dict(record.params), "form": record.form
+        }  # fmt: skip
+    if not isinf(memory_limit):
+        request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
     out = Path(request["out"])
     returned = out.with_name(f"{out.name}.returned")
     try:
         _clear(out, returned)
         reply = worker.ask(
-            {
-                **request,
-                **emitted,
-                **limited,
-                "out": str(returned),
-                "tol": record.asked_tol,
-            },
+            {**request, "out": str(returned)},
             time_limit=time_limit,
             memory_limit=memory_limit,
         )

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mechanics import Extended, Mechanics, Real
+from harness.mechanics import Exact, Extended, Mechanics, Real
 from harness.verify.admissible import closing
 
 EXCHANGES = 60  #: of active sets
@@ -60,13 +60,12 @@ def unconstrained_guess(mechanics: Mechanics) -> States:
     return np.where(open_ & exact.contact, LOWER, CLOSED).astype(np.int8)
 
 
-def suggested(mechanics: Mechanics, u: Extended, multipliers: Extended) -> States:
+def suggested(exact: Exact, u: Extended, multipliers: Extended) -> States:
     """Guess from a pair which rows are closed: λ + v/D within its bounds, v = Bu − c.
 
     D is the compliance of the row; the guess is that of a primal-dual active set
     method.
     """
-    exact = mechanics.exact
     room = multipliers - exact.lower, exact.upper - multipliers
     return predicted(room, exact.loose, exact.motion(u))
 
@@ -85,9 +84,8 @@ def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:
     return np.where(below, LOWER, np.where(above, UPPER, CLOSED)).astype(np.int8)
 
 
-def at_bounds(mechanics: Mechanics, states: States, multipliers: Extended) -> Extended:
+def at_bounds(exact: Exact, states: States, multipliers: Extended) -> Extended:
     """Set the multipliers of the rows that are not closed to the bounds they are at."""
-    exact = mechanics.exact
     upper = np.where(states == UPPER, exact.upper, multipliers)
     return np.asarray(np.where(states == LOWER, exact.lower, upper))
 
@@ -118,7 +116,7 @@ def exchanged(
         states = np.where(below, LOWER, np.where(above, UPPER, states))
         states = np.where(closes, CLOSED, states).astype(np.int8)
     within = np.clip(lam, exact.lower, exact.upper)
-    return u, at_bounds(mechanics, states, within), states
+    return u, at_bounds(exact, states, within), states
 
 
 def _given(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
@@ -126,7 +124,7 @@ def _given(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
     exact, motions = mechanics.exact, mechanics.motions
     R, active = motions.felt, states == CLOSED
     close = closing(mechanics, active)
-    lam = at_bounds(mechanics, states, np.zeros(exact.c.size, dtype=Real))
+    lam = at_bounds(exact, states, np.zeros(exact.c.size, dtype=Real))
     alpha = np.zeros(R.shape[1], dtype=Real)
     for _ in range(REFINEMENTS):
         force = exact.f - exact.B.T @ lam

@@ -23,7 +23,7 @@ from scipy.sparse import (
 )
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from harness.mechanics import UNFELT, Extended, Mechanics, Real, felt_first
+from harness.mechanics import UNFELT, Exact, Extended, Mechanics, Real, felt_first
 from harness.qp import Vector
 
 ROUNDS = 20  #: of growing the set of rows
@@ -54,10 +54,15 @@ def admissible(
         rows = _Rows(exact.B, exact.c, exact.contact)
         found = _inside(rows, u, closed, partial(_nearest, mechanics))
         return None if found is None else found.u
-    found, at = _inside_at_rows(mechanics, u, closed)
+    at = np.unique(mechanics.rows.indices)
+    softness = 1 / mechanics.primal.P.diagonal()
+    softness[exact.held] = 0
+    R = csr_array(moving.felt)[at].toarray()
+    touched = exact._replace(B=csr_array(exact.B[:, at]))
+    found = inside_at_rows(touched, R.astype(np.float64), softness[at], u[at], closed)
     if found is None:
         return None
-    whole = u + moving.felt @ found.u[at.size :] if moving.felt.shape[1] else u.copy()
+    whole = u + moving.felt @ found.u[at.size :] if R.size else u.copy()
     if found.theta != 1:
         whole *= found.theta
     whole[at] = found.u[: at.size]
@@ -72,7 +77,7 @@ class _Rows(NamedTuple):
     contact: NDArray[np.bool_]  #: (m,)
 
 
-class _Inside(NamedTuple):
+class Inside(NamedTuple):
     """A displacement that no row excludes."""
 
     u: Extended
@@ -82,7 +87,7 @@ class _Inside(NamedTuple):
 def _inside(
     rows: _Rows, u: Extended, closed: NDArray[np.bool_],
     nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
-) -> _Inside | None:  # fmt: skip
+) -> Inside | None:  # fmt: skip
     """Move u inside, with equality on V.
 
     V are the closed rows, the violated ones, and those that get violated meanwhile. It
@@ -102,21 +107,21 @@ def _inside(
         inside = _EPS * (reach + 16 * np.abs(c))
         wanted = held | closed | (contact & (gap < 0))
         if not wanted.any():
-            return _Inside(u)
+            return Inside(u)
         if (wanted != held).any():
             held = wanted
             step = nearest(held)
         elif (gap[contact | held] >= 0).all() and (gap[held] <= 4 * inside[held]).all():
-            return _Inside(moved)
+            return Inside(moved)
         assert step is not None
         moved = moved + step((inside - gap)[held].astype(np.float64))
         if not np.isfinite(moved).all():
             return _shrunk(rows, u)
     gap = (c - B @ moved)[contact]
-    return _Inside(moved) if (gap >= 0).all() else _shrunk(rows, u)
+    return Inside(moved) if (gap >= 0).all() else _shrunk(rows, u)
 
 
-def _shrunk(rows: _Rows, u: Extended) -> _Inside | None:
+def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
     """Return θu with the largest θ that is admissible for sure."""
     B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
@@ -126,9 +131,9 @@ def _shrunk(rows: _Rows, u: Extended) -> _Inside | None:
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
     for _ in range(8):  # the product may be rounded outwards
         if not (B @ (theta * u) > c).any():
-            return _Inside(np.asarray(theta * u), theta)
+            return Inside(np.asarray(theta * u), theta)
         theta = theta * (1 - 8 * _EPS)
-    return _Inside(np.zeros_like(u), Real(0))
+    return Inside(np.zeros_like(u), Real(0))
 
 
 def _nearest(
@@ -149,31 +154,29 @@ def _nearest(
     return step
 
 
-def _inside_at_rows(
-    mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
-) -> tuple[_Inside | None, NDArray[np.int64]]:
-    """Move only what rows touch inside: components (w,), then coefficients of R.
+def inside_at_rows(
+    exact: Exact, R: NDArray[np.float64], softness: Vector, u: Extended,
+    closed: NDArray[np.bool_],
+) -> Inside | None:  # fmt: skip
+    """Move only what rows touch inside, as `_inside` does.
+
+    Parameters
+    ----------
+    exact : B has columns (w,) of what rows touch only
+    R : (w, p) rigid motions that contact feels there; they cost nothing
+    softness : (w,) 1/Kᵢᵢ, zero where a support holds
+    u : (w,)
 
     Returns
     -------
-    u at the components and how far rigid motions that contact feels have moved all, and
-    (w,) which components these are
+    u (w + p,) there and how far the motions have moved all
 
     """
-    exact = mechanics.exact
-    at = np.unique(mechanics.rows.indices).astype(np.int64)
-    R = csr_array(mechanics.motions.felt)[at].toarray()
     none = csr_array((exact.c.size, R.shape[1]))
-    rows = _Rows(
-        csr_array(hstack([exact.B[:, at], none.astype(Real)])), exact.c, exact.contact
-    )
-    softness = 1 / mechanics.primal.P.diagonal()
-    softness[exact.held] = 0
-    nearest = partial(
-        _nearest_at_rows, mechanics.rows[:, at], R.astype(np.float64), softness[at]
-    )
-    start = np.concatenate([u[at], np.zeros(R.shape[1], dtype=Real)])
-    return _inside(rows, start, closed, nearest), at
+    B = csr_array(hstack([exact.B, none.astype(Real)]))
+    nearest = partial(_nearest_at_rows, exact.B.astype(np.float64), R, softness)
+    start = np.concatenate([u, np.zeros(R.shape[1], dtype=Real)])
+    return _inside(_Rows(B, exact.c, exact.contact), start, closed, nearest)
 
 
 def _nearest_at_rows(

@@ -53,7 +53,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mechanics import Extended, Mechanics, Real
+from harness.mechanics import Exact, Extended, Mechanics, Real
 from harness.qp import Vector
 from harness.solution import Solution
 from harness.verify.active_set_refinement import (
@@ -71,7 +71,7 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import neighbour
+from harness.verify.substructured import Alone, moved_together, neighbour, residual
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -193,8 +193,8 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    states = suggested(mechanics, u, multipliers)
-    tidied = at_bounds(mechanics, states, multipliers), states == CLOSED
+    states = suggested(exact, u, multipliers)
+    tidied = at_bounds(exact, states, multipliers), states == CLOSED
     pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
     if mechanics.tear is not None:
         pairs.reverse()  # of large problems what mostly is enough comes first
@@ -202,7 +202,7 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     for pair in pairs:
         found = _proved(mechanics, s.x, u, *pair)
         yield found
-        if _sharp(found):
+        if is_sharp(found):
             return
         proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
     exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
@@ -220,7 +220,7 @@ def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
         return str(e)
 
 
-def _sharp(found: Certificate | str) -> bool:
+def is_sharp(found: Certificate | str) -> bool:
     """Whether another pair would not prove much more."""
     return isinstance(found, Certificate) and (
         found.work <= NEARLY * found.distance**2 or found.bound <= GOOD
@@ -260,7 +260,8 @@ def proof(
     )
     middle = (feasible + at_rest) * Real(0.5)
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, off=feasible - at_rest,
+        exact, mechanics.kernel.shape[1] > 0,
+        u=feasible, multipliers=lam, off=feasible - at_rest,
         norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
         apart=apart, left=left, works=works, rounding=rounding,
         from_middle=_length(mechanics, claimed - middle, held),
@@ -269,10 +270,9 @@ def proof(
 
 
 def _certificate(
-    mechanics: Mechanics, *, u: Extended, multipliers: Extended,
-    off: Vector | Extended,
-    norms: list[float], apart: float, left: float, works: Extended, rounding: float,
-    from_middle: float, moved: float,
+    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended,
+    off: Vector | Extended, norms: list[float], apart: float, left: float,
+    works: Extended, rounding: float, from_middle: float, moved: float,
 ) -> Certificate:  # fmt: skip
     """Put the terms of (2) and (3) together.
 
@@ -296,10 +296,10 @@ def _certificate(
     pair = np.sqrt(2 * gap)
     found = Certificate(
         u=u, multipliers=multipliers, off=off, norm=norms[0],
-        distance=total, work=work, sliding=float(works[~mechanics.exact.contact].sum()),
+        distance=total, work=work, sliding=float(works[~exact.contact].sum()),
         rounding=rounding, claimed=from_middle + float(around),
         least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
-        moved=moved, seminorm=mechanics.kernel.shape[1] > 0,
+        moved=moved, seminorm=seminorm,
     )  # fmt: skip
     if not np.isfinite(found.error):
         raise UncertifiableError("the answer is too large for arithmetic")
@@ -323,25 +323,54 @@ def _substructured_proof(
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
     lam = balanced(mechanics, multipliers, feasible)
-    near = neighbour(mechanics, feasible, lam)
+    rho, square = residual(mechanics, feasible, lam)
+    near = neighbour(
+        mechanics.substructures, exact.held, rho.astype(np.float64),
+        moved_together(mechanics), Alone(),
+    )  # fmt: skip
+    force = mechanics.substructures.spread.T @ near.Kd
     moved = mechanics.still(claimed - feasible).astype(np.float64)
-    square, apart = near.square, float(near.d @ near.Kd)
-    across = float(mechanics.still(feasible) @ near.force)
-    shift = float(moved @ (mechanics.primal.P @ moved))
+    return torn_certificate(
+        exact, mechanics.kernel.shape[1] > 0, u=feasible, multipliers=lam, off=near.d,
+        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
+        energies=Energies(
+            square, float(mechanics.still(feasible) @ force), float(near.d @ near.Kd),
+            float(moved @ (mechanics.primal.P @ moved)), float(moved @ force),
+            near.left,
+        ),
+    )  # fmt: skip
+
+
+class Energies(NamedTuple):
+    """Products in K_T of û, of d = Tû − u_λ, and of u − û from û to the answer."""
+
+    u_u: float
+    u_d: float
+    d_d: float
+    moved_moved: float
+    moved_d: float
+    left: float  #: of what is left of d, with itself
+
+
+def torn_certificate(
+    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended, off: Vector,
+    works: Extended, energies: Energies,
+) -> Certificate:  # fmt: skip
+    """Put the terms of (1) and (3) together, of u_λ = Tû − d."""
+    e = energies
 
     def length(square: float) -> float:
         return float(np.sqrt(max(square, 0.0)))
 
     return _certificate(
-        mechanics, u=feasible, multipliers=lam, off=near.d,
+        exact, seminorm, u=u, multipliers=multipliers, off=off, works=works,
         norms=[
-            length(square), length(square - 2 * across + apart),
-            length(square - across + 0.25 * apart),
+            length(e.u_u), length(e.u_u - 2 * e.u_d + e.d_d),
+            length(e.u_u - e.u_d + 0.25 * e.d_d),
         ],
-        apart=length(apart), left=near.left,
-        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
-        rounding=0.0, moved=length(shift),
-        from_middle=length(shift + float(moved @ near.force) + 0.25 * apart),
+        apart=length(e.d_d), left=length(e.left), rounding=0.0,
+        from_middle=length(e.moved_moved + e.moved_d + 0.25 * e.d_d),
+        moved=length(e.moved_moved),
     )  # fmt: skip
 
 

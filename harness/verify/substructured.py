@@ -36,14 +36,15 @@ can hold; along these λ̂ balances the load, see `harness.verify.admissible.bal
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from scipy.sparse.linalg import splu
 
-from harness.mechanics import Extended, Mechanics
+from harness.mechanics import Extended, Mechanics, Substructures
 from harness.qp import Vector
 from harness.verify.products import times_columns
 
@@ -51,61 +52,114 @@ from harness.verify.products import times_columns
 class Neighbour(NamedTuple):
     """The u_λ near a displacement û, by its distance d = Tû − u_λ."""
 
-    square: float  #: ‖û‖²
     d: Vector  #: (N,) as far as it was solved for
     Kd: Vector  #: (N,) K_T d
-    left: float  #: energy norm of the rest of d
-    force: Vector  #: (n,) TᵀK_T d, so that (Tu)ᵀK_T d = uᵀforce
+    left: float  #: square of the energy norm of the rest of d, in these subdomains
 
 
-def neighbour(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Neighbour:
-    """Find u_λ from an admissible û (n,) and λ̂ (m,)."""
-    exact, parts = mechanics.exact, mechanics.substructures
-    still = mechanics.still(u)
+class Among(Protocol):
+    """How what some subdomains have is added to what others have elsewhere.
+
+    Components are those that these subdomains have copies of, (n,); coarse unknowns are
+    those of all subdomains, (r,).
+    """
+
+    def completed(self, v: Any, at: Any = None) -> Any:
+        """Add what is elsewhere of the components `at` (t,), or of all (n,)."""
+
+    def gathered(self, alpha: Vector) -> Vector:
+        """Put coefficients of own rigid motions together with all others: (r,)."""
+
+    def own(self, alpha: Vector) -> Vector:
+        """Take the coefficients of own rigid motions out of all (r,)."""
+
+    def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
+        """Return  M − Sᵀ diag(scale) S  (r, r), with M and S added up over all.
+
+        S : (t, own) its rows are of the components `at`
+        """
+
+
+class Alone:
+    """All subdomains are here."""
+
+    def completed(self, v: Any, at: Any = None) -> Any:
+        """Return v: nothing is elsewhere."""
+        return v
+
+    def gathered(self, alpha: Vector) -> Vector:
+        """Return all coefficients."""
+        return alpha
+
+    def own(self, alpha: Vector) -> Vector:
+        """Return all coefficients."""
+        return alpha
+
+    def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
+        """Return  M − Sᵀ diag(scale) S."""
+        return csr_array(M - S.T @ scaled_rows(S, scale))
+
+
+def residual(mechanics: Mechanics, u: Extended, multipliers: Extended) -> Any:
+    """Return ρ (n,) of an admissible û and λ̂, extended, and ‖û‖²."""
     K = csc_array(mechanics.primal.P)
-    residual = times_columns(K.data, K.indices, K.indptr, still, u.size)
-    square = float(still @ residual)
-    residual += mechanics.primal.q
+    still = mechanics.still(u)
+    found = times_columns(K.data, K.indices, K.indptr, still, u.size)
+    square = float(still @ found)
+    found += mechanics.primal.q
     at = np.unique(mechanics.rows.indices)
-    residual[at] += exact.B[:, at].T @ multipliers
-    residual[exact.held] = 0
-    b = _shared(mechanics, residual.astype(np.float64))
+    found[at] += mechanics.exact.B[:, at].T @ multipliers
+    found[mechanics.exact.held] = 0
+    return found, square
+
+
+def neighbour(
+    parts: Substructures, held: NDArray[np.int64], rho: Vector, loose: Any,
+    among: Among,
+) -> Neighbour:  # fmt: skip
+    """Find u_λ near û from the residual ρ (n,) on the components that nothing holds.
+
+    held : components that supports hold
+    loose : (r, q) coefficients of R of the motions of the whole that no support holds
+    """
+    b = _shared(parts, held, rho, loose, among)
     d = parts.solve(b)
     Kd = parts.product(d)
     b -= Kd
-    left = float(np.sqrt(abs(float(b @ parts.solve(b)))))
-    return Neighbour(square, d, Kd, left, parts.spread.T @ Kd)
+    return Neighbour(d, Kd, abs(float(b @ parts.solve(b))))
 
 
-def _shared(mechanics: Mechanics, residual: Vector) -> Vector:
+def _shared(
+    parts: Substructures, held: NDArray[np.int64], rho: Vector, loose: Any,
+    among: Among,
+) -> Vector:  # fmt: skip
     """Share ρ (n,) among the subdomains, balanced in each: b (N,).
 
     Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
-    parts, held = mechanics.substructures, mechanics.exact.held
     squares = csr_array(parts.spread)
     squares.data = squares.data**2
-    total = squares.T @ parts.weight
+    total = among.completed(squares.T @ parts.weight)
     part = parts.weight / (squares @ total)
-    jointly = squares.T @ np.ones(squares.shape[0]) > 1 + 1e-9
+    jointly = among.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
     jointly[held] = True
-    at = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
+    rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
     inverse = 1 / total
     inverse[held] = 0
-    T, R, w = csr_array(parts.spread[at]), csr_array(parts.kernel[at]), parts.weight[at]
+    T, R = csr_array(parts.spread[rows]), csr_array(parts.kernel[rows])
     touched = np.zeros(total.size, dtype=bool)
     touched[T.indices] = True
-    number = np.cumsum(touched) - 1
-    T = csr_array((T.data, number[T.indices], T.indptr), shape=(at.size, touched.sum()))
-    inverse = inverse[touched]
+    number, at = np.cumsum(touched) - 1, np.flatnonzero(touched)
+    T = csr_array((T.data, number[T.indices], T.indptr), shape=(rows.size, at.size))
+    w, inverse = parts.weight[rows], inverse[at]
     WR = scaled_rows(R, w)
     TWR = csr_array(T.T @ WR)
-    coarse = R.T @ WR - TWR.T @ scaled_rows(TWR, inverse)
-    solve = _coarse_solve(csr_array(coarse), _moved_together(mechanics))
-    b = part * (parts.spread @ residual)
+    coarse = among.coarse(csr_array(R.T @ WR), TWR, inverse, at)
+    solve = _coarse_solve(coarse, loose)
+    b = part * (parts.spread @ rho)
     for _ in range(2):  # the second time for the digits that the first one lost
-        mu = solve(parts.kernel.T @ b)
-        b[at] -= WR @ mu - w * (T @ (inverse * (TWR @ mu)))
+        mu = among.own(solve(among.gathered(parts.kernel.T @ b)))
+        b[rows] -= WR @ mu - w * (T @ (inverse * among.completed(TWR @ mu, at)))
     return np.asarray(b)
 
 
@@ -115,7 +169,7 @@ def scaled_rows(M: csr_array, scale: Vector) -> csr_array:
     return csr_array((data, M.indices, M.indptr), shape=M.shape)
 
 
-def _moved_together(mechanics: Mechanics) -> Any:
+def moved_together(mechanics: Mechanics) -> Any:
     """Return the coefficients (r, q) of R of the motions that no support holds."""
     parts, kernel = mechanics.substructures, mechanics.kernel
     return np.asarray((parts.kernel.T @ (parts.spread @ kernel)).toarray(), dtype=float)

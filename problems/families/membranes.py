@@ -12,6 +12,7 @@ from problems.ranges import GLUES, at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,17 @@ class Membranes(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
+
+    def emitted(
+        self, form: str, params: Mapping[str, Value], ranks: Ranks
+    ) -> Emitted | None:
+        """Have each rank make its share of the dual."""
+        if form != "dual":
+            return None
+        from problems.feti.emission import emitted
+        from problems.models.membranes import structured_problem
+
+        return emitted(structured_problem(params), ranks)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

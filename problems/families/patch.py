@@ -18,6 +18,7 @@ from problems.ranges import (
     at_least,
     deformed,
     doubled,
+    emitted_on_ranks,
     fits,
     one_of,
     positive,
@@ -27,6 +28,7 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,17 @@ class ContactPatch(Family):
                 "expected friction=tresca"
             )
         return {**params, **doubled(params, "lower", "upper")}
+
+    def emitted(
+        self, form: str, params: Mapping[str, Value], ranks: Ranks
+    ) -> Emitted | None:
+        """Have each rank make its share of the dual."""
+        if form != "dual" or not emitted_on_ranks(params):
+            return None
+        from problems.feti.emission import emitted
+        from problems.models.patch import structured_problem
+
+        return emitted(structured_problem(params), ranks)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

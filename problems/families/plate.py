@@ -12,6 +12,7 @@ from problems.ranges import GLUES, PLANES, at_least, doubled, fits, one_of, posi
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,17 @@ class Plate(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved, in the same subdomains."""
         return {**params, **doubled(params, "n", "ny")}
+
+    def emitted(
+        self, form: str, params: Mapping[str, Value], ranks: Ranks
+    ) -> Emitted | None:
+        """Have each rank make its share of the dual."""
+        if form != "dual" or params["supports"] == "eliminated":
+            return None
+        from problems.feti.emission import emitted
+        from problems.models.plate import structured_problem
+
+        return emitted(structured_problem(params), ranks)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -87,6 +87,11 @@ class StructuredGrid:
             points = self.block(last if at == 1 else slice(1), all_)
         return np.asarray(points if at < 2 else points[::-1])
 
+    def prefixed(self, prefix: str) -> StructuredGrid:
+        """Put `prefix` before the names of the sides."""
+        first, second, third, fourth = (prefix + name for name in self.names)
+        return replace(self, names=(first, second, third, fourth))
+
     def mesh(self) -> Mesh:
         """Connect all points."""
         return _structured(self.place(self.columns, self.rows), self.names)

@@ -19,7 +19,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,8 @@ from problems.feti.distributed import (
 )
 from problems.feti.gluing import GLUE
 from problems.feti.operators import DualOperator, explicit_kinds
-from problems.feti.structured import Layout, Places
+from problems.feti.own_bodies import answers
+from problems.feti.structured import Integers, Layout, Places, shape_factors
 from problems.feti.tearing import Part, classify, images
 from problems.feti.torn import Kind, Subdomains
 
@@ -62,9 +63,11 @@ class StructuredBodies:
 
     layout: Layout  #: the grids of the bodies, and their subdomains, S in all
     components: int  #: of a node: 2 of displacements, 1 of heights
-    material: NDArray[np.int64]  #: (S,) of each subdomain
+    material: Integers  #: (S,) of each subdomain
     kind: Callable[[Part], Kind]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
+    #: (bodies,) as of `problems.feti.structured.shape_factors`; None for squares
+    share: Vector | None = None
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
     contact: Contact
@@ -194,6 +197,20 @@ class OwnSubdomains:
         return number, R[at] * value[:, None]
 
     @cached_property
+    def spacings(self) -> NDArray[np.float64]:
+        """(M_p, 2) sides of the cells around each torn node."""
+        return self.problem.layout.spacings(self.number)
+
+    def stiffness(self, node: Nodes, *, held: bool) -> Vector:
+        """Return what rows of supports, or gluing, at torn nodes (k,) are scaled by."""
+        at = Places(*(x[node] for x in self.nodes.at))
+        E, share = self.problem.E[at.body], self.problem.share
+        if share is None:
+            return E
+        lines = self.problem.layout.lines(at, ends=held)
+        return E * shape_factors(self.spacings[node], lines, share[at.body])
+
+    @cached_property
     def rows(self) -> _Rows:
         """Its rows of B."""
         return _rows(self)
@@ -202,9 +219,9 @@ class OwnSubdomains:
 class _OwnNodes(NamedTuple):
     """As `problems.feti.structured.TornNodes`, with what is known of the whole."""
 
-    block: NDArray[np.int64]
+    block: Integers
     at: Places
-    copy: NDArray[np.int64]
+    copy: Integers
     start: NDArray[np.int64]
     number: Nodes  #: (M,) of the whole
     times: NDArray[np.int64]  #: (M,) copies of it on all ranks together
@@ -253,7 +270,8 @@ def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    return Emitted(total, b.size, share)
+    answer = answers(own, at, _contact_scale(problem))
+    return Emitted(total, b.size, share, answer)
 
 
 def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
@@ -319,17 +337,41 @@ def _rows(own: OwnSubdomains) -> _Rows:
 
 def _supports(own: OwnSubdomains) -> Entries:
     """One row for each copy of a component that is held, the last copy first."""
-    problem, nodes, d = own.problem, own.nodes, own.problem.components
-    order = np.argsort(problem.held)
-    times = problem.layout.times(problem.layout.places(problem.held // d))
-    first = np.cumsum(times) - times
-    unknown = np.flatnonzero(np.isin(own.component, problem.held))
-    at = order[np.searchsorted(problem.held[order], own.component[unknown])]
-    node, k = np.divmod(unknown, d)
-    row = first[at] + nodes.times[node] - 1 - nodes.copy[node]
-    entries = _turned(own, row, node, k, np.sqrt(problem.E[nodes.at.body[node]]))
+    problem, d = own.problem, own.problem.components
+    node, k = np.divmod(problem.held, d)
+    at = problem.layout.places(node)
+    times = problem.layout.times(at)
+    copies = _own_copies(own, at)
+    of = copies.node[copies.mine]
+    row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
+    value = np.sqrt(own.stiffness(copies.torn, held=True))
     reached = np.stack([row, np.full(row.size, own.ranks.rank)], axis=1)
-    return Entries(*entries, reached)
+    return Entries(*_turned(own, row, copies.torn, k[of], value), reached)
+
+
+class _Copies(NamedTuple):
+    """The copies of some nodes on all ranks, node by node."""
+
+    node: NDArray[np.int64]  #: (k,) place in the list of nodes
+    copy: NDArray[np.int64]  #: (k,) which one it is, from 0 on
+    rank: NDArray[np.int64]  #: (k,) that holds it
+    mine: NDArray[np.int64]  #: (l,) places of those that this rank holds
+    torn: NDArray[np.int64]  #: (l,) which of the own torn nodes they are
+
+
+def _own_copies(own: OwnSubdomains, at: Places) -> _Copies:
+    of, start = own.problem.layout, own.nodes.start
+    times = of.times(at)
+    node = np.repeat(np.arange(times.size), times)
+    copy = np.arange(node.size) - np.repeat(np.cumsum(times) - times, times)
+    every = Places(*(x[node] for x in at))
+    block = of.holder(every, copy)
+    rank = own.rank[block]
+    mine = np.flatnonzero(rank == own.ranks.rank)
+    left, low, columns, _ = of.corner(block[mine])
+    within = (every.row[mine] - low) * columns + every.column[mine] - left
+    torn = start[np.searchsorted(own.number, block[mine])] + within
+    return _Copies(node, copy, rank, mine, torn)
 
 
 def _glued(own: OwnSubdomains) -> Entries:
@@ -361,7 +403,7 @@ def _glued(own: OwnSubdomains) -> Entries:
                 value = weights[nodes.copy[node]]
                 entries = _turned(
                     own, row, node, np.full(node.size, k),
-                    np.sqrt(problem.E[nodes.at.body[node]]) * value,
+                    np.sqrt(own.stiffness(node, held=False)) * value,
                 )  # fmt: skip
                 there = ranks[mine][:, weights != 0]
                 reached = np.stack(
@@ -374,23 +416,18 @@ def _glued(own: OwnSubdomains) -> Entries:
 
 def _contact(own: OwnSubdomains) -> Entries:
     """Rows of contact and friction, which act on the average of copies."""
-    problem, of, d = own.problem, own.problem.layout, own.problem.components
+    problem, d = own.problem, own.problem.components
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
-    times = of.times(of.places(node))
-    each = np.repeat(np.arange(node.size), times)
-    copy = np.arange(each.size) - np.repeat(np.cumsum(times) - times, times)
-    block = of.holder(of.places(node[each]), copy)
-    row = _equalities(problem) + entries.row[each].astype(np.int64)
-    reached = np.stack([row, own.rank[block]], axis=1)
-    mine = np.flatnonzero(own.rank[block] == own.ranks.rank)
-    each, block = each[mine], np.searchsorted(own.number, block[mine])
-    left, low, columns, _ = of.corner(own.number[block])
-    at = of.places(node[each])
-    torn = own.nodes.start[block] + (at.row - low) * columns + at.column - left
-    value = _contact_scale(problem)[entries.row[each]] * entries.data[each]
-    turned = _turned(own, row[mine], torn, k[each], value / times[each])
-    return Entries(*turned, reached)
+    at = problem.layout.places(node)
+    copies = _own_copies(own, at)
+    row = _equalities(problem) + entries.row.astype(np.int64)
+    reached = np.stack([row[copies.node], copies.rank], axis=1)
+    share = (
+        _contact_scale(problem)[entries.row] * entries.data / problem.layout.times(at)
+    )
+    of = copies.node[copies.mine]
+    return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
 
 
 def _turned(
@@ -436,20 +473,25 @@ def _contact_scale(problem: StructuredBodies) -> Vector:
 def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
     """Return the columns of RᵀBᵀ that belong to own rows, (3S, o)."""
     ranks, rows = own.ranks, own.rows
-    entries = rows.B.tocoo()
-    coarse, value = own.resultants(entries.col, entries.data)
-    r, t = own.coarse, rows.number.size
-    places = coarse.ravel(), np.repeat(entries.row, coarse.shape[1])
-    part = coo_array(csr_array((value.ravel(), places), shape=(r, t)))
-    owner = owners(rows.number, rows.reach)[part.col]
-    told = [
-        (part.row[to], rows.number[part.col[to]], part.data[to])
-        for to in (owner == one for one in range(ranks.size))
-    ]
-    row, column, data = map(
-        np.concatenate, zip(*ranks.comm.alltoall(told), strict=True)
-    )
-    return csr_array((data, (row, np.searchsorted(mine, column))), shape=(r, mine.size))
+    B, t = rows.B, rows.number.size
+    unknown, place = np.unique(B.indices, return_inverse=True)
+    coarse, value = own.resultants(unknown, np.ones(unknown.size))
+    r, modes = own.coarse, coarse.shape[1]
+    ends = modes * np.arange(unknown.size + 1)
+    R = csr_array((value.ravel(), coarse.ravel(), ends), shape=(unknown.size, r))
+    touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
+    part = csr_array(touched @ R)
+    owner = owners(rows.number, rows.reach)
+    told: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
+    for one in set(range(ranks.size)) - {ranks.rank}:
+        theirs = np.flatnonzero(owner == one)
+        entries = coo_array(part[theirs])
+        told[one] = rows.number[theirs][entries.row], entries.col, entries.data
+    found = csr_array(part[np.flatnonzero(owner == ranks.rank)])
+    for row, column, data in filter(None, ranks.comm.alltoall(told)):
+        places = np.searchsorted(mine, row), column
+        found += csr_array((data, places), shape=found.shape)
+    return csr_array(found.T)
 
 
 def _resultants(own: OwnSubdomains) -> Vector:

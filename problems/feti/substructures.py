@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import bsr_array, csr_array
 
 from harness import Vector
 from problems.feti.torn import Kind, Torn
@@ -46,6 +46,23 @@ class LocalProblems:
             found[place] = np.repeat(trace, d)[:, None]
         return found
 
+    def diagonal(self, at: NDArray[np.int64]) -> Vector:
+        """Return the diagonal of  TᵀK_T T  at components `at` (k,)."""
+        d = self.components
+        nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
+        number = np.full(self.spread.shape[0] // d, -1)
+        number[nodes] = np.arange(nodes.size)
+        blocks = np.empty((nodes.size, d, d))
+        for kind, place in self._kinds():
+            own = number[place[::d] // d]
+            node, subdomain = np.nonzero(own >= 0)
+            blocks[own[node, subdomain]] = _nodal(kind, d)[node]
+        rows = (d * nodes[:, None] + np.arange(d)).ravel()
+        T = csr_array(self.spread[rows][:, at])
+        ends = np.arange(nodes.size + 1)
+        K = csr_array(bsr_array((blocks, ends[:-1], ends), shape=(rows.size,) * 2))
+        return np.asarray(T.multiply(K @ T).sum(axis=0))
+
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP in the precision of v; all subdomains of a kind at once."""
         return self._by_kinds(lambda kind, own: kind.K.astype(v.dtype) @ own, v)
@@ -74,3 +91,11 @@ class LocalProblems:
     def _kinds(self) -> zip[tuple[Kind, NDArray[np.int64]]]:
         """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
         return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
+
+
+def _nodal(kind: Kind, d: int) -> NDArray[np.float64]:
+    """Return the blocks of K of each node, (n_k/d, d, d)."""
+    blocks = np.empty((kind.K.shape[0] // d, d, d))
+    for i, j in np.ndindex(d, d):
+        blocks[:, i, j] = kind.K.diagonal(j - i)[min(i, j) :: d]
+    return blocks

@@ -30,9 +30,18 @@ from problems.duality.dualisation import posed
 from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
-from problems.fem.mesh import Mesh, Nodes, join, prefixed, rectangle
+from problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    StructuredGrid,
+    join,
+    joined_sides,
+    rectangle_grid,
+)
+from problems.feti.emission import Contact, StructuredBodies
 from problems.feti.gluing import glue
 from problems.feti.membrane import membrane_kind
+from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
@@ -89,13 +98,15 @@ class Membranes:
 
     @cached_property
     def _joined(self) -> tuple[Mesh, Nodes]:
-        squares = (
-            prefixed(
-                rectangle((x, 0.0), (1.0, 1.0), (self.side, self.side)), f"{name} "
-            )
+        return join(tuple(grid.mesh() for grid in self.grids))
+
+    @property
+    def grids(self) -> tuple[StructuredGrid, ...]:
+        """The squares, side by side."""
+        return tuple(
+            rectangle_grid((x, 0.0), (1.0, 1.0), (self.side,) * 2).prefixed(f"{name} ")
             for x, name in zip((0.0, 1.0), NAMES, strict=True)
         )
-        return join(tuple(squares))
 
     @property
     def mesh(self) -> Mesh:
@@ -112,18 +123,34 @@ class Membranes:
         """The primal problem: unknowns are the heights of the nodes."""
         nodes, sides = len(self.mesh.points), self.mesh.boundaries
         K = grid_stiffness((self.side, self.side))
-        loads = [
-            f * np.outer(shares(self.side, *y), shares(self.side, 0.0, 1.0)).ravel()
-            for f, y in LOADED
-        ]
         one = csr_array(eye_array(nodes, format="csr"))
-        held = one[np.sort(sides["left left"])]
-        lower, upper = (np.sort(sides[s]) for s in ("left right", "right left"))
+        held, G = one[np.sort(sides["left left"])], _touching(sides, nodes)
         return QP(
-            P=csc_array(block_diag([K, K], format="csc")), q=-np.concatenate(loads),
-            A=held, b=np.zeros(held.shape[0]),
-            G=csr_array(one[lower] - one[upper]), h=np.zeros(lower.size),
+            P=csc_array(block_diag([K, K], format="csc")),
+            q=-self.load(np.arange(nodes)),
+            A=held, b=np.zeros(held.shape[0]), G=G, h=np.zeros(G.shape[0]),
             lb=np.full(nodes, -np.inf), ub=np.full(nodes, np.inf),
+        )  # fmt: skip
+
+    def load(self, node: Nodes) -> Vector:
+        """Return the forces on some nodes (k,)."""
+        body, within = np.divmod(node, (self.side + 1) ** 2)
+        row, column = np.divmod(within, self.side + 1)
+        f = np.array([value for value, _ in LOADED])
+        heights = np.stack([shares(self.side, *y) for _, y in LOADED])
+        along = shares(self.side, 0.0, 1.0)
+        return np.asarray(f[body] * (heights[body, row] * along[column]))
+
+    def structured(self, rows: str) -> StructuredBodies:
+        """Describe the dual, glued by `rows` of `problems.feti.gluing`."""
+        layout = Layout.of(self.grids, self.n)
+        sides = joined_sides(self.grids)
+        G = _touching(sides, int(layout.node_start[-1]))
+        return StructuredBodies(
+            layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
+            kind=membrane_kind, E=np.ones(2), load=self.load, glue=rows,
+            held=np.sort(sides["left left"]),
+            contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 
     @property
@@ -165,6 +192,20 @@ class Membranes:
             "contact_force": float(s.z.sum()),
             "lowest": float(s.x.min()),
         }
+
+
+def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+    """Describe the dual, of which ranks can emit their shares."""
+    p: Any = params
+    return Membranes(p["S"], p["n"]).structured(p["glue"])
+
+
+def _touching(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
+    """Return the rows  u_1 − u_2  of nodes that face each other, (m, nodes)."""
+    pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
+    ends = 2 * np.arange(len(pairs) + 1)
+    data = np.tile([1.0, -1.0], len(pairs))
+    return csr_array((data, pairs.ravel(), ends), shape=(len(pairs), nodes))
 
 
 def shares(n: int, lower: float, upper: float) -> Vector:

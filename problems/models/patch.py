@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from harness import Case, InputError, Reference, Solution, Value
+from harness import Case, InputError, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
@@ -50,14 +50,25 @@ from problems.duality.stepping import single_load
 from problems.fem.elasticity import Material
 from problems.fem.finite_strain import cauchy_stress, strain_energy
 from problems.fem.hyperelastic import Hyperelastic, hyperelastic
-from problems.fem.mesh import Mesh, as_vectors, join, nodal_lengths, prefixed, rectangle
+from problems.fem.mesh import (
+    Nodes,
+    StructuredGrid,
+    as_vectors,
+    join,
+    joined_sides,
+    nodal_lengths,
+    rectangle_grid,
+)
 from problems.fem.stress import gauss_stress
-from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
+from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
+from problems.feti.emission import StructuredBodies
+from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 from problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 PRESSURE = 1e6  #: p, Pa
+UNITS = (LENGTH, PRESSURE * LENGTH)  #: l and F₀, m and N/m
 E_UPPER, NU = 10e6, 0.3  #: Pa
 
 
@@ -89,7 +100,8 @@ def subdivided(bodies: Bodies, params: Mapping[str, Value]) -> SubdividedBodies:
     """Cut the blocks into subdomains of at most `feti` cells a side."""
     p: Any = params
     divisions = [_divisions(p[name]) for name in ("lower", "upper")]
-    return subdivide(bodies, structured_bodies(divisions, p["feti"]))
+    layout = Layout.of(_grids(params), p["feti"])
+    return subdivide(bodies, structured_bodies(divisions, p["feti"]), layout)
 
 
 class Homogeneous(NamedTuple):
@@ -229,32 +241,59 @@ def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, An
 def model(params: Mapping[str, Value]) -> Bodies:
     """Mesh and assemble the blocks, with `lower` and `upper` elements along x."""
     p: Any = params
-    mesh, body = join((
-        prefixed(_block(0.0, p["lower"]), "lower_"),
-        prefixed(_block(HEIGHT, p["upper"]), "upper_"),
-    ))  # fmt: skip
-    sides = mesh.boundaries
+    grids = _grids(params)
+    mesh, body = join(tuple(grid.mesh() for grid in grids))
+    sides, (component, force) = mesh.boundaries, _pressure(grids)
     load = np.zeros(mesh.dofs)
-    top = sides["upper_top"]
-    load[2 * top + 1] = -PRESSURE * nodal_lengths(mesh.points[top])
-    rollers = (2 * sides["lower_left"], 2 * sides["upper_left"])
+    load[component] = force
     lower, upper = sides["lower_top"], sides["upper_bottom"]
     return assemble(
-        mesh, body, names=("lower", "upper"),
-        materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
-        plane=p["plane"], units=(LENGTH, PRESSURE * LENGTH),
-        fixed=np.concatenate([*rollers, 2 * sides["lower_bottom"] + 1]), load=load,
+        mesh, body, names=("lower", "upper"), materials=_materials(params),
+        plane=p["plane"], units=UNITS, fixed=_rollers(sides), load=load,
         pairs=(ContactPair(lower, upper) if p["slave"] == "lower"
                else ContactPair(upper, lower),),
     )  # fmt: skip
 
 
+def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+    """Describe the dual of the linear problem in subdomains."""
+    p: Any = params
+    grids = _grids(params)
+    lower, upper = (0, "lower_top"), (1, "upper_bottom")
+    return structured(
+        grids, p["feti"], materials=_materials(params), plane=p["plane"], units=UNITS,
+        fixed=_rollers(joined_sides(grids)), load=_pressure(grids),
+        pairs=[(lower, upper) if p["slave"] == "lower" else (upper, lower)],
+        method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+    )  # fmt: skip
+
+
+def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
+    lower, upper = (
+        rectangle_grid((0.0, bottom), (LENGTH, HEIGHT), _divisions(params[name]))
+        for name, bottom in (("lower", 0.0), ("upper", HEIGHT))
+    )
+    return lower.prefixed("lower_"), upper.prefixed("upper_")
+
+
+def _materials(params: Mapping[str, Any]) -> tuple[Material, Material]:
+    return Material(params["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)
+
+
+def _pressure(grids: tuple[StructuredGrid, StructuredGrid]) -> tuple[Nodes, Vector]:
+    """Return the components on the top, and the forces there, N/m."""
+    top = joined_sides(grids)["upper_top"]
+    return 2 * top + 1, -PRESSURE * nodal_lengths(grids[1].side("upper_top"))
+
+
+def _rollers(sides: Mapping[str, Nodes]) -> Nodes:
+    """Return the components that are held."""
+    left = (2 * sides["lower_left"], 2 * sides["upper_left"])
+    return np.concatenate([*left, 2 * sides["lower_bottom"] + 1])
+
+
 def _divisions(n: int) -> tuple[int, int]:
     return n, -(-n // 2)
-
-
-def _block(bottom: float, n: int) -> Mesh:
-    return rectangle((0.0, bottom), (LENGTH, HEIGHT), _divisions(n))
 
 
 def stress_error(bodies: Bodies, s: Solution) -> float:

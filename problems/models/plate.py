@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -30,10 +30,20 @@ from problems.duality.dualisation import Transformed, posed
 from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
 from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
 from problems.fem.inverse import GeneralisedInverse, regular_inverse
-from problems.fem.mesh import Mesh, as_vectors, dofs_of, nodal_lengths, rectangle
-from problems.feti.elastic import elastic_kind
+from problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    StructuredGrid,
+    as_vectors,
+    dofs_of,
+    nodal_lengths,
+    rectangle_grid,
+)
+from problems.feti.elastic import elastic_kind, forces_at
+from problems.feti.emission import Contact, StructuredBodies
 from problems.feti.gluing import glue, without_supports
 from problems.feti.spectrum import Spectrum, spectra_of_equations
+from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
@@ -148,46 +158,91 @@ class Plate:
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     """Mesh and assemble the plate of complete keys."""
     p: Any = dict(params)
-    side = (p["n"], p["ny"] or p["n"])
-    pieces = (p["Sx"], p["Sy"])
-    cells = (side[0] * pieces[0], side[1] * pieces[1])
-    size = (p["width"] or float(p["Sx"]), p["height"] or float(p["Sy"]))
-    mesh = rectangle((0.0, 0.0), size, cells)
-    subdomain = blocks(cells, side)
-    column, row = subdomain % p["Sx"], subdomain // p["Sx"]
-    material = {
-        "uniform": np.zeros_like(subdomain),
-        "checkerboard": (column + row) % 2,
-        "column": (column == 0).astype(np.int64),
-    }[p["pattern"]]
-    moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
-    materials = [Material(E, STEEL.nu) for E in moduli]
-    D = np.stack([elasticity_matrix(material, p["plane"]) for material in materials])
+    grid, side = _grid(p), _side(p)
+    mesh = grid.mesh()
+    subdomain = blocks(grid.divisions, side)
+    material = _material(p, subdomain % p["Sx"], subdomain // p["Sx"])
+    moduli, D = _stiffness(p)
     n = mesh.dofs
     one = csr_array(eye_array(n, format="csr"))
     held = dofs_of(mesh.boundaries["left"])
     primal = QP(
-        P=stiffness(mesh, D, material), q=-load(mesh, p["load"]),
+        P=stiffness(mesh, D, material), q=-load(grid, p["load"]),
         A=one[held], b=np.zeros(held.size), G=no_rows(n), h=np.zeros(0),
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
     return Plate(
-        size=size, mesh=mesh, subdomain=subdomain, material=material, moduli=moduli,
+        size=_size(p), mesh=mesh, subdomain=subdomain, material=material, moduli=moduli,
         D=D, primal=primal, glue=p["glue"], eliminated=p["supports"] == "eliminated",
     )  # fmt: skip
 
 
-def load(mesh: Mesh, kind: str) -> Vector:
+def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+    """Describe the dual of the plate, its supports being rows of B."""
+    p: Any = params
+    grid, (moduli, D) = _grid(p), _stiffness(p)
+    layout = Layout.of((grid,), _side(p))
+    column, row = (x.astype(np.int64) for x in layout.block[1:])
+    none = np.zeros(0)
+    return StructuredBodies(
+        layout=layout, components=2, E=moduli[:1], glue=p["glue"],
+        material=_material(p, column, row),
+        kind=partial(elastic_kind, D=D, E=moduli),
+        load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
+        contact=Contact(no_rows(2 * grid.nodes), none, none),
+    )  # fmt: skip
+
+
+def _size(p: Mapping[str, Any]) -> tuple[float, float]:
+    return p["width"] or float(p["Sx"]), p["height"] or float(p["Sy"])
+
+
+def _side(p: Mapping[str, Any]) -> tuple[int, int]:
+    """Return the cells along the sides of a subdomain."""
+    return p["n"], p["ny"] or p["n"]
+
+
+def _grid(p: Mapping[str, Any]) -> StructuredGrid:
+    n, ny = _side(p)
+    return rectangle_grid((0.0, 0.0), _size(p), (n * p["Sx"], ny * p["Sy"]))
+
+
+def _material(
+    p: Mapping[str, Any], column: NDArray[np.int64], row: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Choose the material by columns and rows of subdomains."""
+    patterns: dict[str, NDArray[np.int64]] = {
+        "uniform": np.zeros_like(column),
+        "checkerboard": (column + row) % 2,
+        "column": (column == 0).astype(np.int64),
+    }
+    return patterns[p["pattern"]]
+
+
+def _stiffness(p: Mapping[str, Any]) -> tuple[Vector, NDArray[np.float64]]:
+    """Return moduli (2,) and elasticity matrices (2, 3, 3), without dimension."""
+    moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
+    materials = [Material(E, STEEL.nu) for E in moduli]
+    return moduli, np.stack([elasticity_matrix(m, p["plane"]) for m in materials])
+
+
+def load(grid: StructuredGrid, kind: str) -> Vector:
     """Return nodal forces (2N,) that pull down with F₀ in all, without dimension."""
-    right = mesh.boundaries["right"]
+    component, force = _pull(grid, kind)
+    f = np.zeros(2 * grid.nodes)
+    f[component] = force
+    return f
+
+
+def _pull(grid: StructuredGrid, kind: str) -> tuple[Nodes, Vector]:
+    """Return the components that are pulled, and the forces there."""
+    right = grid.sides["right"]
     share = {
-        "point": (right == np.intersect1d(right, mesh.boundaries["top"])).astype(float),
-        "edge": nodal_lengths(mesh.points[right]),
+        "point": (right == np.intersect1d(right, grid.sides["top"])).astype(float),
+        "edge": nodal_lengths(grid.side("right")),
         "nodal": np.ones(right.size),
     }[kind]
-    f = np.zeros(mesh.dofs)
-    f[2 * right + 1] = -share / share.sum()
-    return f
+    return 2 * right + 1, -share / share.sum()
 
 
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:

@@ -1,0 +1,257 @@
+"""The certificate of torn bodies by the ranks that hold them: no process has the whole.
+
+As `harness.verify.substructured`, of bodies that supports hold, with what other ranks
+have added where a sum says so. Each rank has the components that its subdomains touch.
+Copies of a component on several ranks get the same value on all of them. The rows of
+contact and friction, which are no longer than the sides, are on every rank, and so is
+the coarse problem.
+
+K is the sum TᵀK_T T over subdomains here, since nobody has another one: what rounding
+makes of it is no part of the problem.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from harness.distributed.vectors import Ranks
+from harness.mechanics import Exact, Extended, Real, Substructures
+from harness.qp import Vector
+from harness.verify.active_set_refinement import CLOSED, at_bounds, suggested
+from harness.verify.admissible import UncertifiableError, inside_at_rows
+from harness.verify.certificate import (
+    Certificate,
+    Energies,
+    is_sharp,
+    torn_certificate,
+)
+from harness.verify.substructured import neighbour, scaled_rows
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Contact:
+    """All rows of contact, then of friction with a bound above zero; on every rank."""
+
+    rows: csr_array  #: (m, n) columns are components of the whole
+    c: Vector  #: (m,)
+    bound: Vector  #: (k,) of the last rows
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OwnBodies:
+    """What one rank has of torn bodies that their supports hold."""
+
+    ranks: Ranks
+    parts: Substructures  #: its subdomains; T has a column for each of its components
+    components: NDArray[np.int64]  #: (n,) of the whole, ascending
+    shared: NDArray[np.bool_]  #: (n,) whether other ranks have copies, too
+    coarse: NDArray[np.int64]  #: (r,) of each column of R, among those of all ranks
+    motions: int  #: of all subdomains of all ranks
+    f: Vector  #: (N,) the load of a component is the sum of those of its copies
+    held: NDArray[np.int64]  #: places in `components` of those that are prescribed
+    contact: Contact
+
+    @cached_property
+    def among(self) -> AmongRanks:
+        """How sums are completed."""
+        return AmongRanks(self)
+
+
+class AmongRanks:
+    """Adds what other ranks have; see `harness.verify.substructured.Among`."""
+
+    def __init__(self, own: OwnBodies) -> None:
+        self._own, comm = own, own.ranks.comm
+        mine = own.components[own.shared]
+        known = np.unique(np.concatenate(comm.allgather(mine)))
+        self._size = known.size
+        #: of each component, its place among all shared ones
+        self._place = np.full(own.components.size, -1)
+        self._place[own.shared] = np.searchsorted(known, mine)
+        first = np.full(known.size, comm.size)
+        first[self._place[own.shared]] = comm.rank
+        lowest = np.min(comm.allgather(first), axis=0)
+        #: whether this is the first rank that has a component
+        self.counts = np.ones(own.components.size, dtype=bool)
+        self.counts[own.shared] = lowest[self._place[own.shared]] == comm.rank
+
+    def _summed(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Add arrays in the order of the ranks: all get the same digits."""
+        parts = np.empty((self._own.ranks.size, *x.shape), dtype=x.dtype)
+        self._own.ranks.comm.Allgather(x, parts)
+        return np.asarray(parts.sum(axis=0))
+
+    def completed(self, v: Any, at: Any = None) -> Any:
+        """Add what other ranks have of the components `at` (t,), or of all (n,)."""
+        place = self._place if at is None else self._place[at]
+        here = place >= 0
+        exchanged = np.zeros(self._size, dtype=v.dtype)
+        exchanged[place[here]] = v[here]
+        found = v.copy()
+        found[here] = self._summed(exchanged)[place[here]]
+        return found
+
+    def total(self, *numbers: float) -> list[float]:
+        """Add numbers over all ranks."""
+        return [float(x) for x in self._own.ranks.total(np.array(numbers))]
+
+    def gathered(self, alpha: Vector) -> Vector:
+        """Put coefficients of own rigid motions together with those of other ranks."""
+        whole = np.zeros(self._own.motions)
+        whole[self._own.coarse] = alpha
+        return self._summed(whole)
+
+    def own(self, alpha: Vector) -> Vector:
+        """Take the coefficients of own rigid motions."""
+        return np.asarray(alpha[self._own.coarse])
+
+    def traced(self, v: NDArray[Any], at: NDArray[np.int64]) -> Any:
+        """Tell all ranks the values of v (n,) at components `at` (w,) of the whole."""
+        places, here = self.places(at)
+        counted = self.counts[places[here]]
+        found = np.zeros(at.size, dtype=v.dtype)
+        found[np.flatnonzero(here)[counted]] = v[places[here][counted]]
+        return self._summed(found)
+
+    def places(
+        self, at: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Find components of the whole (w,) among own ones, and which are there."""
+        own = self._own.components
+        places = np.minimum(np.searchsorted(own, at), own.size - 1)
+        return places, own[places] == at
+
+    def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
+        """Return  M − Sᵀ diag(scale) S,  with M and S added up over all ranks."""
+        r, comm = self._own.motions, self._own.ranks.comm
+        place = self._place[at]
+        alone, jointly = place < 0, place >= 0
+        own = csr_array(S[alone])
+        mine = coo_array(M - own.T @ scaled_rows(own, scale[alone]))
+        numbers = self._own.coarse
+        row, column = numbers[mine.row], numbers[mine.col]
+        told = csr_array((mine.data, (row, column)), shape=(r, r))
+        rows = coo_array(S[jointly])
+        across = csr_array(
+            (rows.data, (place[jointly][rows.row], numbers[rows.col])),
+            shape=(self._size, r),
+        )
+        weight = np.zeros(self._size)
+        weight[place[jointly]] = scale[jointly]
+        parts, crossing, weights = zip(
+            *comm.allgather((told, across, weight)), strict=True
+        )
+        S_all = csr_array(sum(crossing[1:], start=crossing[0]))
+        whole = sum(parts[1:], start=parts[0])
+        return csr_array(whole - S_all.T @ scaled_rows(S_all, np.max(weights, axis=0)))
+
+
+def certify_over_ranks(
+    own: OwnBodies, claimed: Vector, multipliers: Vector
+) -> Certificate:
+    """Bound the error of an answer; called by all ranks, which get the same bound.
+
+    Parameters
+    ----------
+    claimed : (n,) displacement of own components, the same of copies on several ranks
+    multipliers : (m,) of all rows, on every rank
+
+    Returns
+    -------
+    of which `u` and `off` are those of own components and subdomains
+
+    Raises
+    ------
+    UncertifiableError
+        When the answer holds NaN or inf, or no admissible pair is found near it.
+
+    """
+    finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
+    if own.among.total(float(finite))[0] < own.ranks.size:
+        raise UncertifiableError("the answer holds NaN or inf")
+    u = claimed.astype(Real)
+    u[own.held] = 0
+    at = np.unique(own.contact.rows.indices).astype(np.int64)
+    exact, softness = _at_rows(own, at)
+    trace = own.among.traced(u, at)
+    raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
+    states = suggested(exact, trace, raw)
+    tidied = at_bounds(exact, states, raw), states == CLOSED
+    found, why = list[Certificate](), list[str]()
+    for lam, closed in (tidied, (raw, np.zeros(raw.size, dtype=bool))):
+        try:
+            found.append(
+                _proof(own, exact, (at, softness, trace), u, lam, closed, claimed)
+            )
+        except UncertifiableError as e:
+            why.append(str(e))
+        if found and is_sharp(found[-1]):
+            break
+    if not found:
+        raise UncertifiableError(f"no admissible pair near the answer: {why[0]}")
+    return min(found, key=lambda c: c.error)
+
+
+def _at_rows(own: OwnBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
+    """Return the rows on the components they touch (w,), and 1/Kᵢᵢ there."""
+    contact, k = own.contact, own.contact.bound.size
+    B, contacts = csr_array(contact.rows[:, at]), contact.c.size - k
+    places, here = own.among.places(at)
+    diagonal = np.zeros(own.components.size)
+    known = np.unique(places[here])
+    diagonal[known] = own.parts.diagonal(known)
+    diagonal = own.among.traced(own.among.completed(diagonal), at)
+    free = np.ones(own.components.size)
+    free[own.held] = 0
+    is_free = own.among.traced(free, at) > 0
+    softness = np.where(is_free & (diagonal > 0), 1 / diagonal, 0)
+    bound = contact.bound.astype(Real)
+    return Exact(
+        f=np.zeros(0, dtype=Real), B=B.astype(Real), c=contact.c.astype(Real),
+        held=np.flatnonzero(~is_free),
+        lower=np.append(np.zeros(contacts, dtype=Real), -bound),
+        upper=np.append(np.full(contacts, np.inf, dtype=Real), bound),
+        loose=(B.multiply(B) @ softness).astype(Real),
+    ), softness  # fmt: skip
+
+
+def _proof(
+    own: OwnBodies, exact: Exact, trace: tuple[NDArray[np.int64], Vector, Extended],
+    u: Extended, lam: Extended, closed: NDArray[np.bool_], claimed: Vector,
+) -> Certificate:  # fmt: skip
+    """Evaluate (1) and (3) of `harness.verify.certificate` for the pair mended."""
+    at, softness, start = trace
+    none = np.zeros((at.size, 0))
+    found = inside_at_rows(exact, none, softness, start, closed)
+    if found is None:
+        raise UncertifiableError("the answer penetrates beyond repair")
+    places, here = own.among.places(at)
+    feasible = u * found.theta
+    feasible[places[here]] = found.u[here]
+    parts, among = own.parts, own.among
+    spread = parts.spread.astype(Real)
+    torn = spread @ feasible
+    pull = parts.product(torn)
+    square = torn @ pull
+    rho = among.completed(spread.T @ (pull - own.f))
+    rho[places[here]] += (exact.B.T @ lam)[here]
+    rho[own.held] = 0
+    near = neighbour(
+        parts, own.held, rho.astype(np.float64), np.zeros((own.motions, 0)), among
+    )
+    moved = parts.spread @ (claimed - feasible).astype(np.float64)
+    energies = among.total(
+        float(square), float(torn @ near.Kd), float(near.d @ near.Kd),
+        float(moved @ parts.product(moved)), float(moved @ near.Kd), near.left,
+    )  # fmt: skip
+    return torn_certificate(
+        exact, False, u=feasible, multipliers=lam, off=near.d,
+        works=exact.friction_work(found.u) - lam * exact.motion(found.u),
+        energies=Energies(*energies),
+    )  # fmt: skip

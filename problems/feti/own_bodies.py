@@ -1,0 +1,125 @@
+"""What a rank has of torn bodies, as certificates over ranks take it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import bsr_array, csr_array
+
+from harness import Solution, Vector
+from harness.verify.over_ranks import Contact, OwnBodies
+from problems.fem.mesh import Nodes
+from problems.feti.distributed import Halo
+from problems.feti.substructures import LocalProblems
+from problems.feti.torn import Torn
+
+if TYPE_CHECKING:
+    from problems.feti.emission import OwnSubdomains, StructuredBodies
+
+#: of this rank's slice of a solution → its bodies, the displacement (n,) of its
+#: components, and the multipliers (m,) of all rows of contact and friction
+Answer = Callable[[Solution], tuple[OwnBodies, Vector, Vector]]
+
+
+def answers(own: OwnSubdomains, halo: Halo, scale: Vector) -> Answer | None:
+    """Make the way back from multipliers to displacements, on each rank for its own.
+
+    It is that of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
+    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. None where the
+    supports leave a rigid motion of some body: only the whole knows what holds it.
+
+    scale : (m,) by which the rows of contact and friction are multiplied
+    """
+    if not _is_held(own.problem):
+        return None
+    problem, domains, rows = own.problem, own.domains, own.rows
+    equalities = rows.equalities
+
+    def answer(s: Solution) -> tuple[OwnBodies, Vector, Vector]:
+        bodies, times = _bodies(own)
+        T, R = bodies.parts.spread, bodies.parts.kernel
+        touched = halo.gathered(np.asarray(s.x))
+        v = domains.inverse(own.f - rows.B.T @ touched)
+        v -= R @ np.asarray(s.y)[bodies.coarse]
+        u = bodies.among.completed(T.T @ v) / times
+        owned = rows.number[halo.own]
+        is_contact = owned >= equalities
+        z = np.zeros(scale.size)
+        z[owned[is_contact] - equalities] = np.asarray(s.x)[is_contact]
+        z = scale * own.ranks.total(z)
+        return bodies, u, z[_carrying(problem)]
+
+    return answer
+
+
+def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
+    """Gather what this rank has, and count the copies (n,) of its components."""
+    problem, domains, rows = own.problem, own.domains, own.rows
+    d, contact, kept = problem.components, problem.contact, _carrying(problem)
+    components, place = np.unique(own.component, return_inverse=True)
+    times = np.empty(components.size)
+    times[place] = own.times
+    T = _spread(own, place, components.size)
+    modes = domains.kinds[0].R.shape[1]
+    torn = Torn(
+        kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
+        scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
+    )  # fmt: skip
+    return OwnBodies(
+        ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
+        shared=np.bincount(place, minlength=times.size) < times,
+        coarse=(modes * own.number[:, None] + np.arange(modes)).ravel(),
+        motions=own.coarse, f=own.f,
+        held=np.flatnonzero(np.isin(components, problem.held)),
+        contact=Contact(
+            rows=csr_array(contact.rows[kept]), c=contact.c[kept],
+            bound=contact.bound[contact.bound > 0],
+        ),
+    ), times  # fmt: skip
+
+
+def _spread(own: OwnSubdomains, place: Nodes, n: int) -> csr_array:
+    """Return T (N, n): a block Qᵀ for each torn node, into the axes of subdomains."""
+    d, N = own.problem.components, place.size
+    if d == 1:
+        return csr_array((np.ones(N), place, np.arange(N + 1)), shape=(N, n))
+    turn = own.rotation[own.nodes.block].transpose(0, 2, 1)
+    blocks = np.ascontiguousarray(turn), place[::d] // d, np.arange(N // d + 1)
+    T = csr_array(bsr_array(blocks, shape=(N, n)))
+    T.eliminate_zeros()
+    return T
+
+
+def _carrying(problem: StructuredBodies) -> Nodes:
+    """List the rows of contact, and those of friction with a bound above zero."""
+    m, bound = problem.contact.rows.shape[0], problem.contact.bound
+    return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
+
+
+def _is_held(problem: StructuredBodies) -> bool:
+    """Whether the supports leave no rigid motion of any body."""
+    of, d = problem.layout, problem.components
+    node, k = np.divmod(problem.held, d)
+    at = of.places(node)
+    for b, grid in enumerate(of.grids):
+        own = at.body == b
+        if d == 1:
+            if not own.any():
+                return False
+            continue
+        points = np.concatenate([
+            np.zeros((0, 2)),
+            *(
+                grid.block(slice(i, i + 1), slice(j, j + 1))
+                for i, j in zip(at.column[own], at.row[own], strict=True)
+            ),
+        ])  # fmt: skip
+        size = np.ptp(points, axis=0).max(initial=0.0) or 1.0
+        x, y = ((points - points[:1]) / size).T
+        along_x = k[own] == 0
+        motions = np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
+        if np.linalg.matrix_rank(motions) < 3:
+            return False
+    return True

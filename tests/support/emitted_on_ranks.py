@@ -1,0 +1,96 @@
+"""What tests/problems/feti/test_emission.py runs on several ranks; prints JSON.
+
+Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The shares that
+ranks emit are put together here, and compared with the QP that one process emits.
+"""
+
+import json
+import sys
+from importlib import import_module
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+import mortarbench as mb
+from harness.distributed.vectors import Ranks
+from problems.feti.emission import OwnSubdomains, emitted, subdomains_of
+
+MODELS = {
+    "beam-ring": "beam_ring", "contact-patch": "patch", "membranes": "membranes",
+    "plate": "plate",
+}  # fmt: skip
+
+
+def compared(name, ranks):
+    """Tell how far the shares are from the QP of one process, part by part."""
+    case = mb.build(name)
+    model = import_module(f"problems.models.{MODELS[case.id.family.name]}")
+    problem = model.structured_problem(case.params)
+    made = emitted(problem, ranks)
+    share, qp = made.share().qp, case.qp
+    whole, rows = qp.P.build(), share.P.halo.rows
+    own = rows[share.P.halo.own]
+
+    mine = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    number = mine.number
+    columns = np.concatenate(
+        [np.arange(*whole.domains.start[[s, s + 1]]) for s in number]
+    )
+    B, x = share.P.local.B.tocoo(), np.random.default_rng(3).standard_normal(qp.q.size)
+    told = {
+        "B": (rows[B.row], columns[B.col], B.data),
+        "own": own,
+        **{key: np.asarray(getattr(share, key)) for key in ("q", "lb", "ub")},
+        "A": share.A.part, "b": share.b,
+        "Fx": np.asarray(share.P @ x[own]),
+        "component": mine.component,
+    }  # fmt: skip
+    everyone = ranks.comm.gather(told)
+    if everyone is None:
+        return None
+
+    def joined(key, size):
+        found = np.full(size, np.nan)
+        for one in everyone:
+            found[one["own"]] = one[key]
+        return found
+
+    row, column, value = map(
+        np.concatenate, zip(*(e["B"] for e in everyone), strict=True)
+    )
+    B_whole = csr_array((value, (row, column)), shape=whole.B.shape)
+    m, A = qp.q.size, csr_array(qp.A)
+    return {
+        "sizes": [[made.variables, made.equality_rows], [m, qp.b.size]],
+        "owners": np.bincount(np.concatenate([e["own"] for e in everyone])).tolist(),
+        "entries": [int(column.size), int(whole.B.nnz)],
+        "torn": sum(e["component"].size for e in everyone) - int(whole.B.shape[1]),
+        "bounds": [
+            _off(np.nan_to_num(joined(key, m)), np.nan_to_num(getattr(qp, key)))
+            for key in ("lb", "ub")
+        ],
+        "errors": {
+            "B": float(abs(B_whole - whole.B).max() / abs(whole.B).max()),
+            "q": _off(joined("q", m), qp.q),
+            "Fx": _off(joined("Fx", m), whole(x)),
+            "A": max(float(abs(e["A"] - A[:, e["own"]]).max()) for e in everyone)
+            / float(abs(A).max()),
+            "b": max(_off(e["b"], qp.b) for e in everyone),
+        },
+    }
+
+
+def _off(found, known):
+    return float(np.abs(found - known).max() / max(np.abs(known).max(), 1e-300))
+
+
+def main():
+    ranks = Ranks(MPI.COMM_WORLD)
+    found = {name: compared(name, ranks) for name in sys.argv[1:]}
+    if ranks.rank == 0:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
