@@ -298,3 +298,16 @@ def busy(mark):
         and b"worker" in command
         and resident_mib(pid) > WITH_A_SHARE
     ]
+
+
+def test_ranks_tell_how_fast_they_talk_to_one_another(answers):
+    first, _, alone = answers
+    network = first.record.rank_network
+    assert network.keys() == {
+        "reduction_seconds", "message_seconds", "seconds_per_byte",
+    }  # fmt: skip
+    for mean, largest in network.values():
+        assert 0 <= mean <= largest < 1
+    assert network["reduction_seconds"][0] > 0
+    assert alone.record.rank_network == {}
+    assert "rank_network" not in json.loads(alone.record.to_json())
