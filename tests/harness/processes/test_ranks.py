@@ -54,6 +54,13 @@ def test_what_would_see_a_slice_only_is_refused(found):
     assert found["vectors"]["kept"]
 
 
+def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(found):
+    for error, refused, shared in found["factors"]:
+        assert error < 1e-12
+        assert refused  # on all ranks, though one alone has dependent rows
+        assert shared == list(range(0, 24, 3))
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_ranks_multiply_and_precondition_as_one_process_does(found, case):
     for errors in found[case]["errors"]:
