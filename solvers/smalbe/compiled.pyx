@@ -389,21 +389,26 @@ cdef class Model:
     cdef Py_ssize_t n, k
     cdef double tau
     cdef double[:, ::1] U
-    cdef double[::1] w, root
+    cdef double[::1] room
+    cdef double *w  # (k,)
+    cdef double *root  # of w
     cdef Gram gram
 
     @staticmethod
-    cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
-        """Leave out the rows whose w is not positive."""
+    cdef Model above_tail(double[:, ::1] U, const double *w, double shift, double tau):
+        """Add `shift` to w, and leave out the rows where that is not positive."""
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0
-        for i in range(w.shape[0]):
-            k += w[i] > 0
-        if k < w.shape[0]:
-            kept = np.asarray(w) > 0
-            U, w = np.asarray(U)[kept], np.asarray(w)[kept]
-        B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
-        B.root = np.sqrt(w)
+        cdef Py_ssize_t i, k = 0, found = U.shape[0]
+        B.room = np.empty(2 * found)
+        B.w, B.root = pointer(B.room), pointer(B.room) + found
+        for i in range(found):
+            B.w[k] = w[i] + shift
+            k += B.w[k] > 0
+        if k < found:
+            U = np.asarray(U)[[i for i in range(found) if w[i] + shift > 0]]
+        for i in range(k):
+            B.root[i] = sqrt(B.w[i])
+        B.U, B.tau, B.k, B.n = U, tau, k, U.shape[1]
         return B
 
     cdef double *rows(self) noexcept:
@@ -417,13 +422,10 @@ cdef class Model:
 
     cdef Model with_tail(self, double tau):
         """Change τ and leave w + τ as it is, where that is above τ."""
-        cdef double[::1] w = np.array(self.w) if self.k else np.zeros(0)
-        cdef Py_ssize_t i
+        cdef Model B
         if not self.k:
             return Model.of_norm(tau, self.n)
-        for i in range(self.k):
-            w[i] += self.tau - tau
-        cdef Model B = Model.above_tail(self.U, w, tau)
+        B = Model.above_tail(self.U, self.w, self.tau - tau, tau)
         if B.k == self.k:
             B.gram = self.gram  # of the same rows
         return B
@@ -597,12 +599,11 @@ cdef class Solver:
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
         cdef Py_ssize_t i, k = self.above.shape[0]
-        cdef double[::1] w
         if self.known is None or self.known_rho != rho:
-            w = np.array(self.above)
-            for i in range(k - self.r, k):
-                w[i] += rho
-            self.known, self.known_rho = Model.above_tail(self.vectors, w, self.tail), rho
+            for i in range(k):
+                self.c[i] = self.above[i] + (rho if i >= k - self.r else 0.0)
+            self.known = Model.above_tail(self.vectors, self.c, 0.0, self.tail)
+            self.known_rho = rho
         return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
@@ -687,10 +688,10 @@ cdef class Solver:
             memcpy(y, there, k * sizeof(double))
             memcpy(slope, slope_there, k * sizeof(double))
             memcpy(piece, piece_there, n * sizeof(double))
-        largest = B.tau + np.max(B.w)  # seldom
-        return self.step_of_model(
-            Model.of_norm(largest, n), x, g, lower, upper, s
-        )
+        t = 0.0
+        for i in range(k):
+            t = fmax(t, B.w[i])
+        return self.step_of_model(Model.of_norm(B.tau + t, n), x, g, lower, upper, s)
 
     cdef Model raised(self, Model B, const double *s, double sHs):
         """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""

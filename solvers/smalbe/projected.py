@@ -17,7 +17,7 @@ from solvers.smalbe import compiled
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
 from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
-from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start
+from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start, size
 
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
 FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
@@ -183,9 +183,9 @@ def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
 
 def by_lanczos(PFP: Callable[[Vector], Vector], rows: Rows, *, steps: int) -> Spectrum:
     """Find the norm and the upper Ritz pairs; `steps` products."""
-    n = rows.x_tilde.size
-    steps = min(steps, n - len(rows.C))  # the dimension of the range of 𝒫
-    ritz = lanczos(PFP, rows.project(random_start(n)), steps)
+    start = rows.project(random_start(rows.x_tilde.size))
+    steps = min(steps, size(start) - len(rows.C))  # the dimension of the range of 𝒫
+    ritz = lanczos(PFP, start, steps)
     return Spectrum(ritz.norm or 1.0, ritz)
 
 

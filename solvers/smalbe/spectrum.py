@@ -38,6 +38,11 @@ def random_start(n: int) -> Vector:
     return start
 
 
+def size(v: Vector) -> int:
+    """Count the components of a vector; of one over ranks, those of all."""
+    return int((np.zeros_like(v) + 1).sum())
+
+
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
 
@@ -46,7 +51,7 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     steps where all Ritz values are of one size: conjugate gradients need few steps
     there, and no model.
     """
-    basis = np.zeros((min(steps, start.size), start.size))
+    basis = np.zeros((min(steps, size(start)), start.size))
     diagonal: list[float] = []
     off: list[float] = []
     v, beta = start, float(np.linalg.norm(start))

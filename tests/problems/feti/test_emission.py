@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from harness.distributed import mpi
@@ -21,21 +22,26 @@ CASES = (
 ROUNDING = 1e-14
 
 
+def emitted(ranks, cases):
+    """What the shares of several ranks are together, by case."""
+    done = subprocess.run(
+        [
+            mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
+            str(SUPPORT / "emitted_on_ranks.py"), *cases,
+        ],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
 @pytest.fixture(
     scope="module",
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request):
     """What the shares of several ranks are together."""
-    done = subprocess.run(
-        [
-            mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "emitted_on_ranks.py"), *CASES,
-        ],
-        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return emitted(request.param, CASES)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -53,6 +59,42 @@ def test_every_row_has_one_owner_and_every_torn_unknown_one_rank(found, case):
     assert set(of["owners"]) == {1}
     assert len(of["owners"]) == of["sizes"][1][0]
     assert of["torn"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_no_choice_of_keys_is_emitted_as_another_qp(seed):
+    for case, of in emitted(
+        2 + seed % 2, generated(np.random.default_rng(seed))
+    ).items():
+        assert of["sizes"][0] == of["sizes"][1], case
+        assert max(*of["errors"].values(), *of["bounds"]) < ROUNDING, case
+        assert set(of["owners"]) == {1}, case
+        assert of["torn"] == 0, case
+
+
+def generated(rng, count=8):
+    """Names of tiny cases, with blocks of all shapes and three subdomains or more."""
+    for _ in range(count):
+        glue = rng.choice(["orthonormal", "chain", "redundant"])
+        law = rng.choice(["", "/friction=tresca/bound=1e5"])
+        contact = rng.choice(["nts", "mortar"])
+        method = f"glue={glue}/contact={contact}{law}/dual"
+        n = rng.integers(1, 8, size=8)
+        yield (
+            f"beam-ring/Nr={n[0]}/Nh={n[1] % 4 + 1}/radial={n[2]}/steps=1/feti={n[3]}/"
+            f"{method}"
+        )
+        yield (
+            f"contact-patch/lower={n[4] + 3}/upper={n[5] + 3}/feti={n[6] % 3 + 1}/"
+            f"slave={rng.choice(['upper', 'lower'])}/{method}"
+        )
+        yield (
+            f"plate/Sx={n[0] % 3 + 1}/Sy={n[1] % 2 + 3}/n={n[2] % 4 + 1}/ny={n[3] % 4}/"
+            f"pattern={rng.choice(['checkerboard', 'column'])}/jump=100/"
+            f"load={rng.choice(['point', 'edge', 'nodal'])}/glue={glue}/dual"
+        )
+        yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/glue={glue}/dual"
 
 
 @pytest.mark.parametrize(
