@@ -40,11 +40,10 @@ demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
 
 test: setup browser  ## check, and run the tests on all CPUs
 	@$(MAKE) --no-print-directory -j2 check tests
-	$(BIN)/pytest -q -m 'alone and not slow' $$(grep -rl 'mark\.alone' tests --include='*.py')
 
 .PHONY: tests
-tests:  # those that may run side by side
-	$(BIN)/pytest -q -n auto --dist loadgroup -m 'not slow and not alone'
+tests:
+	$(BIN)/pytest -q -n auto --dist loadgroup
 
 mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
 	@$(BIN)/python tools/mutants.py

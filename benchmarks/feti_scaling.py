@@ -33,12 +33,11 @@ from problems.contact.node_to_segment import node_to_segment
 from problems.duality.dualisation import dualise
 from problems.duality.stepping import primal_qp
 from problems.duality.torn_dual import torn_dual
-from problems.feti.elastic import subdivide, torn
+from problems.feti.elastic import torn
 from problems.feti.operators import dual_operator
 from problems.feti.spectrum import spectra_of_equations
 from problems.feti.substructures import LocalProblems
-from problems.feti.tearing import structured_bodies
-from problems.models.beam_ring import model
+from problems.models.beam_ring import model, subdivided
 from solvers.baselines.feti import FETI
 from solvers.smalbe.solver import SMALBE
 
@@ -61,7 +60,7 @@ def one(way, Nr, cells):
     lap()
     pieces = tear = None
     if way == "feti":
-        pieces = torn(subdivide(bodies, labels(Nr, cells)), primal)
+        pieces = torn(subdivided(cells, Nr, Nr // 2, Nr, "strain"), primal)
         dual = torn_dual(pieces, primal)
         tear = lambda: LocalProblems(pieces)  # noqa: E731
     else:
@@ -89,11 +88,6 @@ def one(way, Nr, cells):
         **s.counts,
     }  # fmt: skip
     return found | (known_face(pieces, dual.qp, s) if pieces is not None else {})
-
-
-def labels(Nr, cells):
-    """Cut beam and ring into squares of `cells` cells, evenly."""
-    return structured_bodies([(8 * Nr, Nr), (12 * (Nr // 2), Nr)], cells)
 
 
 def known_face(pieces, qp, s):

@@ -1,10 +1,17 @@
 """The contract between problems, solvers and reports, and the clock.
 
 A name is imported when it is asked for: what only reads names of cases and solvers
-needs neither numpy nor scipy, and a refusal should not wait for them.
+needs neither numpy nor scipy, and a refusal should not wait for them. Nor should a
+process of a run wait for parts of numpy that nothing here uses, see `_Unused`.
 """
 
+import sys
+from collections.abc import Sequence
 from importlib import import_module
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import LazyLoader
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -65,6 +72,28 @@ _MODULES = {
     "too_large": "harness.limits",
     "verdict": "harness.verify.kkt",
 }
+
+
+class _Unused(MetaPathFinder):
+    """Executes parts of numpy when something of them is used first, and not before.
+
+    scipy imports all names of numpy, these modules among them, see
+    ``scipy/_lib/array_api_compat/numpy/__init__.py``: a quarter of what a process of
+    ours takes to start.
+    """
+
+    _NAMES = ("numpy.f2py", "numpy.testing")
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, _target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(name, path) if name in self._NAMES else None
+        if spec is not None and spec.loader is not None:
+            spec.loader = LazyLoader(spec.loader)
+        return spec
+
+
+sys.meta_path.insert(0, _Unused())
 
 
 def __getattr__(name: str) -> Any:

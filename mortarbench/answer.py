@@ -264,8 +264,9 @@ def answers_of(
         )
         with one_thread(), redirect_stdout(stderr):  # whatever the family prints
             record, solution = measured_once(
-                worker, case.made, record, registries.reference
-            )
+                worker, case.made, record, registries.reference,
+                evaluates=registries.hold_own_code_only(),
+            )  # fmt: skip
         return Answer(
             case=case, record=record, solution=solution, spec=spec, defaults=defaults
         )

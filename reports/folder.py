@@ -23,7 +23,6 @@ from reports.figures.scaling import scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
 from reports.sections.answer import answer as fastest_section
 from reports.sections.answer import answer_statements
-from reports.sections.cases import cases
 from reports.sections.convergence import convergence
 from reports.sections.performance import profiles
 from reports.sections.physics import agreement, deformed, physics, tractions
@@ -31,7 +30,7 @@ from reports.sections.ranking import left_out, means, ranking
 from reports.sections.ranks import ranks
 from reports.sections.results import claim_counts, claims, errors, iterations
 from reports.sections.scaling import growth, scaling, steps
-from reports.sections.settings import definitions, environment
+from reports.sections.settings import cases, definitions, environment
 from reports.sections.summary import summary
 from reports.sections.sweeps import accuracy, certified_sweeps
 from reports.sections.times import precision, ratios, times

@@ -1,4 +1,4 @@
-"""Shared by all tests: a CPU for each pytest worker, QPs of known solution."""
+"""Shared by all tests: CPUs of pytest's workers, QPs of known solution."""
 
 import gc
 import os
@@ -14,8 +14,15 @@ from harness.processes import supervisor
 from tests.support.fork_server import Forks
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Run two tests per CPU where CPUs are few: a third of the time, tests wait."""
+    cpus = len(os.sched_getaffinity(0))
+    return max(cpus, min(2 * cpus, 8))
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each of pytest-xdist's workers CPUs of its own, where there are enough.
+    """Share the CPUs among pytest-xdist's workers.
 
     The harness binds what it measures to the last CPU that it may use; without this,
     all workers would measure on the same one.

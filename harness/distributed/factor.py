@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, cho_factor, solve_triangular
+from scipy.linalg import blas, cho_factor
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -67,7 +67,7 @@ class Touched:
         return distributed(t / self.touching, self.ranks)
 
 
-def touched(rows: Rows, ranks: Ranks) -> Touched:
+def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
     """Tell the others which rows this rank touches, and learn which are shared."""
     every, count = np.unique(
         np.concatenate(ranks.comm.allgather(rows)), return_counts=True
@@ -140,8 +140,8 @@ class LocalFactor:
         S = np.zeros((s, s))
         try:
             L_cc = _cholesky(T[:c, :c])
-            L_sc = solve_triangular(L_cc, T[:c, c:], lower=True).T
-            S[np.ix_(place, place)] = T[c:, c:] - L_sc @ L_sc.T
+            L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
+            S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
             fails = 0.0
         except np.linalg.LinAlgError:  # to be said by all ranks alike
             fails = 1.0
@@ -182,9 +182,8 @@ class SummedFactor:
             u, r = self.local.reduced(np.asarray(t))
             c = len(self.L_cc)
             z_c = _solved(self.L_cc, r[:c])
-            shared = np.zeros(len(self.L_ss))
-            shared[self.local.at.place] = r[c:] - self.L_sc @ z_c
-            z_s = _solved(self.L_ss, ranks.total(shared)) / np.sqrt(ranks.size)
+            z_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            z_s /= np.sqrt(ranks.size)
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
@@ -201,7 +200,21 @@ class SummedFactor:
 
     def __call__(self, t: Dense) -> DistributedVector:
         """Solve for the consistent y (k,) of an additive t (k,)."""
-        return self.backward(self.forward(t))
+        local, c = self.local, len(self.L_cc)
+        with local.at.ranks.clocked("coarse"):
+            u, r = local.reduced(np.asarray(t))
+            z_c = _solved(self.L_cc, r[:c])
+            x_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            x_s = _solved(self.L_ss, x_s, transposed=True)[local.at.place]
+            x_c = _solved(self.L_cc, z_c - x_s @ self.L_sc, transposed=True)
+            y = local.extended(u / self.root**2, np.concatenate([x_c, x_s]))
+            return distributed(y, local.at.ranks)
+
+    def _gathered(self, r: Dense) -> Dense:
+        """Add what all ranks have for the shared rows (s,)."""
+        shared = np.zeros(len(self.L_ss))
+        shared[self.local.at.place] = r
+        return self.local.at.ranks.total(shared)
 
 
 def local_factor(
@@ -240,10 +253,10 @@ def local_factor(
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return L with LLᵀ = M; an empty one where M is."""
+    """Return L with LLᵀ = M, its upper triangle not to be read."""
     if not len(M):
         return np.zeros((0, 0), order="F")
-    return np.asfortranarray(np.tril(cho_factor(M, lower=True)[0]))
+    return np.asfortranarray(cho_factor(M, lower=True)[0])
 
 
 def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:

@@ -17,8 +17,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import wraps
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    NamedTuple,
+    ParamSpec,
+    Protocol,
+    TypeVar,
+    runtime_checkable,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +38,9 @@ from harness.solution import Solution
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 FEW = 64  #: numbers that are added in the order of the ranks
 
@@ -196,6 +208,24 @@ def inner_products(
     found = one.ranks.everyones(np.array(products + smallest))
     sums = found[:, : len(products)].sum(axis=0)
     return (*sums.tolist(), *found[:, len(products) :].min(axis=0).tolist())
+
+
+def on_slices(function: Callable[P, R]) -> Callable[P, R]:
+    """Have what acts component by component act on slices: one pass, wrapped once.
+
+    function : takes vectors (n,), and gives one or a tuple of them
+    """
+
+    @wraps(function)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
+        ranks = next((a.ranks for a in args if isinstance(a, DistributedVector)), None)
+        if ranks is None:
+            return function(*args, **kwargs)
+        plain: Any = [_slice(a) for a in args]
+        found: R = _again(ranks, function(*plain, **kwargs))
+        return found
+
+    return wrapped
 
 
 def _slice(value: Any) -> Any:

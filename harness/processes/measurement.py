@@ -120,8 +120,12 @@ def measured(
         notes = _cached(
             cost, first, worker.first_seconds, (record.qp, record.asked_tol)
         )
-    record = judged(record.but(**asdict(cost)), qp, solution, prove)
+    found = reply.answer["evaluated"] if request.get("evaluates") else None
+    values = None if found is None else found["values"]
+    record = judged(record.but(**asdict(cost)), qp, solution, prove, values)
     record = noted(record, reply.message, *notes)
+    if found is not None and record.verdict is not Verdict.DECLINED:
+        record = noted(record, found["note"]).but(**found["bounds"])
     return _within(memory_limit, record).but(
         canary_seconds=reply.answer["canary_seconds"],
         **{
@@ -316,11 +320,18 @@ def single_worker(
 
 
 def measured_once(
-    worker: WorkerProcess, case: Case, record: Record, reference: Reference
+    worker: WorkerProcess,
+    case: Case,
+    record: Record,
+    reference: Reference,
+    *,
+    evaluates: bool = False,
 ) -> tuple[Record, Solution | None]:
     """Do as `measured`, without limits.
 
     reference : solves the QP where residuals cannot decide
+    evaluates : whether ranks, where there are several, evaluate residuals and the
+        certificate themselves; only where no code but ours runs in them
 
     Raises
     ------
@@ -336,6 +347,7 @@ def measured_once(
             "qp": str(qp_file),
             "digest": content_digest(qp_file),
             "out": str(scratch / "point.npz"),
+            "evaluates": evaluates,
         }
         once = partial(
             measured, worker, case.qp, record, request,
@@ -348,7 +360,9 @@ def measured_once(
     if solution is None or record.verdict is Verdict.DECLINED:
         return record, solution
     quantities, note = quantities_of(case, solution)
-    bounds, objection = certified(case, solution)
+    bounds, objection = dict[str, Any](), ""
+    if record.certify_seconds is None:
+        bounds, objection = certified(case, solution)
     record = noted(record, note, objection).but(quantities=quantities, **bounds)
     return record, solution
 

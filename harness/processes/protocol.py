@@ -26,6 +26,7 @@ from typing import Any, TextIO
 
 from harness.record import Measurement, finite, journal_name
 from harness.solution import Status
+from harness.verify.kkt import Residuals
 
 LONGEST_REPLY = 2**22  #: bytes
 MOST_ECHOED = 200  #: characters of what came, in a message
@@ -182,6 +183,18 @@ def _is_bounds(value: Any) -> bool:
     ) and all(name.startswith(("energy", "certif")) for name in value)
 
 
+def _is_evaluation(value: Any) -> bool:
+    """As of `harness.verify.verdicts.evaluated_by_ranks`."""
+    return (
+        isinstance(value, dict)
+        and value.keys() == {"values", "bounds", "note"}
+        and _named(_is_number)(value["values"])
+        and value["values"].keys() == {"objective", *Residuals._fields}
+        and _is_bounds(value["bounds"])
+        and _is_text(value["note"])
+    )
+
+
 def _cost(field: Field[Any]) -> Accepts:
     """Tell what is accepted as what a measurement cost, by the field's name and type.
 
@@ -200,6 +213,7 @@ _MEASURED: Mapping[str, Accepts] = {
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
     "rank_seconds": _named(_is_mean_and_largest),
     "rank_counts": _named(_is_mean_and_largest),
+    "evaluated": lambda value: value is None or _is_evaluation(value),
     "rank_network": _named(_is_mean_and_largest),
     "first_seconds": _is_time,
     "canary_seconds": _is_size,

@@ -49,6 +49,7 @@ from harness.plugin import Solver
 from harness.qp import QP, no_rows
 from harness.solution import Solution
 from harness.verify.measure import memory_mib
+from harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: tag of what rank 0 tells the others to do
 _IDLE_SECONDS = 2e-4  #: between two looks for an order
@@ -130,6 +131,7 @@ def follow(
     run: Callable[[], Solution] | None = None
     share: Share | None = None
     emitted: Emitted | None = None
+    solution: Solution | None = None
     while (order := _next_order(ranks)) is not None:
         try:
             if "case" in order:
@@ -149,8 +151,11 @@ def follow(
                 share = _share(qp, ranks, copies=order["copies"])
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
+            elif "evaluate" in order and emitted and solution:
+                limit(None)
+                evaluated_by_ranks(emitted, solution, ranks)
             elif run is not None and share is not None:
-                _solved(run, share, ranks)
+                solution, _ = _solved(run, share, ranks)
         except BaseException as e:
             if _ordered(ranks, _ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
@@ -205,6 +210,7 @@ class OnRanks:
         self._path = Path()
         self._memory_limit: float | None = None
         self.spent = Spent()
+        self._own: Solution | None = None
 
     def emits(self, case: Mapping[str, Any], memory_limit: float | None) -> QP | None:
         """Have all ranks make their shares of the next QP, where its family can.
@@ -222,6 +228,19 @@ class OnRanks:
         with suppress(InputError):  # why it cannot be shared will be said of the whole
             self._emitted = self._emit(case, self._ranks)
         return None if self._emitted is None else _sized(self._emitted)
+
+    def evaluated(self) -> dict[str, Any] | None:
+        """Have all ranks evaluate the last answer, if they emitted its QP; see there.
+
+        Returns
+        -------
+        as `harness.verify.verdicts.evaluated_by_ranks`
+
+        """
+        if self._emitted is None or self._own is None:
+            return None
+        self._order({"evaluate": True})
+        return evaluated_by_ranks(self._emitted, self._own, self._ranks)
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
         """Say in which file the next QP is, unless it is emitted."""
@@ -267,7 +286,7 @@ class OnRanks:
 
         def solve() -> Solution:
             self._order({})
-            found = _solved(run, share, self._ranks)
+            self._own, found = _solved(run, share, self._ranks)
             assert found is not None  # this is rank 0
             solution, spent = found
             self.spent = Spent() if self._copies else spent
@@ -301,8 +320,8 @@ def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
 
 def _solved(
     run: Callable[[], Solution], share: Share, ranks: Ranks
-) -> tuple[Solution, Spent] | None:
-    """Solve, and gather the solution on rank 0, with what the ranks have spent."""
+) -> tuple[Solution, tuple[Solution, Spent] | None]:
+    """Solve: a slice of the solution, and on rank 0 all of it and what was spent."""
     ranks.clear()
     s = run()
     seconds, counts = dict(ranks.seconds), dict(ranks.counts)
@@ -310,14 +329,15 @@ def _solved(
     peak = memory_mib("VmHWM") or 0.0
     told = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
     if found is None or told is None:
-        return None
+        return s, None
     *tables, peaks = zip(*told, strict=True)
     reported = {
         **found.reported, "ranks": ranks.size,
         "rank_peak_mib_largest": max(peaks),
         "rank_peak_mib_mean": sum(peaks) / ranks.size,
     }  # fmt: skip
-    return replace(found, reported=reported), Spent(*map(_mean_and_largest, tables))
+    spent = Spent(*map(_mean_and_largest, tables))
+    return s, (replace(found, reported=reported), spent)
 
 
 def _mean_and_largest(

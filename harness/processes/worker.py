@@ -147,6 +147,9 @@ class _Bench:
         s = timed.solution
         _write_new(out, s)
         spent = Spent() if self.on_ranks is None else self.on_ranks.spent
+        evaluated = None
+        if self.on_ranks is not None and request.get("evaluates"):
+            evaluated = self.on_ranks.evaluated()
         return {
             "claimed": s.status,
             "message": s.message,
@@ -156,6 +159,7 @@ class _Bench:
             "rank_seconds": spent.seconds,
             "rank_counts": spent.counts,
             "rank_network": spent.network,
+            "evaluated": evaluated,
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},

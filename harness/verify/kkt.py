@@ -160,8 +160,8 @@ def _violated(error: Vector, rhs: Vector, terms: Vector, known: Vector) -> float
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
-    curved = t.curvature[t.curvature > 0]
-    least = np.sqrt(E * curved.min()) if curved.size else 0.0
+    softest = _least(t.curvature[t.curvature > 0])
+    least = np.sqrt(E * softest) if softest < np.inf else 0.0
     S = _largest(_sup(t.Px), _sup(qp.q), _sup(t.forces), least)
     size = t.Px_size + np.abs(qp.q) + t.forces_size
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
@@ -218,19 +218,24 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     terms = _sup(t.energies)
     value = abs(float(t.energies[0] / 2 + t.energies[1]))
     capped = min(terms, max(CANCELLED * value, terms / CANCELLED))
-    E, pick = (terms, _middle) if generous else (capped, np.min)
+    E, pick = (terms, _middle) if generous else (capped, _least)
     if np.isnan(terms):
         return terms
     known = _sup(qp.b), _sup(qp.h), _finite_sup(qp.lb), _finite_sup(qp.ub)
     is_tiny = E <= SMALL * _sup(t.curvature) * np.square(max(known))
-    alone = _alone(qp, t.curvature, by_length=is_tiny or not qp.q.any())
-    if alone.size and SHARE * pick(alone) > E:  # seldom, and tightening costs more
-        alone = _alone(qp, t.curvature, widths(qp), by_length=True)
-    return max(E, SHARE * float(pick(alone))) if alone.size else E
+    alone = pick(_alone(qp, t.curvature, by_length=is_tiny or not qp.q.any()))
+    if E < SHARE * alone < np.inf:  # seldom, and tightening costs more
+        alone = pick(_alone(qp, t.curvature, widths(qp), by_length=True))
+    return max(E, SHARE * alone) if alone < np.inf else E
+
+
+def _least(values: Vector) -> float:
+    """Give the least value, over all ranks of a distributed vector; inf without any."""
+    return float(values.min(initial=np.inf))
 
 
 def _middle(values: Vector) -> float:
-    return float(np.sort(values)[(values.size - 1) // 2])
+    return float(np.sort(values)[(values.size - 1) // 2]) if values.size else np.inf
 
 
 def _alone(
@@ -261,7 +266,8 @@ def _alone(
     bend: Vector = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
     if bend.size and gain.max(initial=0) <= NOISE * bend.min():
         return bend
-    return np.asarray(gain)
+    found: Vector = gain
+    return found
 
 
 def _lengths(qp: QP) -> Vector:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import Any
@@ -12,16 +13,17 @@ from typing import Any
 import numpy as np
 
 from harness.digest import hex_digest
-from harness.mechanics import Mechanics
+from harness.distributed.vectors import DistributedColumns, Emitted, Ranks
 from harness.names import CaseId
 from harness.plugin import Case
-from harness.qp import QP
+from harness.qp import QP, no_rows
 from harness.record import Record, Verdict
 from harness.registry import COPIES, SolverSpec
 from harness.solution import Solution, Status
-from harness.verify.certificate import UncertifiableError, certify
-from harness.verify.kkt import kkt_residuals, verdict
+from harness.verify.certificate import Certificate, UncertifiableError, certify
+from harness.verify.kkt import Residuals, kkt_residuals, verdict
 from harness.verify.optimum import Proves, decided
+from harness.verify.over_ranks import certify_over_ranks
 
 #: first part of what a run_id digests; it names a measurement, whatever is stored of it
 IDENTITY = 1
@@ -78,10 +80,17 @@ def new_record(
     )
 
 
-def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> Record:
+def judged(
+    record: Record,
+    qp: QP,
+    s: Solution,
+    prove: Proves | None = None,
+    found: Mapping[str, Any] | None = None,
+) -> Record:
     """Fill in what a solver's answer `s` is worth on `qp`, by our own evaluation.
 
     prove : finds the optimum of `qp` where residuals cannot decide
+    found : residuals and objective, where ranks have evaluated them together
     """
     record = record.but(
         sizes=qp.sizes,
@@ -93,9 +102,13 @@ def judged(record: Record, qp: QP, s: Solution, prove: Proves | None = None) -> 
     )
     if s.status is Status.DECLINED:
         return record.but(verdict=Verdict.DECLINED)
-    with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
-        residuals = kkt_residuals(qp, s)
-        objective = qp.objective(s.x)
+    if found is not None:
+        residuals = Residuals(*(found[name] for name in Residuals._fields))
+        objective = found["objective"]
+    else:
+        with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
+            residuals = kkt_residuals(qp, s)
+            objective = qp.objective(s.x)
     tol, error = record.judged_at, None
     if prove is not None:
         error = decided(qp, s, residuals, tol, prove)
@@ -129,20 +142,54 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     """
     if case.mechanics is None or not has_point(s):
         return {}, ""
-    loaded = LATE in sys.modules
-    told = _certified(case.mechanics, s)
+    mechanics, loaded = case.mechanics, LATE in sys.modules
+
+    def certificate() -> Certificate:
+        return certify(mechanics, mechanics.back(s))
+
+    told = _certified(certificate)
     if not loaded and LATE in sys.modules:  # and that is no part of the time
-        told = _certified(case.mechanics, s)
+        told = _certified(certificate)
     return told
+
+
+def evaluated_by_ranks(
+    emitted: Emitted, s: Solution, ranks: Ranks
+) -> dict[str, Any] | None:
+    """Evaluate an answer on all ranks together; each has its slice of the solution.
+
+    By a share of its own, without what the solver has made of the first one. All ranks
+    call it.
+
+    Returns
+    -------
+    objective and residuals; fields of `certified` where that does not need the whole,
+    and a note, perhaps empty. None where it cannot be evaluated in parts.
+
+    """
+    qp = emitted.share().qp
+    qp = replace(qp, G=DistributedColumns(no_rows(qp.q.size), ranks))
+    try:
+        with np.errstate(all="ignore"):
+            residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
+    except TypeError:  # some scale of energy is one that only the whole knows
+        return None
+    if not np.isfinite([*residuals, objective]).all():
+        return None
+    bounds, note = dict[str, Any](), ""
+    if (answer := emitted.answer) is not None:
+        bounds, note = _certified(lambda: certify_over_ranks(*answer(s)))
+    values = {"objective": float(objective), **residuals._asdict()}
+    return {"values": values, "bounds": bounds, "note": note}
 
 
 LATE = "scipy.optimize"  #: which `certify` imports for some bodies; it takes long
 
 
-def _certified(mechanics: Mechanics, s: Solution) -> tuple[dict[str, Any], str]:
+def _certified(certificate: Callable[[], Certificate]) -> tuple[dict[str, Any], str]:
     start = perf_counter()
     try:
-        found = certify(mechanics, mechanics.back(s))
+        found = certificate()
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"

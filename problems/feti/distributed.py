@@ -8,20 +8,24 @@ others get its multiplier before they multiply, and send what they add to it:
 
 Nothing of the size of the whole is anywhere: a rank has the columns of B, and the rows
 of all vectors, that its subdomains touch. Subdomains go to ranks so that these do
-alike much work and share few rows, by graph partitioning (METIS).
+alike much work and share few rows, by graph partitioning (METIS). Of a kind that
+several ranks have, one forms the explicit blocks, and sends them to the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array
 
 from harness import QP, InputError, Solution, Vector, no_rows
+from harness.digest import hex_digest
+from harness.distributed.factor import Touched, local_factor, touched_rows
 from harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
@@ -32,12 +36,15 @@ from harness.distributed.vectors import (
 from harness.operators import Product
 from problems.fem.mesh import Nodes
 from problems.feti.operators import (
+    ROUNDING,
+    SHIFT,
     DualOperator,
+    Group,
     gram_inverse,
     touched,
     uncoupled,
 )
-from problems.feti.torn import Dense, Subdomains
+from problems.feti.torn import Condensed, Dense, Subdomains
 
 
 class Parts(NamedTuple):
@@ -134,6 +141,13 @@ class Halo:
     lends: NDArray[np.int64]  #: (ranks,) how many go to each
     borrows: NDArray[np.int64]  #: (ranks,) how many come from each
 
+    @property
+    def is_shared(self) -> NDArray[np.bool_]:
+        """Which of its rows other ranks touch, too."""
+        shared = np.zeros(self.rows.size, dtype=bool)
+        shared[self.borrowed] = shared[self.own[self.lent]] = True
+        return shared
+
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
         with self.ranks.clocked("exchange"):
@@ -227,38 +241,150 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Make x ↦ (B W Bᵀ)⁻¹x of the sum of all ranks' parts, on owned rows.
 
-        Contact rows, and those that are coupled with others (none if gluing is
-        orthonormal), are solved for by all ranks alike.
+        Most equations are coupled with no other row, all of them if gluing is
+        orthonormal; all ranks alike solve for those that are. Contact rows are coupled
+        along the contact. They are solved for rank by rank, unless ranks share many.
         """
-        at, ranks = self.halo, self.halo.ranks
+        at, equalities = self.halo, self.local.equalities
         diagonal = at.added(part.diagonal())
-        entries = part.tocoo()
-        told = at.rows[entries.row], at.rows[entries.col], entries.data
-        beside = (entries.row != entries.col) & (entries.data != 0)
-        contact = at.rows[at.rows >= self.local.equalities]
-        mine = np.union1d(told[0][beside], contact)
-        known = np.unique(np.concatenate(ranks.comm.allgather(mine)))
-        of_known = np.isin(told[0], known) & np.isin(told[1], known)
-        rows, columns, data = map(
-            np.concatenate,
-            zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
-        )
-        places = np.searchsorted(known, rows), np.searchsorted(known, columns)
-        gram = csr_array((data, places), shape=(known.size,) * 2)
-        gram.sum_duplicates()
-        equalities = int(np.searchsorted(known, self.local.equalities))
-        inverse = gram_inverse(uncoupled(gram, equalities), equalities)
-        place, own = np.intersect1d(known, at.rows[at.own], return_indices=True)[1:]
+        is_contact = at.rows >= equalities
+        coupled = np.isin(at.rows, _coupled(part, at, diagonal, ~is_contact))
+        contact = touched_rows(at.rows[is_contact], at.ranks)
+        solves = []
+        if contact.few_shared:
+            of_contact = csc_array(part[is_contact][:, is_contact])
+            solves.append(_rank_by_rank(of_contact, contact, at, diagonal))
+        else:
+            coupled |= is_contact
+        if at.ranks.extreme(float(coupled.any()), np.max):
+            solves.append(_alike(part, coupled, at, equalities))
 
         def solve(x: Dense) -> Dense:
             x = np.asarray(x)
             y = x / diagonal
-            whole = np.zeros(known.size)
-            whole[place] = x[own]
-            y[own] = inverse(ranks.total(whole))[place]
+            for owned, inverse in solves:
+                y[owned] = inverse(x[owned])
             return np.asarray(y)
 
         return solve
+
+
+def _coupled(
+    part: csr_array, at: Halo, diagonal: Vector, some: NDArray[np.bool_]
+) -> Nodes:
+    """Find which of some rows (t,) the sum of all parts couples beyond rounding."""
+    row, column = part.tocoo().coords
+    size = np.sqrt(at.gathered(diagonal))
+    share = part.tocoo().data / (size[row] * size[column])
+    beside = (row != column) & some[row] & some[column] & (share != 0)
+    between = at.is_shared[row] & at.is_shared[column]
+    found = [at.rows[row[beside & ~between & (np.abs(share) > ROUNDING)]]]
+    told = [v[beside & between] for v in (at.rows[row], at.rows[column], share)]
+    rows, columns, shares = map(
+        np.concatenate, zip(*at.ranks.comm.allgather(told), strict=True)
+    )
+    pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
+    total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
+    return np.concatenate([*found, pairs[0, total > ROUNDING]])
+
+
+def _rank_by_rank(
+    part: csc_array, rows: Touched, at: Halo, diagonal: Vector
+) -> tuple[Nodes, Callable[[Dense], Dense]]:
+    """Invert the sum of the ranks' parts (k, k) of B W Bᵀ on some rows.
+
+    Returns the places of these among the owned rows (o,), whose sum has this diagonal,
+    and the inverse for what is there.
+    """
+    size = 1 / np.sqrt(at.gathered(diagonal)[np.searchsorted(at.rows, rows.rows)])
+    unit = csc_array(diags_array(size) @ part @ diags_array(size))
+    unit += csc_array(diags_array(SHIFT * unit.diagonal()))
+    factor = local_factor(unit, rows).completed()
+    _, mine, owned = np.intersect1d(rows.rows, at.rows[at.own], return_indices=True)
+
+    def inverse(x: Dense) -> Dense:
+        t = np.zeros(rows.rows.size)
+        t[mine] = size[mine] * x
+        return np.asarray(factor(t))[mine] * size[mine]
+
+    return owned, inverse
+
+
+def _alike(
+    part: csr_array, some: NDArray[np.bool_], at: Halo, equalities: int
+) -> tuple[Nodes, Callable[[Dense], Dense]]:
+    """Do as `_rank_by_rank`, the same on all ranks.
+
+    some : (t,) which of the touched rows
+    """
+    ranks, entries = at.ranks, part.tocoo()
+    known = np.unique(np.concatenate(ranks.comm.allgather(at.rows[some])))
+    told = at.rows[entries.row], at.rows[entries.col], entries.data
+    of_known = np.isin(told[0], known) & np.isin(told[1], known)
+    row, column, data = map(
+        np.concatenate,
+        zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
+    )
+    places = np.searchsorted(known, row), np.searchsorted(known, column)
+    gram = csr_array((data, places), shape=(known.size,) * 2)
+    gram.sum_duplicates()
+    first = int(np.searchsorted(known, equalities))
+    solve = gram_inverse(uncoupled(gram, first), first)
+    _, place, owned = np.intersect1d(known, at.rows[at.own], return_indices=True)
+
+    def inverse(x: Dense) -> Dense:
+        whole = np.zeros(known.size)
+        whole[place] = x
+        return np.asarray(solve(ranks.total(whole))[place])
+
+    return owned, inverse
+
+
+def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]:
+    """Form the blocks of equal groups on one of the ranks that have them.
+
+    Largest first, each goes to the rank that has the least to do so far (Graham 1969).
+    """
+    names = [_name(group) for group in groups]
+    work = {
+        n: g.kind.K.nnz * g.touched.size for n, g in zip(names, groups, strict=True)
+    }
+    have = ranks.comm.allgather(work)
+    loads, maker = [0] * ranks.size, dict[str, int]()
+    everyones = {name: size for one in have for name, size in one.items()}
+    for name in sorted(everyones, key=lambda name: (-everyones[name], name)):
+        able = [r for r, one in enumerate(have) if name in one]
+        maker[name] = min(able, key=loads.__getitem__)
+        loads[maker[name]] += everyones[name]
+    found, sent = dict[str, Condensed](), []
+    ours = dict(zip(names, groups, strict=True))
+    for name, rank in maker.items():
+        if rank == ranks.rank:
+            group = ours[name]
+            found[name] = group.kind.condensed(group.touched)
+            blocks = np.stack(found[name])
+            to = [r for r, one in enumerate(have) if name in one and r != rank]
+            sent += [(ranks.comm.Isend(blocks, dest=r), blocks) for r in to]
+    for name, rank in maker.items():
+        if name in ours and rank != ranks.rank:
+            n = ours[name].touched.size
+            blocks = np.empty((2, n, n))
+            with ranks.clocked("waiting"):
+                ranks.comm.Recv(blocks, source=rank)
+            found[name] = Condensed(*blocks)
+    for request, _ in sent:
+        request.wait()
+    return [found[name] for name in names]
+
+
+def _name(group: Group) -> str:
+    """Name what the blocks of a group depend on by its content."""
+    kind = group.kind
+    parts = (
+        kind.K.data, kind.K.indices, kind.K.indptr, kind.R, kind.fixing, kind.boundary,
+        group.touched,
+    )  # fmt: skip
+    return hex_digest((np.ascontiguousarray(part).tobytes() for part in parts), 32)
 
 
 def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
@@ -285,6 +411,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         Subdomains(tuple(domains.kinds[k] for k in kinds), kind),
         operator.explicit[kinds],
         operator.equalities,
+        partial(condensed_by_ranks, ranks=ranks),
     )
     own = at.rows[at.own]
     q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))

@@ -38,15 +38,38 @@ class SubdividedBodies:
     bodies: Bodies
     decomposition: Decomposition
     kinds: tuple[Kind, ...]
+    shape: Vector | float  #: factor of E in the rows that hold them, (n,) or one
 
 
-def subdivide(bodies: Bodies, label: NDArray[np.int64]) -> SubdividedBodies:
-    """Cut bodies into the subdomains that their cells (E,) are labelled with."""
+def subdivide(
+    bodies: Bodies, label: NDArray[np.int64], layout: Layout | None = None
+) -> SubdividedBodies:
+    """Cut bodies into the subdomains that their cells (E,) are labelled with.
+
+    layout : the same blocks of grids, where bodies are such: then rows that hold them
+        follow the shape of cells (`problems.feti.structured`)
+    """
     mesh = bodies.mesh
     decomposition = decompose(mesh.points, mesh.cells, label, bodies.body)
     D = bodies.elasticity * (bodies.length / bodies.force)
     kinds = tuple(elastic_kind(part, D, bodies.moduli) for part in decomposition.parts)
-    return SubdividedBodies(bodies, decomposition, kinds)
+    shape = 1.0 if layout is None else _shape(bodies, layout)
+    return SubdividedBodies(bodies, decomposition, kinds, shape)
+
+
+def _shape(bodies: Bodies, layout: Layout) -> Vector:
+    """Return the factor of each component; those held are on sides of the grids."""
+    share, held = longitudinal_share(bodies.elasticity), bodies.B_D.indices
+    free, at_ends = (
+        np.repeat(layout.shapes(share, ends=ends), 2) for ends in (False, True)
+    )
+    free[held] = at_ends[held]
+    return np.asarray(free)
+
+
+def longitudinal_share(D: NDArray[np.float64]) -> Vector:
+    """Return C₁₁ / (C₁₁ + C₆₆) of elasticity matrices (k, 3, 3)."""
+    return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, 2, 2]))
 
 
 def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
@@ -96,7 +119,7 @@ def torn(
     return glue(
         subdomains.decomposition, subdomains.kinds, load=-primal.q,
         supports=csr_array(primal.A), supported=primal.b, contact=contact, c=c,
-        E=bodies.moduli[bodies.body_of_node], rows=rows,
+        E=bodies.moduli[bodies.body_of_node], shape=subdomains.shape, rows=rows,
     )  # fmt: skip
 
 
@@ -138,7 +161,8 @@ def structured(
     E = np.array([m.E for m in materials]) * (length / force)
     return StructuredBodies(
         layout=layout, components=2, material=layout.block.body,
-        kind=partial(elastic_kind, D=D, E=E), E=E, held=fixed,
+        kind=partial(elastic_kind, D=D, E=E), E=E, share=longitudinal_share(D),
+        held=fixed,
         load=forces_at(load[0], load[1] / force), glue=glue,
         contact=_contact_of_sides(layout, pairs, method, laws, units),
     )  # fmt: skip

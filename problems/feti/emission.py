@@ -44,7 +44,7 @@ from problems.feti.distributed import (
 from problems.feti.gluing import GLUE
 from problems.feti.operators import DualOperator, explicit_kinds
 from problems.feti.own_bodies import answers
-from problems.feti.structured import Integers, Layout, Places
+from problems.feti.structured import Integers, Layout, Places, shape_factors
 from problems.feti.tearing import Part, classify, images
 from problems.feti.torn import Kind, Subdomains
 
@@ -66,6 +66,8 @@ class StructuredBodies:
     material: Integers  #: (S,) of each subdomain
     kind: Callable[[Part], Kind]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
+    #: (bodies,) as of `problems.feti.structured.shape_factors`; None for squares
+    share: Vector | None = None
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
     contact: Contact
@@ -193,6 +195,20 @@ class OwnSubdomains:
         at = first[domains.kind[of]] + unknown - domains.start[of]
         number = modes * self.number[of][:, None] + np.arange(modes)
         return number, R[at] * value[:, None]
+
+    @cached_property
+    def spacings(self) -> NDArray[np.float64]:
+        """(M_p, 2) sides of the cells around each torn node."""
+        return self.problem.layout.spacings(self.number)
+
+    def stiffness(self, node: Nodes, *, held: bool) -> Vector:
+        """Return what rows of supports, or gluing, at torn nodes (k,) are scaled by."""
+        at = Places(*(x[node] for x in self.nodes.at))
+        E, share = self.problem.E[at.body], self.problem.share
+        if share is None:
+            return E
+        lines = self.problem.layout.lines(at, ends=held)
+        return E * shape_factors(self.spacings[node], lines, share[at.body])
 
     @cached_property
     def rows(self) -> _Rows:
@@ -328,7 +344,7 @@ def _supports(own: OwnSubdomains) -> Entries:
     copies = _own_copies(own, at)
     of = copies.node[copies.mine]
     row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
-    value = np.sqrt(problem.E[at.body[of]])
+    value = np.sqrt(own.stiffness(copies.torn, held=True))
     reached = np.stack([row, np.full(row.size, own.ranks.rank)], axis=1)
     return Entries(*_turned(own, row, copies.torn, k[of], value), reached)
 
@@ -387,7 +403,7 @@ def _glued(own: OwnSubdomains) -> Entries:
                 value = weights[nodes.copy[node]]
                 entries = _turned(
                     own, row, node, np.full(node.size, k),
-                    np.sqrt(problem.E[nodes.at.body[node]]) * value,
+                    np.sqrt(own.stiffness(node, held=False)) * value,
                 )  # fmt: skip
                 there = ranks[mine][:, weights != 0]
                 reached = np.stack(

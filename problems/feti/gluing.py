@@ -13,7 +13,7 @@ to all gluing.
 
 Rows of a body are scaled by √E of that body, contact rows by that of the softest body
 they touch, after they are normalised: then F does not depend on E where each body is
-homogeneous.
+homogeneous. A factor of E may follow the shape of cells (`problems.feti.structured`).
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ def glue(
     contact: csr_array,
     c: Vector,
     E: Vector,
+    shape: Vector | float = 1.0,
     rows: str = "orthonormal",
 ) -> Torn:
     """Pose a contact problem of the whole on the subdomains.
@@ -76,6 +77,7 @@ def glue(
         value
     contact, c : (m_I, n) and (m_I,) of the whole, normals, then tangents
     E : (nodes,) stiffness of the body that each node belongs to, without dimension
+    shape : factor of E in rows of supports and gluing, (n,) of the components or one
     rows : how copies are glued, one of GLUE
 
     """
@@ -98,7 +100,7 @@ def glue(
     norm = np.sqrt(B_I.multiply(B_I).sum(axis=1))
     E_of = np.repeat(E, d)
     softest = np.minimum.reduceat(E_of[contact.indices], contact.indptr[:-1])
-    scale = np.sqrt(np.append(E_of[of_row], softest / norm**2))
+    scale = np.sqrt(np.append((E_of * shape)[of_row], softest / norm**2))
     values = np.zeros(of_row.size)
     values[: reached.nnz] = np.repeat(supported, np.diff(reached.indptr))
     return Torn(

@@ -29,7 +29,7 @@ it, and 3.7 without, as it is if B holds the rows of that face alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -45,7 +45,7 @@ from harness import QP, Vector
 from harness.distributed.vectors import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
-from problems.feti.torn import Dense, Kind, Subdomains
+from problems.feti.torn import Condensed, Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
@@ -65,6 +65,11 @@ class Group(NamedTuple):
     explicit: bool  #: whether (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within each, ascending
+
+
+def condensed(groups: Sequence[Group]) -> list[Condensed]:
+    """Form (K⁺)_bb and S_bb of each group."""
+    return [group.kind.condensed(group.touched) for group in groups]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +165,8 @@ class DualOperator:
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
     equalities: int  #: rows that are equations, the first ones; the others are contact
+    #: forms (K⁺)_bb and S_bb of groups that are explicit
+    condense: Callable[[Sequence[Group]], list[Condensed]] = condensed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
@@ -242,13 +249,14 @@ class DualOperator:
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:
         """(K⁺)_bb and S_bb of each group: matrices, or what multiplies with them."""
+        groups = self.packed.groups
+        formed = iter(self.condense([g for g in groups if g.explicit]))
         return [
-            _explicit(g) if g.explicit else _implicit(g) for g in self.packed.groups
+            _explicit(g, next(formed)) if g.explicit else _implicit(g) for g in groups
         ]
 
 
-def _explicit(group: Group) -> tuple[Any, Any]:
-    blocks = group.kind.condensed(group.touched)
+def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
     if group.members.size == 1:
         return _Triangle.of(blocks.compliance), _Triangle.of(blocks.schur)
     return blocks

@@ -5,6 +5,17 @@ A block knows its place among the others, so everything that tearing and gluing 
 long as the sides of the grids. With aᵢ = 2 for a column of nodes where two blocks meet,
 otherwise 1, and bⱼ alike for rows, node (i, j) has aᵢbⱼ copies; the copies are numbered
 as their blocks are, from left to right and from below.
+
+The stiffest motion of an interface is a saw tooth along it, and the thinner the cells
+there, the stiffer it is. Between half planes of cells with the sides hₜ along the
+interface and hₙ across, tension and compression in turn meet the stiffness
+
+    s(r) = √((C₆₆ + C₁₁r²) / (C₆₆ + C₁₁)),    r = hₙ/hₜ
+
+relative to squares: the cells along a row have 4C₁₁/hₜ times the mass matrix of linear
+elements across and hₜC₆₆/3 times their stiffness matrix, and of these the half line has
+the Schur complement. Rows scaled by √s leave to the least eigenvalue of the dual what
+it has on squares (`shape_factors`).
 """
 
 from __future__ import annotations
@@ -16,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from harness import Vector
 from problems.fem.mesh import Nodes, StructuredGrid
 from problems.feti.tearing import blocks
 
@@ -169,6 +181,48 @@ class Layout:
             + across
         )
 
+    def lines(self, at: Places, *, ends: bool) -> NDArray[np.bool_]:
+        """Say whether a row, and a column, of each node (k, 2) separates blocks.
+
+        ends : sides of the grid count, too, as where supports hold them
+        """
+        found = []
+        for lines, line in ((self._rows, at.row), (self._columns, at.column)):
+            passed = lines.times[lines.start[at.body] + line] == 2
+            if ends:
+                last = np.diff(lines.start)[at.body] - 1
+                passed |= (line == 0) | (line == last)
+            found.append(passed)
+        return np.stack(found, axis=1)
+
+    def shapes(self, share: Vector, *, ends: bool) -> Vector:
+        """Return the `shape_factors` of all nodes.
+
+        share : (grids,) of the materials
+        """
+        found = []
+        for b, grid in enumerate(self.grids):
+            number = self.node_start[b] + np.arange(grid.nodes)
+            all_ = slice(None)
+            points = grid.block(all_, all_).reshape(grid.rows.size, -1, 2)
+            lines = self.lines(self.places(number), ends=ends)
+            found.append(shape_factors(spacings(points), lines, share[b]))
+        return np.concatenate(found)
+
+    def spacings(self, block: Nodes) -> NDArray[np.float64]:
+        """Return the `spacings` at the torn nodes (M, 2) of some blocks."""
+        found = [np.empty((0, 2))]
+        body = self.block.body[block]
+        for b, left, low, wide, high in zip(body, *self.corner(block), strict=True):
+            i, j = max(left - 1, 0), max(low - 1, 0)
+            around = slice(i, left + wide + 1), slice(j, low + high + 1)
+            grid = self.grids[b]
+            shape = grid.rows[around[1]].size, grid.columns[around[0]].size, 2
+            h = spacings(grid.block(*around).reshape(shape)).reshape(shape)
+            own = h[low - j : low - j + high, left - i : left - i + wide]
+            found.append(own.reshape(-1, 2))
+        return np.concatenate(found)
+
     def before(self, at: Places) -> NDArray[np.int64]:
         """Count, of each node, those before it that have as many copies."""
         columns, rows = self._columns, self._rows
@@ -232,6 +286,38 @@ class Layout:
             )
             alone.append(count - ends)
         return np.asarray(columns * rows - alone[0] * alone[1])
+
+
+def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean lengths (l·k, 2) of the edges of each node, along row and column.
+
+    points : (l, k, 2) of l rows and k columns of nodes
+    """
+    found = np.empty(points.shape)
+    for of, axis in ((0, 1), (1, 0)):
+        edges = np.linalg.norm(np.diff(points, axis=axis), axis=2)
+        before = edges.take([0], axis), edges
+        after = edges, edges.take([-1], axis)
+        found[..., of] = sum(np.concatenate(e, axis) for e in (before, after)) / 2
+    return found.reshape(-1, 2)
+
+
+def shape_factors(
+    spacing: NDArray[np.float64], lines: NDArray[np.bool_], share: Vector | float
+) -> Vector:
+    """Return s(r) of the interfaces at each node (k,), their mean where several meet.
+
+    Parameters
+    ----------
+    spacing, lines : (k, 2) as of `spacings` and `Layout.lines`; without a line it is 1
+    share : C₁₁ / (C₁₁ + C₆₆) of the material, (k,) or one for all
+
+    """
+    squares = (spacing[:, ::-1] / spacing) ** 2
+    share = np.reshape(share, (-1, 1))
+    s = np.where(lines, np.sqrt(1 - share + share * squares), 0.0).sum(axis=1)
+    count = lines.sum(axis=1)
+    return np.asarray(np.where(count > 0, s / np.maximum(count, 1), 1.0))
 
 
 class _Lines(NamedTuple):

@@ -96,6 +96,47 @@ def structured_bodies(
     return np.concatenate(labels)
 
 
+def compact_blocks(
+    points: NDArray[np.float64], cells: Nodes, divisions: tuple[int, int], most: int
+) -> NDArray[np.int64]:
+    """Label the cells of a graded structured mesh by blocks about as long as wide.
+
+    A block of more than most² cells is cut across where it is longer, at half of its
+    length. Blocks as long as `blocks` are in cells would be as long and thin as these,
+    and bending of long subdomains is what conditions their dual worst.
+
+    Parameters
+    ----------
+    points : (n, 2)
+    cells : (nx·ny, 4) anticlockwise, first along a row; a triangle repeats its last one
+    divisions : nx, ny
+    most : H/h of a square
+
+    Returns
+    -------
+    (nx·ny,) block of each cell
+
+    """
+    corners = points[cells].reshape(*divisions[::-1], 4, -1)
+    a, b, c, d = (corners[:, :, k] for k in range(4))
+    sides = [np.linalg.norm(s, axis=-1) / 2 for s in (c + d - a - b, b + c - a - d)]
+    label = np.zeros(divisions[::-1], dtype=np.int64)
+    left, count = [(slice(0, divisions[1]), slice(0, divisions[0]))], 0
+    while left:
+        block = left.pop()
+        lengths = [side[block].mean(axis=1 - k) for k, side in enumerate(sides)]
+        size = [0.0 if part.size == 1 else part.sum() for part in lengths]
+        if label[block].size <= most**2 or not any(size):
+            label[block], count = count, count + 1
+            continue
+        k = int(np.argmax(size))
+        ends = np.cumsum(lengths[k])
+        at = block[k].start + int(np.argmin(np.abs(ends[:-1] - ends[-1] / 2))) + 1
+        for part in (slice(at, block[k].stop), slice(block[k].start, at)):
+            left.append((part, block[1]) if k == 0 else (block[0], part))
+    return label.ravel()
+
+
 def decompose(
     points: NDArray[np.float64],
     cells: Nodes,

@@ -40,6 +40,7 @@ from problems.fem.mesh import (
 )
 from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
 from problems.feti.emission import StructuredBodies
+from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
@@ -71,10 +72,10 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
     )  # fmt: skip
     problem = path.problem(p["step"], p["iterate"])
     primal, friction = problem.primal, problem.friction
-    subdivided = partial(_subdivided, p["feti"], *geometry)
+    cut = partial(subdivided, p["feti"], *geometry)
     return contact_case(
         bodies, primal, form,
-        torn=posed_on(params, subdivided, primal, friction),
+        torn=posed_on(params, cut, primal, friction),
         floating=lambda: _floating(*geometry),
         clamped=lambda: _clamped(*geometry),
         supported=lambda: _clamped(*geometry),
@@ -129,11 +130,13 @@ def _tip(sides: Mapping[str, Nodes]) -> Nodes:
 
 
 @lru_cache(maxsize=4)
-def _subdivided(
+def subdivided(
     most: int, Nr: int, Nh: int, radial: int, plane: Plane
 ) -> SubdividedBodies:
+    """Cut beam and ring into subdomains of at most so many cells a side."""
     label = structured_bodies([(8 * Nr, Nr), (12 * Nh, radial)], most)
-    return subdivide(model(Nr, Nh, radial, plane), label)
+    layout = Layout.of(_grids(Nr, Nh, radial), most)
+    return subdivide(model(Nr, Nh, radial, plane), label, layout)
 
 
 @lru_cache(maxsize=4)

@@ -64,7 +64,7 @@ from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
 from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
-from problems.feti.tearing import structured_bodies
+from problems.feti.tearing import compact_blocks
 from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
@@ -198,17 +198,21 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
 
 
 def subdivided(bodies: Bodies, most: int) -> SubdividedBodies:
-    """Cut the half discs into blocks of rings and sectors.
+    """Cut the half discs into blocks of rings and sectors, about as long as wide.
 
-    most : cells a side; the triangles at a centre are the last ring
+    most : blocks have at most so many cells, squared; the triangles at a centre are the
+        last ring
     """
     sides, cells = bodies.mesh.boundaries, np.bincount(bodies.body)
     arcs = [sides[name] for name in ("arc", "upper_arc", "lower_arc") if name in sides]
-    divisions = [
-        (arc.size - 1, int(count) // (arc.size - 1))
-        for arc, count in zip(arcs, cells, strict=True)
-    ]
-    return subdivide(bodies, structured_bodies(divisions, most))
+    label, first = np.empty_like(bodies.body), 0
+    for b, (arc, count) in enumerate(zip(arcs, cells, strict=True)):
+        own, divisions = bodies.body == b, (arc.size - 1, int(count) // (arc.size - 1))
+        disc = compact_blocks(
+            bodies.mesh.points, bodies.mesh.cells[own], divisions, most
+        )
+        label[own], first = first + disc, first + int(disc.max()) + 1
+    return subdivide(bodies, label)
 
 
 def kept_on_axis(bodies: Bodies) -> Bodies:

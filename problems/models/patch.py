@@ -62,6 +62,7 @@ from problems.fem.mesh import (
 from problems.fem.stress import gauss_stress
 from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
 from problems.feti.emission import StructuredBodies
+from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 from problems.ranges import SHORTEST
 
@@ -99,7 +100,8 @@ def subdivided(bodies: Bodies, params: Mapping[str, Value]) -> SubdividedBodies:
     """Cut the blocks into subdomains of at most `feti` cells a side."""
     p: Any = params
     divisions = [_divisions(p[name]) for name in ("lower", "upper")]
-    return subdivide(bodies, structured_bodies(divisions, p["feti"]))
+    layout = Layout.of(_grids(params), p["feti"])
+    return subdivide(bodies, structured_bodies(divisions, p["feti"]), layout)
 
 
 class Homogeneous(NamedTuple):

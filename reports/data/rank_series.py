@@ -178,7 +178,8 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
         title = f"{name}, {clean(solver, 40)}, tol {tolerance(tol)}"
         answers = [Member(o.first.ranks, n, o) for o, n in _sized(of, copies=False)]
         copied = [o for o, _ in _sized(of, copies=True)]
-        for first in sorted(m for m in answers if m.ranks == 1):
+        alone = [m for m in answers if m.ranks == 1]
+        for first in sorted(alone, key=lambda m: m.dofs):
             members = tuple(_grown(first, answers))
             if len(members) > 1:
                 found.append(

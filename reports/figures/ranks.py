@@ -39,6 +39,7 @@ from reports.figures.style import (
 from reports.statistics.intervals import Interval
 
 _BAND = 0.18  #: opacity
+_PALE = "#a9cde6"  #: a band in the first colour, in a legend
 _LONG = 72  #: letters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: times the values that an axis goes on for intervals
@@ -65,6 +66,9 @@ def strong_figure(found: Sequence[StrongSeries]) -> Figure:
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
     if any(s.copies for s in found):
         keys.append(Key(label="as many copies at once", look=_copies_look(INK)))
+    if any(s.crowded(n) for s in found for n in s.several):
+        crowded = replace(look(0), dash=None, fill="none")
+        keys.append(Key(label="more ranks than CPUs: they took turns", look=crowded))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
     return _figure(panels, keys, columns=1)
 
@@ -81,7 +85,12 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
         for n in s.several
         if (ratio := s.reach(n, phase)) is not None
     ]
-    curves = [_curve(measured, _line(style), s.solver)]
+    free = [point for point in measured if not s.crowded(point[0])]
+    crowded = [point for point in measured if s.crowded(point[0])]
+    curves = [_curve(free, _line(style), s.solver)]
+    if crowded:
+        hollow = replace(style, dash=None, fill="none")
+        curves.append(_curve(crowded, hollow, s.solver))
     if len(copied) > 1:
         curves.insert(0, _curve(copied, _copies_look(style.colour), s.solver))
     return curves
@@ -140,7 +149,7 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
         Key(label="model, not measured",
             look=Look(colour=COLOURS[0], dash=DASHED, width=1.4)),
         Key(label="band of the fit",
-            look=Look(colour=COLOURS[0], width=6.0, opacity=_BAND)),
+            look=Look(colour=_PALE, width=6.0)),
         Key(label="as many times as ranks", look=GUIDE),
     )  # fmt: skip
     return _figure(panels, keys, columns=4)
@@ -168,7 +177,7 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
                 start += taken
     keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
     keys.append(Key(label="rest", look=_bar(_REST)))
-    names = [f"{legible(s.case, 44)}, {n} ranks" for s, n in found]
+    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in found]
     panel = Panel(
         x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
         marks=tuple(marks), grid="x",
@@ -186,7 +195,9 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
         marks: list[Mark] = []
         for i, s in enumerate(found):
             first = s.members[0].answer
-            copied = [(1, first), *sorted(s.copies.items())]
+            beside = {m.ranks for m in s.members}
+            copied = [(1, first)]
+            copied += [(n, o) for n, o in sorted(s.copies.items()) if n in beside]
             if len(copied) > 1:
                 marks += _times(copied, phase, _copies_look(look(i).colour), s.solver)
             answers = [(m.ranks, m.answer) for m in s.members]

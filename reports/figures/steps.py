@@ -18,6 +18,7 @@ from reports.document.figure import (
     Panel,
     Row,
     Series,
+    in_rows,
     numbers,
 )
 from reports.document.formatting import exponent
@@ -111,12 +112,12 @@ def _figure(
         )  # fmt: skip
     if not panels:
         return None
-    (low, *_), (high, *_) = points[0], points[-1]
-    if len(panels) > 2 and x.ticks is None and high >= 10 * low:
-        panels = [replace(p, x=replace(p.x, most=4)) for p in panels]  # has less room
+    rows = in_rows(panels, 2)
+    if len(panels) == 3:  # κ below, as wide as both
+        rows = (rows[0], Row(panels=(replace(panels[2], span=2),)))
     return Figure(
-        rows=(Row(panels=tuple(panels)),),
-        height=2.5 + LEGEND_LINE * -(-len(keys) // 2),
+        rows=rows,
+        height=0.2 + 2.3 * len(rows) + LEGEND_LINE * -(-len(keys) // 2),
         legend=below(keys, 2),
     )
 
@@ -154,7 +155,9 @@ def _condition_numbers(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
     ]
     return [
         _Curve(
-            label=rf"$\kappa${legible(name.removeprefix(KAPPA).replace('_', ' '))}",
+            label=" ".join(
+                [r"$\kappa$", *legible(name.removeprefix(KAPPA)).split("_")[1:]]
+            ),
             x=tuple(x for x, _ in points),
             y=tuple(float(o.quantities[name]) for _, o in points),
             answers=tuple(o for _, o in points),

@@ -88,9 +88,9 @@ def _prose(strong: Sequence[StrongSeries], weak: Sequence[WeakSeries]) -> list[s
         "Speed-up is the time on one rank over that on N, paired within blocks and "
         "averaged by logarithms, with Student's 95 % interval; efficiency is speed-up "
         "over N. CPUs of one machine share its memory, so that N independent solves at "
-        "once are not N times as fast either: copies tells how many solves of one rank "
-        "N of them do in the time of one, and of copies is the speed-up over that. "
-        "Ranks that would do as well as independent solves are at 1."
+        "once are not N times as fast as one either. Copies is the speed-up that they "
+        "reach together; of copies is that of N ranks over it, 1 where ranks on one "
+        "case do as well as independent solves."
     ]
     if any(s.several and not s.copies for s in strong):
         found.append(

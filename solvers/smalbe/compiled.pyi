@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Matrix, Vector
-from solvers.smalbe.mprgp import Rules
-from solvers.smalbe.outer_loop import Constants, Iterate
+from solvers.smalbe.options import Options
+from solvers.smalbe.outer_loop import Iterate
 from solvers.smalbe.projected import Projected
 
 Array = NDArray[np.float64]
@@ -21,14 +21,13 @@ class Solver:
         self,
         problem: Projected,
         F: Product,
-        rules: Rules,
-        alpha: float,
+        options: Options,
         preconditioned: bool,
     ) -> None: ...
     def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
     def smalbe(
         self,
-        constants: Constants,
+        options: Options,
         tol: float,
         at: Iterate,
         infeasible: Callable[[Vector], bool],
@@ -46,7 +45,18 @@ class Solver:
         self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
 
-def residual_bound(*vectors: Vector, G: Array) -> float: ...
+def residual_bound(
+    cost: Vector,
+    told_diagonal: Vector,
+    x: Vector,
+    y: Vector,
+    z_box: Vector,
+    Fx: Vector,
+    lower: Vector,
+    upper: Vector,
+    right: Vector,
+    rows: Array,
+) -> float: ...
 def orthonormal(
     G: Array, e: Vector
 ) -> tuple[

@@ -53,8 +53,8 @@ cdef extern from "vectors.h" nogil:
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
-    int cholesky(double *S, Py_ssize_t k)
-    void solve(const double *L, double *y, Py_ssize_t k)
+    int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
+    void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
@@ -217,6 +217,8 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
     cdef Py_ssize_t i, j
     cdef double s
     result = np.zeros(m)
+    if not m:
+        return result
     cdef double[::1] y = result
     for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
@@ -224,6 +226,21 @@ def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
             s -= R[i, j] * y[kept[j]] * size[kept[j]]
         y[kept[i]] = s / (R[i, i] * size[kept[i]])
     return result
+
+
+cdef double FLAT = 10.0  # ratio of Ritz values of one size
+
+cdef enum:
+    FEW = 5
+
+
+cdef bint is_flat(const double[::1] diagonal, const double[::1] off) except -1:
+    """Whether all Ritz values of the first FEW steps are of one size."""
+    cdef double[::1] theta = np.array(diagonal[:FEW]), between = np.array(off[:FEW])
+    cdef double none
+    cdef int order = FEW, one = 1, info = 0
+    dstev(b"N", &order, &theta[0], &between[0], &none, &one, &none, &info)
+    return theta[0] >= theta[FEW - 1] / FLAT
 
 
 def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int steps):
@@ -259,6 +276,8 @@ def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int step
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
+            break
+        if kept == FEW and is_flat(told, offs):
             break
     if not kept:
         return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
@@ -323,34 +342,73 @@ cdef struct Until:
     double M
 
 
-cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n).
-
-    It keeps U_F U_Fᵀ for the face F for which it was asked last.
-    """
+cdef class Gram:
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
 
     cdef Py_ssize_t n, k, stride, flips
-    cdef bint entered
-    cdef double tau
     cdef double[:, ::1] U
-    cdef double[::1] w, room
-    cdef double *root
-    cdef double *gram
+    cdef double[::1] room
+    cdef int[::1] where
+    cdef double *values  # (k, k), rows of `stride` numbers
     cdef double *column
     cdef double *held
-    cdef int[::1] where
+
+    def __cinit__(self, double[:, ::1] U):
+        self.U, self.k, self.n = U, U.shape[0], U.shape[1]
+        self.stride, self.flips = (self.k + 3) & ~3, self.n + 1
+        self.room = np.zeros(self.stride * (self.stride + 1) + self.n)
+        self.where = np.empty(self.n, dtype=np.int32)
+        self.values = &self.room[0]
+        self.column = self.values + self.stride * self.stride
+        self.held = self.column + self.stride
+
+    cdef void enter(self, const double *piece) noexcept:
+        """Have it be that of the face where `piece` is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew.
+        """
+        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        if self.flips > self.n:
+            self.flips = 0
+            memset(self.values, 0, stride * stride * sizeof(double))
+            for i in range(k):
+                self.values[i * stride + i] = 1.0
+            memset(self.held, 0, self.n * sizeof(double))
+        for c in range(changed(piece, self.held, self.n, &self.where[0])):
+            i = self.where[c]
+            for j in range(k):
+                self.column[j] = self.U[j, i]
+            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
+            self.flips += 1
+
+
+cdef class Model:
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
+
+    cdef Py_ssize_t n, k
+    cdef double tau
+    cdef double[:, ::1] U
+    cdef double[::1] room
+    cdef double *w  # (k,)
+    cdef double *root  # of w
+    cdef Gram gram
 
     @staticmethod
-    cdef Model above_tail(double[:, ::1] U, double[::1] w, double tau):
-        """Leave out the rows whose w is not positive."""
+    cdef Model above_tail(double[:, ::1] U, const double *w, double shift, double tau):
+        """Add `shift` to w, and leave out the rows where that is not positive."""
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0
-        for i in range(w.shape[0]):
-            k += w[i] > 0
-        if k < w.shape[0]:
-            kept = np.asarray(w) > 0
-            U, w = np.asarray(U)[kept], np.asarray(w)[kept]
-        B.U, B.w, B.tau, B.k, B.n = U, w, tau, k, U.shape[1]
+        cdef Py_ssize_t i, k = 0, found = U.shape[0]
+        B.room = np.empty(2 * found)
+        B.w, B.root = pointer(B.room), pointer(B.room) + found
+        for i in range(found):
+            B.w[k] = w[i] + shift
+            k += B.w[k] > 0
+        if k < found:
+            U = np.asarray(U)[[i for i in range(found) if w[i] + shift > 0]]
+        for i in range(k):
+            B.root[i] = sqrt(B.w[i])
+        B.U, B.tau, B.k, B.n = U, tau, k, U.shape[1]
         return B
 
     cdef double *rows(self) noexcept:
@@ -364,45 +422,19 @@ cdef class Model:
 
     cdef Model with_tail(self, double tau):
         """Change τ and leave w + τ as it is, where that is above τ."""
-        cdef double[::1] w = np.array(self.w) if self.k else np.zeros(0)
-        cdef Py_ssize_t i
+        cdef Model B
         if not self.k:
             return Model.of_norm(tau, self.n)
-        for i in range(self.k):
-            w[i] += self.tau - tau
-        return Model.above_tail(self.U, w, tau)
+        B = Model.above_tail(self.U, self.w, self.tau - tau, tau)
+        if B.k == self.k:
+            B.gram = self.gram  # of the same rows
+        return B
 
     cdef int enter(self, const double *piece) except -1:
-        """Have the Gram matrix be that of the face where `piece` is zero.
-
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
-        """
-        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
-        cdef double was
-        if not self.entered:
-            self.entered = True
-            self.stride = stride = (k + 3) & ~3
-            self.room = np.zeros(stride * (stride + 2) + self.n)
-            self.gram = &self.room[0]
-            self.root = self.gram + stride * stride
-            self.column, self.held = self.root + stride, self.root + 2 * stride
-            self.where, self.flips = np.empty(self.n, dtype=np.int32), self.n + 1
-            for j in range(k):
-                self.root[j] = sqrt(self.w[j])
-        if self.flips > self.n:
-            self.flips = 0
-            memset(self.gram, 0, stride * stride * sizeof(double))
-            for i in range(k):
-                self.gram[i * stride + i] = 1.0
-            memset(self.held, 0, self.n * sizeof(double))
-        for c in range(changed(piece, self.held, self.n, &self.where[0])):
-            i = self.where[c]
-            was = 1 - self.held[i]
-            for j in range(k):
-                self.column[j] = self.U[j, i]
-            add_gram(2 * was - 1, self.column, self.gram, stride)
-            self.flips += 1
+        """Have the Gram matrix of the face where `piece` is zero."""
+        if self.gram is None:
+            self.gram = Gram(self.U)
+        self.gram.enter(piece)
         return 0
 
 
@@ -423,7 +455,7 @@ cdef copied(const double *v, Py_ssize_t n):
 cdef class Solver:
     """One projected problem, the rules of its solution, and room for the vectors.
 
-    problem : a `Projected` with the `Product` P; rules : a `Rules`
+    problem : a `Projected` with the `Product` F; options : an `Options`
     """
 
     cdef Product F
@@ -458,6 +490,8 @@ cdef class Solver:
     cdef double *box_upper
     cdef double *piece
     cdef double *piece2
+    cdef double *x0
+    cdef double *g0
     cdef double *Cv
     cdef double *Cw
     cdef double *y
@@ -473,7 +507,7 @@ cdef class Solver:
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
 
-    def __init__(self, problem, Product F, rules, double alpha, bint preconditioned):
+    def __init__(self, problem, Product F, options, bint preconditioned):
         cdef Py_ssize_t i, k, n
         rows, spectrum = problem.rows, problem.spectrum
         self.problem, self.F = problem, F
@@ -484,10 +518,11 @@ cdef class Solver:
         self.right, self.told_q = _whole(problem.b), _whole(problem.q)
         self.least, self.most = map(_whole, problem.bounds)
         self.told_diagonal = _whole(problem.diagonal)
-        self.alpha, self.Gamma_square, self.reduced = alpha, rules.Gamma**2, rules.reduced
-        self.expansion = ("std", "projcg", "mixed", "model").index(rules.expansion)
-        self.newton_proportions = rules.proportioning == "model"
-        self.plain = rules.expansion != "model"
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.reduced = options.reduced
+        self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.newton_proportions = options.proportioning == "model"
+        self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
@@ -497,7 +532,7 @@ cdef class Solver:
         self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
         self.lower, self.upper = pointer(self.least), pointer(self.most)
         self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
-        self.room = np.empty(17 * n + 2 * self.r + (6 + k) * k)
+        self.room = np.zeros(19 * n + 2 * self.r + (9 + k) * (k + 3))
         cdef double *at = pointer(self.room)
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -507,11 +542,12 @@ cdef class Solver:
         at += 4 * n
         self.box_lower, self.box_upper, self.rhs = at, at + n, at + 2 * n
         self.piece, self.piece2 = at + 3 * n, at + 4 * n
-        at += 5 * n
+        self.x0, self.g0 = at + 5 * n, at + 6 * n
+        at += 7 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
-        self.slope2, self.c, self.core = at + 4 * k, at + 5 * k, at + 6 * k
-        at += (6 + k) * k
-        self.Cv, self.Cw = at, at + self.r
+        self.slope2, self.c, self.Cv = at + 4 * k, at + 5 * k, at + 6 * k
+        self.Cw = self.Cv + self.r
+        self.core = self.Cw + self.r
 
     cdef int find_upper_end(self, const double[::1] values, const double[::1] residuals,
                             vectors, rows) except -1:
@@ -563,24 +599,25 @@ cdef class Solver:
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
         cdef Py_ssize_t i, k = self.above.shape[0]
-        cdef double[::1] w
         if self.known is None or self.known_rho != rho:
-            w = np.array(self.above)
-            for i in range(k - self.r, k):
-                w[i] += rho
-            self.known, self.known_rho = Model.above_tail(self.vectors, w, self.tail), rho
+            for i in range(k):
+                self.c[i] = self.above[i] + (rho if i >= k - self.r else 0.0)
+            self.known = Model.above_tail(self.vectors, self.c, 0.0, self.tail)
+            self.known_rho = rho
         return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k
+        cdef Py_ssize_t i, j, k = B.k, stride
         cdef double *S = self.core
+        cdef double *U_F
         B.enter(piece)
+        U_F, stride = B.gram.values, B.gram.stride
         for i in range(k):
-            for j in range(i + 1):
-                S[i * k + j] = B.root[i] * B.root[j] * B.gram[i * B.stride + j]
-            S[i * k + i] += B.tau
-        if not cholesky(S, k):
+            for j in range(i, k):
+                S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
+            S[i * stride + i] += B.tau
+        if not cholesky(S, k, stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -622,7 +659,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, dy, k)
+            solve(self.core, dy, k, B.gram.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -651,10 +688,10 @@ cdef class Solver:
             memcpy(y, there, k * sizeof(double))
             memcpy(slope, slope_there, k * sizeof(double))
             memcpy(piece, piece_there, n * sizeof(double))
-        largest = B.tau + np.max(B.w)  # seldom
-        return self.step_of_model(
-            Model.of_norm(largest, n), x, g, lower, upper, s
-        )
+        t = 0.0
+        for i in range(k):
+            t = fmax(t, B.w[i])
+        return self.step_of_model(Model.of_norm(B.tau + t, n), x, g, lower, upper, s)
 
     cdef Model raised(self, Model B, const double *s, double sHs):
         """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
@@ -699,7 +736,7 @@ cdef class Solver:
         rows_times(M.rows(), z, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.c, M.k)
+        solve(self.core, self.c, M.k, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         add_combination(-1.0, M.rows(), self.c, z, M.k, n)
@@ -781,7 +818,8 @@ cdef class Solver:
         self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
         return 1
 
-    cdef int expand(self, double cg, double feasible, bint is_first) except -1:
+    cdef int expand(self, double cg, double feasible, bint is_first, long most,
+                    double enough, bytearray trace) except -1:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
@@ -797,7 +835,7 @@ cdef class Solver:
                 memcpy(self.g, self.g2, n * sizeof(double))
                 return b"e"
         if self.expansion == MODEL:
-            return self.expand_by_model(cg, feasible, is_first)
+            return self.expand_by_model(cg, feasible, is_first, most, enough, trace)
         self.to(feasible, self.p, self.Hp)
         self.split()
         for i in range(n):
@@ -806,8 +844,9 @@ cdef class Solver:
         self.gradient(self.x, self.g)
         return b"f" if self.expansion == MIXED else b"e"
 
-    cdef int expand_by_model(self, double cg, double feasible, bint is_first) except -1:
-        """Project x − α_cg p on the box in the metric of the model."""
+    cdef int expand_by_model(self, double cg, double feasible, bint is_first, long most,
+                             double enough, bytearray trace) except -1:
+        """Project z, where CG leads beyond the box, on it in the metric of the model."""
         cdef Py_ssize_t i, n = self.n
         cdef double *p = self.p
         cdef double *Hp = self.Hp
@@ -815,9 +854,12 @@ cdef class Solver:
         cdef double *Hs = self.Hs
         cdef double *lower = self.box_lower
         cdef double *upper = self.box_upper
-        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, change, tau
-        cdef bint held, release = is_first and self.B.k > 0
-        change = -feasible * self.told[2] + 0.5 * feasible * feasible * self.told[3]
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, tau = self.B.tau
+        cdef double change = -feasible * self.told[2] + 0.5 * feasible**2 * self.told[3]
+        cdef double least = self.reduced_square / (2 * tau)
+        cdef bint held, is_flat = not self.B.k, release = is_first and not is_flat
+        memcpy(self.x0, self.x, n * sizeof(double))
+        memcpy(self.g0, self.g, n * sizeof(double))
         self.to(feasible, p, Hp)
         for i in range(n):
             held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
@@ -826,7 +868,9 @@ cdef class Solver:
             upper[i] = self.x[i] if held else self.upper[i]
             self.x2[i] = self.x[i] - beyond * p[i]
             self.g2[i] = self.g[i] - beyond * Hp[i]
-        tau, self.B.tau = self.B.tau, self.B.tau / self.alpha
+        if beyond and is_flat:
+            self.minimise_beyond(most, enough, trace)
+        self.B.tau = tau / self.alpha
         self.step_of_model(self.B, self.x2, self.g2, lower, upper, s)
         self.B.tau = tau
         within(self.x2, self.x, lower, upper, s, n)
@@ -834,20 +878,63 @@ cdef class Solver:
             if lower[i] == upper[i] and not release:
                 s[i] = 0.0
         if dot(self.g, s, n) >= 0:
-            beyond = 0.0
+            memcpy(self.x2, self.x, n * sizeof(double))
+            memcpy(self.g2, self.g, n * sizeof(double))
             self.step_of_model(self.B, self.x, self.g, lower, upper, s)
         length = self.searched(s, Hs)
-        if length == 0:
-            return b"e"
         if isinf(length):
             return 0
-        if -self.told[2] + 0.5 * self.told[3] + change < 0:
-            length = fmax(length, 1.0)
-        self.to(length, s, Hs)
-        add(-beyond, p, s, n)
-        add(-beyond, Hp, Hs, n)
-        self.B = self.raised(self.B, s, dot(s, Hs, n))
+        if length:
+            if -self.told[2] + 0.5 * self.told[3] + change < 0:
+                length = fmax(length, 1.0)
+            change += -length * self.told[2] + 0.5 * length**2 * self.told[3]
+            for i in range(n):  # x + s − z and its product
+                self.x2[i] = self.x[i] - s[i] - self.x2[i]
+                self.g2[i] = self.g[i] - Hs[i] - self.g2[i]
+            self.to(length, s, Hs)
+            self.B = self.raised(self.B, self.x2, dot(self.x2, self.g2, n))
+        if is_flat and -change < least:
+            return self.project_gradient(tau)
         return b"e"
+
+    cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
+        """Go on with CG from z on the face as if it had no bounds."""
+        cdef Py_ssize_t i, n = self.n
+        cdef long step
+        cdef double curvature = dot(self.p, self.Hp, n), length
+        for step in range(most):
+            for i in range(n):
+                self.phi[i] = self.free[i] * self.g2[i]
+            if dot(self.phi, self.phi, n) <= enough:
+                break
+            turn(self.phi, dot(self.phi, self.Hp, n) / curvature, self.p, n)
+            self.H(self.p, self.Hp)
+            trace.append(c'b')
+            curvature = dot(self.p, self.Hp, n)
+            if curvature <= 0:
+                break
+            length = dot(self.phi, self.p, n) / curvature
+            add(-length, self.p, self.x2, n)
+            add(-length, self.Hp, self.g2, n)
+        return 0
+
+    cdef int project_gradient(self, double tau) except -1:
+        """Take the step of plain gradient projection from where the expansion began."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double length
+        memcpy(self.x, self.x0, n * sizeof(double))
+        memcpy(self.g, self.g0, n * sizeof(double))
+        for i in range(n):
+            self.s[i] = fmin(
+                fmax(self.x[i] - self.free[i] * self.g[i] / tau, self.lower[i]),
+                self.upper[i],
+            ) - self.x[i]
+        length = self.searched(self.s, self.Hs)
+        if length == 0 or isinf(length):
+            return 0
+        self.B = self.raised(self.B, self.s, dot(self.s, self.Hs, n))
+        self.to(length, self.s, self.Hs)
+        return b"f"
 
     cdef int gradient(self, const double *x, double *g) except -1:
         """g ← Hx − b; one product."""
@@ -858,19 +945,20 @@ cdef class Solver:
     cdef int minimise(self, Until until, double tol, double energy, double b_size,
                       long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
-        cdef long steps = 0, idle = 0
+        cdef long idle = 0, inside = 0  # CG steps in this face
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
-        cdef double weight
+        cdef double weight, began
         self.split()
         self.enter_face()
+        began = self.phi_square
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
                 return 1
-            if steps >= most:
+            if len(trace) >= most:
                 return 0
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
@@ -888,17 +976,20 @@ cdef class Solver:
                 if self.told[0] <= self.told[1]:
                     self.minimise_along_p()
                     self.tell(b"c", trace, note)
-                    steps += 1
+                    inside += 1
                     continue
-                letter = self.expand(self.told[0], self.told[1], not has_expanded)
+                letter = self.expand(
+                    self.told[0], self.told[1], not has_expanded, max(inside, 1), began,
+                    trace,
+                )
                 has_expanded = True
             if not letter:
                 return 0
             self.split()
             self.enter_face()
+            inside, began = 0, self.phi_square
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
-            steps += 1
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
@@ -978,18 +1069,24 @@ cdef class Solver:
     def begin(self, const double[::1] x, const double[::1] mu, double rho):
         """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
         cdef Py_ssize_t i, n = self.n
-        start, gradient = np.empty(n), np.empty(n)
+        start, gradient = np.empty(n), np.zeros(n)
+        cdef bint moved = False
         cdef double[::1] nu = start, g = gradient
         self.rho = rho
         for i in range(n):
             nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
-        self.H(pointer(nu), pointer(g))
+            moved = moved or nu[i] + self.x_tilde[i] != 0
+        if moved:
+            self.H(pointer(nu), pointer(g))
+        else:  # PFPν = 0
+            self.infeasibility(pointer(nu))
+            add_combination(rho, first(self.C), self.Cv, pointer(g), self.r, n)
         add(-1.0, self.b, pointer(g), n)
         for i in range(self.r):
             add(mu[i], &self.C[i, 0], pointer(g), n)
         return start, gradient
 
-    def smalbe(self, constants, double tol, at, infeasible, watch=None):
+    def smalbe(self, options, double tol, at, infeasible, watch=None):
         """Run the outer loop on from `at`, as `solvers.smalbe.outer_loop.smalbe` does.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
@@ -1001,8 +1098,8 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = -INFINITY, lagrangian, error, M = at.M
-        cdef long left = constants.max_steps - len(at.steps) - len(at.outer)
-        cdef double energy = constants.energy
+        cdef long left = options.max_steps - len(at.steps) - len(at.outer)
+        cdef double energy = options.energy
         cdef bint stopped, enough, solved, stalled
         cdef Until until
         cdef const double[::1] nu = _whole(at.nu), g = _whole(at.g)
@@ -1013,7 +1110,7 @@ cdef class Solver:
         cdef double[::1] mu = np.array(at.mu)
         cdef double b_size = sqrt(dot(self.b, self.b, n))
         b_size = b_size or sqrt(dot(self.g, self.g, n))
-        until.small, until.coarse = tol * b_size, constants.eta * b_size
+        until.small, until.coarse = tol * b_size, options.eta * b_size
         done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
         status = "iteration_limit"
         while True:
@@ -1047,9 +1144,9 @@ cdef class Solver:
                 add(self.rho * self.Cv[i], &self.C[i, 0], self.g, n)
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
-                M *= constants.beta
-                if constants.rho_growth != 1:
-                    self.change_penalty(constants.rho_growth * self.rho)
+                M *= options.beta
+                if options.rho_growth != 1:
+                    self.change_penalty(options.rho_growth * self.rho)
             if solved:
                 status = "solved"
                 break
@@ -1094,68 +1191,84 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result = np.zeros((4, n))
-        cdef const double[::1] v = nu, low = _whole(lb), high = _whole(ub)
-        cdef double[::1] x, z_box, Fx, rest, at = np.empty(n)
-        cdef double[::1] a = self.norm * np.asarray(mu), da = np.zeros(r)
-        cdef double[:, ::1] S = np.zeros((r, r))
+        result, multipliers = np.zeros((3, n)), np.empty(r)
+        cdef double[:, ::1] whole = result, S
+        cdef const double[::1] v = nu, least = _whole(lb), most = _whole(ub), at_mu = mu
+        cdef double[::1] a = multipliers
+        cdef double *x = first(whole)
+        cdef double *z_box = x + n
+        cdef double *Fx = z_box + n
+        cdef double *rest = self.s
+        cdef double *at = self.Hs  # −2 at the lower bound, 1 at the upper, −1 at both
+        cdef double *da = self.Cv
         cdef double s
-        x, z_box, Fx, rest = result
         for i in range(n):
             at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
             s = self.x_tilde[i] + v[i]
-            s = low[i] if at[i] < 0 else (high[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, low[i]), high[i])  # l − x̃ + x̃ may differ in the last bit
-        self.F.apply(&x[0], &Fx[0])
+            s = least[i] if at[i] < 0 else (most[i] if at[i] > 0 else s)
+            x[i] = fmin(fmax(s, least[i]), most[i])  # l − x̃ + x̃ may differ from l
+        self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
-        for i in range(r):
-            a[i] -= dot(&self.C[i, 0], &rest[0], n)
-        for i in range(r):
-            add(a[i], &self.C[i, 0], &rest[0], n)
-        for k in range(n):
-            if at[k] == 0:
-                for i in range(r):
-                    da[i] += self.C[i, k] * rest[k]
-                    for j in range(i + 1):
-                        S[i, j] += self.C[i, k] * self.C[j, k]
         if r:
+            S = np.zeros((r, r))
+            rows_times(first(self.C), rest, da, r, n)
+            for i in range(r):
+                a[i] = self.norm * at_mu[i] - da[i]
+                da[i] = 0.0
+            add_combination(1.0, first(self.C), pointer(a), rest, r, n)
+            for k in range(n):
+                if at[k] == 0:
+                    for i in range(r):
+                        da[i] += self.C[i, k] * rest[k]
+                        for j in range(i + 1):
+                            S[i, j] += self.C[i, k] * self.C[j, k]
             dpotrf(b"U", &order, &S[0, 0], &order, &info)
             for i in range(r):
                 if info or S[i, i] < 1e-4:
                     return None
-            dpotrs(b"U", &order, &one, &S[0, 0], &order, &da[0], &order, &info)
-        for i in range(r):
-            a[i] -= da[i]
-            add(-da[i], &self.C[i, 0], &rest[0], n)
+            dpotrs(b"U", &order, &one, &S[0, 0], &order, da, &order, &info)
+            for i in range(r):
+                a[i] -= da[i]
+            add_combination(-1.0, first(self.C), da, rest, r, n)
         for i in range(n):
             if at[i] < 0:
                 z_box[i] = -fmax(rest[i], 0.0)
-            if at[i] == 1 or at[i] == -1:  # −1 is both
+            if at[i] == 1 or at[i] == -1:
                 z_box[i] -= fmin(rest[i], 0.0)
-        return np.asarray(x), np.asarray(a), np.asarray(z_box), np.asarray(Fx)
+        return result[0], multipliers, result[1], result[2]
 
 
-def residual_bound(*vectors, G):
+def residual_bound(
+    cost, told_diagonal, const double[::1] x, const double[::1] y,
+    const double[::1] z_box, const double[::1] Fx, lower, upper, right,
+    const double[:, ::1] rows,
+):
     """Bound the worst of `harness.kkt_residuals` from above, without products.
 
-    vectors : q, the diagonal of P (empty for an operator), x, y, z_box, Px, lb, ub, e;
-    G (m, n), e (m,): the rows Gx = e
+    cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
+    x, y, z_box, Fx : the point and Px
+    lower, upper, right, rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
 
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef const double[:, ::1] rows = G
-    cdef const double[::1] q, diagonal, x, y, z_box, Fx, lb, ub, e
-    q, diagonal, x, y, z_box, Fx, lb, ub, e = map(_whole, vectors)
+    cdef const double[::1] q = _whole(cost), diagonal = _whole(told_diagonal)
+    cdef const double[::1] e = _whole(right)
+    cdef const double[::1] lb = _whole(lower), ub = _whole(upper)
     cdef Py_ssize_t i, j, n = x.shape[0], m = e.shape[0]
     cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
     cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-    cdef double[::1] forces = np.array(z_box), size = np.empty(n)
-    if not diagonal.shape[0]:
+    cdef double[:, ::1] room
+    cdef double *forces
+    cdef double *size
+    if not diagonal.shape[0] or not n:
         return INFINITY
+    room = np.empty((2, n))
+    forces, size = &room[0, 0], &room[1, 0]
+    memcpy(forces, &z_box[0], n * sizeof(double))
     for i in range(m):
-        add(y[i], &rows[i, 0], pointer(forces), n)
+        add(y[i], &rows[i, 0], forces, n)
         held += e[i] * y[i]
     for i in range(n):
         if not lb[i] <= x[i] <= ub[i]:

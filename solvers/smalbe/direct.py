@@ -111,7 +111,7 @@ class _Task:
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
         worst = residual_bound(
-            qp.q, faces.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, G=self.rows.G
+            qp.q, faces.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, self.rows.G
         )
         if worst == np.inf:  # it tells nothing
             worst = kkt_residuals(qp, self.solution(x, y, z_box)).worst

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -39,7 +38,9 @@ from solvers.smalbe.projected import (
 from solvers.smalbe.rows import DenseRows, Rows, is_sparse
 from solvers.smalbe.spectrum import random_start
 
-STEPS = {"c": "cg", "e": "expansion", "f": "fallback", "p": "proportioning"}
+STEPS = {
+    "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
+}  # fmt: skip
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
@@ -71,6 +72,7 @@ class _Task:
     eliminated: Eliminated | None
     problem: Projected
     options: Options
+    rho: float  #: penalty ρ
     solve: Callable[[float, Iterate], Iterate]  #: the outer loop, to a tolerance
     solver: compiled.Solver | None  #: None where nothing is compiled
     history: History | None
@@ -81,8 +83,7 @@ def prepared(
     qp: QP, tol: float, options: Options, carry: Carry | None, *, eliminate: bool
 ) -> Solve:
     """Eliminate the free variables where asked and possible; project; look at F."""
-    if options.rho == 0:
-        options = replace(options, rho=TORN_RHO if offered(qp) else RHO)
+    rho = options.rho or (TORN_RHO if offered(qp) else RHO)
     history = History() if options.history else None
     eliminated = None
     if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
@@ -101,8 +102,8 @@ def prepared(
     solve, solver = outer_loop(problem, inner, options, history)
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
-        solve=solve, solver=solver, history=history,
-        start=_start(problem, options, carry, tol, solver),
+        rho=rho, solve=solve, solver=solver, history=history,
+        start=_start(problem, options.M, _penalty(rho, tol), carry, solver),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -163,9 +164,9 @@ def _lanczos_steps(options: Options, qp: QP) -> int:
 
 def _start(
     problem: Projected,
-    options: Options,
+    M: float,
+    rho: float,
     carry: Carry | None,
-    tol: float,
     solver: compiled.Solver | None,
 ) -> Iterate:
     """Start from zero, or from where the problem before ended.
@@ -180,10 +181,9 @@ def _start(
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
         x = np.where(np.isfinite(x), x, carry.x)
         mu = C @ carry.force / problem.spectrum.norm
-    rho = _penalty(options.rho, tol)
     if solver is None:
-        return first_iterate(problem, x, mu, M=options.M, rho=rho)
-    return Iterate(*solver.begin(x, mu, rho), mu, options.M, rho)
+        return first_iterate(problem, x, mu, M=M, rho=rho)
+    return Iterate(*solver.begin(x, mu, rho), mu, M, rho)
 
 
 def _penalty(rho: float, tol: float) -> float:
@@ -203,6 +203,13 @@ def outer_loop(
 
     Where preconditioners need more than products, or rows are sparse, it is not.
     """
+    watch = None if history is None else partial(history.watch, problem)
+    kind = chosen(qp, options.preconditioner)
+    F = problem.F
+    is_compiled = is_compiled and isinstance(problem.rows, DenseRows)
+    if is_compiled and isinstance(F, compiled.Product) and kind in WITHOUT_P:
+        solver = compiled.Solver(problem, F, options, kind == "model")
+        return partial(_compiled_loop, solver, problem, options, watch), solver
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced,
         options.alpha,
@@ -211,14 +218,6 @@ def outer_loop(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
         options.energy,
     )  # fmt: skip
-    watch = None if history is None else partial(history.watch, problem)
-    kind = chosen(qp, options.preconditioner)
-    F = problem.F
-    is_compiled = is_compiled and isinstance(problem.rows, DenseRows)
-    if is_compiled and isinstance(F, compiled.Product) and kind in WITHOUT_P:
-        with_model = kind == "model"
-        solver = compiled.Solver(problem, F, rules, options.alpha, with_model)
-        return partial(_compiled_loop, solver, problem, constants, watch), solver
     plain = partial(problem.plain_model, alpha=options.alpha)
     inner = InnerSolver(
         rules=rules,
@@ -232,13 +231,13 @@ def outer_loop(
 def _compiled_loop(
     solver: compiled.Solver,
     problem: Projected,
-    constants: Constants,
+    options: Options,
     watch: Callable[[int, Vector], Watch] | None,
     tol: float,
     at: Iterate,
 ) -> Iterate:
     nu, g, mu, M, rho, done, status = solver.smalbe(
-        constants, tol, at, partial(infeasible, problem.rows, problem.bounds),
+        options, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
     outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
@@ -277,7 +276,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         if at.status is not Status.SOLVED or waited == PATIENCE:
             break
         tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
-        at = _refreshed(problem, at, _penalty(options.rho, tighter * tol))
+        at = _refreshed(problem, at, _penalty(task.rho, tighter * tol))
     message = "no further progress: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
@@ -316,11 +315,15 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     qp, problem = task.inner, task.problem
     found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
     x, a, z_box, Fx = found or recovered(problem, qp, at)
-    steps = Counter(STEPS[letter] for letter in at.steps)
+    letters = at.steps
+    taken = ((name, letters.count(letter)) for letter, name in STEPS.items())
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
-        z_box=z_box, iterations=len(at.steps),
-        counts={**problem.counts, "outer": len(at.outer), **steps},
+        z_box=z_box, iterations=len(letters),
+        counts={
+            "P_products": problem.F.count, **problem.counts, "outer": len(at.outer),
+            **{name: count for name, count in taken if count},
+        },
         message="converged", history=task.history.columns if task.history else {},
     )  # fmt: skip
     return point if task.eliminated is None else task.eliminated.recover(point), Fx
@@ -358,7 +361,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     if task.solver is not None and task.eliminated is None:
         bound = compiled.residual_bound(
             qp.q, task.problem.diagonal, point.x, point.y, point.z_box, Fx,
-            qp.lb, qp.ub, qp.b, G=task.problem.rows.G,
+            qp.lb, qp.ub, qp.b, task.problem.rows.G,
         )  # fmt: skip
         if bound <= enough:
             return bound
@@ -408,8 +411,10 @@ def _residual_bound(qp: QP, s: Solution, Fx: Vector) -> float:
 
 def _counted(task: _Task, point: Solution) -> Solution:
     """Note all products, those of the residuals too."""
-    counts = {"P_products": task.problem.F.count, **point.counts}
-    return replace(point, counts=counts)
+    products = task.problem.F.count
+    if products == point.counts["P_products"]:
+        return point
+    return replace(point, counts={**point.counts, "P_products": products})
 
 
 COLUMNS = (

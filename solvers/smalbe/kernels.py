@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
-from harness.distributed.vectors import inner_products
+from harness.distributed.vectors import inner_products, on_slices
 
 Mask = NDArray[np.bool_]
 ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations
@@ -19,14 +19,22 @@ def lengths(
 
     The first is inf along a direction without curvature.
     """
-    moves = p != 0
-    bound = np.where(p > 0, lower, upper)[moves]
     curvature, slope, feasible = inner_products(
-        (p, Hp), (g, p), least=(x[moves] - bound) / p[moves]
+        (p, Hp), (g, p), least=_to_bounds(x, p, lower, upper)
     )
     return slope / curvature if curvature > 0 else np.inf, feasible
 
 
+@on_slices
+def _to_bounds(x: Vector, p: Vector, lower: Vector, upper: Vector) -> Vector:
+    """Return, of components that move, the α at which they are on a bound."""
+    moves = p != 0
+    bound = np.where(p > 0, lower, upper)[moves]
+    found: Vector = (x[moves] - bound) / p[moves]
+    return found
+
+
+@on_slices
 def moved(
     x: Vector, g: Vector, alpha: float, p: Vector, Hp: Vector,
     lower: Vector, upper: Vector,
@@ -54,14 +62,22 @@ def split(
     x: Vector, g: Vector, lower: Vector, upper: Vector
 ) -> tuple[Mask, Vector, Vector, float, float]:
     """Split the gradient: free components, φ, β, ‖φ‖², ‖β‖²."""
-    at_lower, at_upper = x <= lower, x >= upper
-    free = ~(at_lower | at_upper)
-    leads_inside = ((g < 0) & ~at_upper) | ((g > 0) & ~at_lower)
-    phi, beta = np.where(free, g, 0.0), np.where(~free & leads_inside, g, 0.0)
+    free, phi, beta = _parted(x, g, lower, upper)
     phi_square, beta_square = inner_products((phi, phi), (beta, beta))
     return free, phi, beta, phi_square, beta_square
 
 
+@on_slices
+def _parted(
+    x: Vector, g: Vector, lower: Vector, upper: Vector
+) -> tuple[Mask, Vector, Vector]:
+    at_lower, at_upper = x <= lower, x >= upper
+    free = ~(at_lower | at_upper)
+    leads_inside = ((g < 0) & ~at_upper) | ((g > 0) & ~at_lower)
+    return free, np.where(free, g, 0.0), np.where(~free & leads_inside, g, 0.0)
+
+
+@on_slices
 def reduced(
     x: Vector, phi: Vector, alpha: float, lower: Vector, upper: Vector
 ) -> Vector:
@@ -76,6 +92,7 @@ def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
     return z - along / curvature * p
 
 
+@on_slices
 def tilted_step(
     x: Vector, g: Vector, tau: float, lower: Vector, upper: Vector
 ) -> tuple[Vector, NDArray[np.int8]]:

@@ -6,14 +6,16 @@ is off its bounds), the chopped gradient β (the part of g on the bounds that le
 inside) and the projected gradient g^P = φ + β, each step is one of
 
 * c, conjugate gradient: minimise along p on the face, if that stays feasible
+* b, beyond: conjugate gradients on the face as if it had no bounds, for the expansion
 * e, expansion of the active set, by one of the `EXPANSIONS`
-* f, fallback: an expansion that raised the cost, done anew in the safe way
+* f, fallback: an expansion that gained too little, done anew in the safe way
 * p, proportioning: free components, by one of the `PROPORTIONINGS`
 
 Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
 length ᾱ takes beyond a bound.
 
-Every step but projcg's lessens the cost. Expansion never frees a component that the
+Every step but projcg's lessens the cost, and by the model τI as much as the rate of the
+book needs. Expansion never frees a component that the
 half step left at a bound, but for the first expansion by a model of directions: from
 one proportioning to the next the active set only grows. docs/smalbe.md: what follows.
 """
@@ -38,8 +40,9 @@ Precondition = Callable[[Mask], Operator]  #: free components → their precondi
 #: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
 #: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
 #: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
-#: model: the CG step, projected in the metric of the model (ours; 2 products, 1 where
-#: the CG step as far as it is feasible was all)
+#: model: where CG leads, projected in the metric of the model (ours; 2 products, 1
+#: where the CG step as far as it is feasible was all; one for each step beyond the box,
+#: one more where it gained less than gradient projection must)
 Expansion = Literal["std", "projcg", "mixed", "model"]
 #: cg: minimise along −β, as far as feasible (the book's; 1 product)
 #: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); else cg
@@ -89,11 +92,13 @@ class Minimum(NamedTuple):
     g: Vector  #: Hx − b
     face: Face
     stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
-    trace: str  #: one letter per step: c, e, f, p
+    trace: str  #: one letter per step: c, b, e, f, p
 
 
-Watch = Callable[[str, Point, Face], None]  #: told after each step: letter, where
-#: letter, where, model; None where the cost falls without end
+#: told after each step but those beyond the box: letter, where
+Watch = Callable[[str, Point, Face], None]
+#: letters, the last of the step itself; where, model; None where the cost falls
+#: without end
 Step = tuple[str, Point, BoxModel] | None
 
 
@@ -104,6 +109,13 @@ class _Line(NamedTuple):
     Hp: Vector
     cg: float  #: α_cg, minimises the cost at x − αp; inf without curvature
     feasible: float  #: the largest α that is
+
+
+class _Stay(NamedTuple):
+    """On a face."""
+
+    inside: int  #: CG steps taken there
+    began: float  #: ‖φ‖² at the first
 
 
 class _Task(NamedTuple):
@@ -144,7 +156,7 @@ def mprgp(
     at, trace = Point(*start), ""
     face = split(at, bounds)
     z_of = precondition(face.free)
-    p = z_of(face.phi)
+    p, stay = z_of(face.phi), _Stay(0, face.phi_square)
     idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
     while not (done := stop(at, face)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
@@ -155,19 +167,22 @@ def mprgp(
             )
         else:
             Hp = H(p)
-            step = _minimise_or_expand(task, at, p, Hp, B, first="e" not in trace)
+            step = _minimise_or_expand(
+                task, at, face, p, Hp, B, stay=stay, first=not trace.strip("cp")
+            )
         if step is None:
             break
-        letter, at, B = step
+        letters, at, B = step
         face = split(at, bounds)
-        if letter == "c":
+        if letters == "c":
             p = kernels.conjugate(z_of(face.phi), p, Hp)
+            stay = stay._replace(inside=stay.inside + 1)
         else:
             z_of = precondition(face.free)
-            p = z_of(face.phi)
-        trace += letter
+            p, stay = z_of(face.phi), _Stay(0, face.phi_square)
+        trace += letters
         if watch is not None:
-            watch(letter, at, face)
+            watch(letters[-1], at, face)
     return Minimum(at.x, at.g, face, done, trace)
 
 
@@ -200,8 +215,9 @@ def _proportion(
 
 
 def _minimise_or_expand(
-    task: _Task, at: Point, p: Vector, Hp: Vector, B: BoxModel, *, first: bool
-) -> Step:
+    task: _Task, at: Point, face: Face, p: Vector, Hp: Vector, B: BoxModel,
+    *, stay: _Stay, first: bool,
+) -> Step:  # fmt: skip
     """Take the CG step where it is feasible, else expand the active set."""
     H, b, bounds, rules = task
     cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
@@ -216,7 +232,8 @@ def _minimise_or_expand(
             return "e", new, B
     half = _moved(task, at, feasible, p, Hp)
     if rules.expansion == "model":
-        return _model_expansion(task, at, half, _Line(p, Hp, cg, feasible), B, first)
+        line = _Line(p, Hp, cg, feasible)
+        return _model_expansion(task, at, face, half, line, B, stay=stay, first=first)
     x = np.clip(half.x - split(half, bounds).phi / B.tau, *bounds)  # cuts φ to φ̃
     letter = "f" if rules.expansion == "mixed" else "e"
     return letter, Point(x, H(x) - b), B
@@ -241,11 +258,14 @@ def _model_step(task: _Task, at: Point, B: BoxModel) -> Step:
 
 
 def _model_expansion(
-    task: _Task, at: Point, half: Point, line: _Line, B: BoxModel, first: bool
-) -> Step:
-    """Project z = x − α_cg p on the box in the metric of the model.
+    task: _Task, at: Point, face: Face, half: Point, line: _Line, B: BoxModel,
+    *, stay: _Stay, first: bool,
+) -> Step:  # fmt: skip
+    """Project z, where CG leads beyond the box, on it in the metric of the model.
 
-    The cost is known at z and beyond it bounded by the model where that is above H,
+    z is x − α_cg p, and in a flat spectrum, where active sets change least in a step,
+    what CG makes of it on the face without bounds. The cost is known at z and beyond it
+    bounded by the model where that is above H,
 
         f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr,
 
@@ -254,30 +274,80 @@ def _model_expansion(
     left at a bound stays there, unless this is the `first` expansion, before which the
     active set is a guess, and the model knows more than a norm. From the half step it
     goes all the way to z + r if the cost ends below that at x, else as far as that
-    lessens the cost.
+    lessens the cost. Where B = τI and that is less than φ̃ᵀφ/2τ, by which gradient
+    projection from x lessens the cost where τ ≥ ‖H‖, this is what is done.
     """
     (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
     release = first and B.has_directions
     held = ((half.x <= lower) | (half.x >= upper)) & (not release)
     box = np.where(held, half.x, lower), np.where(held, half.x, upper)
-    beyond = cg - feasible if math.isfinite(cg) else 0.0
-    z = Point(half.x - beyond * p, half.g - beyond * Hp)
+    z, letters = half, ""
+    if math.isfinite(cg):
+        z = Point(half.x - (cg - feasible) * p, half.g - (cg - feasible) * Hp)
+        if not B.has_directions:
+            z, letters = _beyond(task, z, face.free, line, stay)
     relaxed = B.relaxed(task.rules.relaxation)
     to = kernels.within(z.x, relaxed.step(*z, box), *box)
     s = np.where(held, 0.0, to - half.x)
     if half.g @ s >= 0:
-        beyond, s = 0.0, B.step(*half, box)
+        z, s = half, B.step(*half, box)
+    new, raised = half, B
+    change = _change(at.g, -p, -Hp, feasible)
+    if s.any():
+        Hs = task.H(s)
+        cost, most = kernels.lengths(*half, -s, -Hs, *task.bounds)
+        length = min(cost, max(1.0, most))
+        if math.isinf(length):
+            return None
+        if change + _change(half.g, s, Hs, 1.0) < 0:
+            length = max(length, 1.0)
+        change += _change(half.g, s, Hs, length)
+        r, Hr = half.x + s - z.x, half.g + Hs - z.g
+        new, raised = _moved(task, half, -length, s, Hs), B.raised(r, float(r @ Hr))
+    if not B.has_directions:
+        cut = kernels.reduced(at.x, face.phi, 1 / B.tau, *task.bounds)
+        if -change < float(cut @ face.phi) / (2 * B.tau):
+            return _project_gradient(task, at, face, B.tau, raised, letters)
+    return letters + "e", new, raised
+
+
+def _beyond(
+    task: _Task, z: Point, free: Mask, line: _Line, stay: _Stay
+) -> tuple[Point, str]:
+    """Go on with CG on the face as if it had no bounds, without a preconditioner.
+
+    Until the free gradient is what it was when the face was entered, and at most for as
+    many steps as were taken inside the box (one, if there were none).
+    """
+    p, Hp, letters = line.p, line.Hp, ""
+    for _ in range(max(stay.inside, 1)):
+        phi = np.where(free, z.g, 0.0)
+        if phi @ phi <= stay.began:
+            break
+        p = kernels.conjugate(phi, p, Hp)
+        Hp, letters = task.H(p), letters + "b"
+        curvature = float(p @ Hp)
+        if curvature <= 0:
+            break
+        length = float(phi @ p) / curvature
+        z = Point(z.x - length * p, z.g - length * Hp)
+    return z, letters
+
+
+def _project_gradient(
+    task: _Task, at: Point, face: Face, tau: float, B: BoxModel, letters: str
+) -> Step:
+    """Go along P(x − φ/τ) − x, as far as that lessens the cost; at least all of it."""
+    s = np.clip(at.x - face.phi / tau, *task.bounds) - at.x
     if not s.any():
-        return "e", half, B
+        return None
     Hs = task.H(s)
-    cost, most = kernels.lengths(*half, -s, -Hs, *task.bounds)
+    cost, most = kernels.lengths(*at, -s, -Hs, *task.bounds)
     length = min(cost, max(1.0, most))
     if math.isinf(length):
         return None
-    if _change(half.g, s, Hs, 1.0) + _change(at.g, -p, -Hp, feasible) < 0:
-        length = max(length, 1.0)
-    r, Hr = s + beyond * p, Hs + beyond * Hp
-    return "e", _moved(task, half, -length, s, Hs), B.raised(r, float(r @ Hr))
+    B = B.raised(s, float(s @ Hs))
+    return letters + "f", _moved(task, at, -length, s, Hs), B
 
 
 def _change(g: Vector, s: Vector, Hs: Vector, t: float) -> float:

@@ -109,10 +109,14 @@ class Iterate(NamedTuple):
 def first_iterate(
     problem: Projected, x: Vector, mu: Vector, *, M: float, rho: float
 ) -> Iterate:
-    """Start from x, moved into the bounds, and μ; one product."""
-    nu = np.clip(x - problem.rows.x_tilde, *problem.bounds)
-    g = problem.H(nu, rho) - problem.b + problem.rows.C.T @ mu
-    return Iterate(nu, g, mu, M, rho)
+    """Start from x, moved into the bounds, and μ; one product, none for x = 0.
+
+    There 𝒫ν = −𝒫x̃ = 0, and Hν = ρQν.
+    """
+    C, x_tilde = problem.rows.C, problem.rows.x_tilde
+    nu = np.clip(x - x_tilde, *problem.bounds)
+    Hnu = problem.H(nu, rho) if (nu + x_tilde).any() else rho * (C.T @ (C @ nu))
+    return Iterate(nu, Hnu - problem.b + C.T @ mu, mu, M, rho)
 
 
 def smalbe(

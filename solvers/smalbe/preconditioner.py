@@ -45,6 +45,8 @@ DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 def offered(qp: QP) -> Preconditioned | None:
     """Give what P offers preconditioners by, if it does."""
+    if qp.is_explicit:
+        return None
     product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else qp.P
     return product if isinstance(product, Preconditioned) else None
 

@@ -175,7 +175,7 @@ def _diagonal(qp: QP) -> Vector:
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
     """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
-    mean = float(diagonal.mean()) if diagonal.size else 0.0
+    mean = float(diagonal.sum()) / diagonal.size if diagonal.size else 0.0
     if spectrum.norm > NOTHING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)

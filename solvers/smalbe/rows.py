@@ -38,7 +38,7 @@ from harness.distributed.factor import (
     LocalFactor,
     SummedFactor,
     local_factor,
-    touched,
+    touched_rows,
 )
 from harness.distributed.vectors import DistributedColumns, distributed
 from solvers.smalbe import compiled
@@ -247,6 +247,7 @@ class _LocalRows:
     """The rows of distributed columns that a rank touches: products are additive."""
 
     part: csr_array  #: (k, n_p)
+    transposed: csr_array  #: (n_p, k), by rows: it is multiplied with as often
     columns: DistributedColumns
 
     @property
@@ -267,7 +268,7 @@ class _LocalRowsTransposed:
     rows: _LocalRows
 
     def __matmul__(self, y: Vector) -> Vector:
-        part = self.rows.part.T @ np.asarray(y)
+        part = self.rows.transposed @ np.asarray(y)
         return distributed(part, self.rows.columns.ranks)
 
 
@@ -478,7 +479,7 @@ def rows_over_ranks(
     if not (size > 0).all():
         return None
     with ranks.clocked("coarse"):
-        at = touched(np.flatnonzero(np.diff(part.indptr)), ranks)
+        at = touched_rows(np.flatnonzero(np.diff(part.indptr)), ranks)
         if not at.few_shared:
             return sparse_rows(G, e, bounded)
         rows, here = at.rows, np.asarray(bounded)
@@ -503,7 +504,7 @@ def rows_over_ranks(
         whole[rows] = np.asarray(factor.backward(a)) / at.touching
         return ranks.total(whole) / size
 
-    own = _LocalRows(unit, G)
+    own = _LocalRows(unit, csr_array(unit.T), G)
     return SparseRows(
         G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
@@ -567,5 +568,7 @@ def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
 
 def as_dense(G: Matrix) -> NDArray[np.float64]:
     """Return a matrix as an array, row by row."""
+    if not G.shape[0]:
+        return np.zeros(G.shape)
     dense = G.toarray() if hasattr(G, "toarray") else G
     return np.ascontiguousarray(dense, dtype=float)

@@ -45,7 +45,7 @@ class SMALBE(Options):
         limits=(
             "inequality rows are declined: dualise first",
             "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
-            "parallel rows, tolerances to 1e-12) 2 ended as `iteration_limit`",
+            "parallel rows, tolerances to 1e-12) 3 ended as `iteration_limit`",
         ),
     )  # fmt: skip
 

@@ -8,9 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh_tridiagonal
+from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
 
 from harness import Vector
+
+FEW = 5  #: steps after which a flat spectrum shows
+FLAT = 10.0  #: ratio of Ritz values of one size
 
 
 class Ritz(NamedTuple):
@@ -44,7 +47,9 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
 
     The residual of the pair (θ, Vᵀs) is |β s_k| with the last off-diagonal entry β. A
-    start vector from an invariant subspace keeps the process there.
+    start vector from an invariant subspace keeps the process there. It ends after FEW
+    steps where all Ritz values are of one size: conjugate gradients need few steps
+    there, and no model.
     """
     basis = np.zeros((min(steps, size(start)), start.size))
     diagonal: list[float] = []
@@ -60,6 +65,10 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
         off.append(beta)
         if beta <= 1e-12 * max(map(abs, diagonal)):
             break
+        if k + 1 == FEW:
+            values = eigvalsh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
+            if values[0] >= values[-1] / FLAT:
+                break
     if not diagonal:
         return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)), 0.0)
     theta, S = eigh_tridiagonal(np.array(diagonal), np.array(off[:-1]))

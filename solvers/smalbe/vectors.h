@@ -122,7 +122,21 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
         }
         c[i] = c0, c[i + 1] = c1, c[i + 2] = c2, c[i + 3] = c3;
     }
-    for (; i < k; i++) {
+    for (; i + 2 <= k; i += 2) {
+        in u0 = U + i * n, u1 = u0 + n;
+        four t0 = EACH(0), t1 = EACH(0);
+        for (Py_ssize_t j = 0; j < whole; j += 4) {
+            t0 += FOUR(u0 + j) * FOUR(v + j);
+            t1 += FOUR(u1 + j) * FOUR(v + j);
+        }
+        double c0 = total(t0), c1 = total(t1);
+        for (Py_ssize_t j = whole; j < n; j++) {
+            c0 += u0[j] * v[j];
+            c1 += u1[j] * v[j];
+        }
+        c[i] = c0, c[i + 1] = c1;
+    }
+    if (i < k) {
         double rest = 0;
         for (Py_ssize_t j = 0; j < n; j++)
             rest += U[i * n + j] * v[j];
@@ -145,9 +159,17 @@ TWICE static void add_combination(double s, in U, in c, out y, Py_ssize_t k,
         for (Py_ssize_t j = whole; j < n; j++)
             y[j] += c0 * u0[j] + c1 * u1[j] + c2 * u2[j] + c3 * u3[j];
     }
-    for (; i < k; i++)
+    for (; i + 2 <= k; i += 2) {
+        in u0 = U + i * n, u1 = u0 + n;
+        double c0 = s * c[i], c1 = s * c[i + 1];
         for (Py_ssize_t j = 0; j < n; j++)
-            y[j] += s * c[i] * U[i * n + j];
+            y[j] += c0 * u0[j] + c1 * u1[j];
+    }
+    if (i < k) {
+        double c0 = s * c[i];
+        for (Py_ssize_t j = 0; j < n; j++)
+            y[j] += c0 * U[i * n + j];
+    }
 }
 
 #define BLOCK 256 /* components that stay in the cache from one loop to the next */
@@ -297,37 +319,41 @@ TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict 
     return count;
 }
 
-/* S = LLᵀ (k, k) by rows, L in its lower triangle and 1/Lᵢᵢ for Lᵢᵢ; 0 where it is not
-   positive definite. */
-TWICE static int cholesky(double *S, Py_ssize_t k)
+/* S = RᵀR (k, k) with rows of `stride` numbers, a multiple of four: R in the upper
+   triangle, 1/Rᵢᵢ in place of Rᵢᵢ; 0 where S is not positive definite. */
+TWICE static int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
 {
-    for (Py_ssize_t i = 0; i < k; i++)
-        for (Py_ssize_t j = 0; j <= i; j++) {
-            double rest = S[i * k + j];
-            for (Py_ssize_t l = 0; l < j; l++)
-                rest -= S[i * k + l] * S[j * k + l];
-            if (j < i)
-                S[i * k + j] = rest * S[j * k + j];
-            else if (rest > 0)
-                S[i * k + i] = 1 / sqrt(rest);
-            else
-                return 0;
+    for (Py_ssize_t i = 0; i < k; i++) {
+        double *r = S + i * stride;
+        if (!(r[i] > 0))
+            return 0;
+        double inverse = 1 / sqrt(r[i]);
+        r[i] = inverse;
+        for (Py_ssize_t j = i + 1; j < k; j++)
+            r[j] *= inverse;
+        for (Py_ssize_t j = i + 1; j < k; j++) {
+            four s = EACH(r[j]);
+            for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < k; l += 4)
+                *(four *) (S + j * stride + l) -= s * FOUR(r + l);
         }
+    }
     return 1;
 }
 
 /* y = S⁻¹y with its `cholesky`. */
-TWICE static void solve(const double *L, double *y, Py_ssize_t k)
+TWICE static void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
-        for (Py_ssize_t l = 0; l < i; l++)
-            y[i] -= L[i * k + l] * y[l];
-        y[i] *= L[i * k + i];
+        const double *r = R + i * stride;
+        y[i] *= r[i];
+        for (Py_ssize_t j = i + 1; j < k; j++)
+            y[j] -= r[j] * y[i];
     }
     for (Py_ssize_t i = k - 1; i >= 0; i--) {
-        y[i] *= L[i * k + i];
-        for (Py_ssize_t l = 0; l < i; l++)
-            y[l] -= L[i * k + l] * y[i];
+        const double *r = R + i * stride;
+        for (Py_ssize_t j = i + 1; j < k; j++)
+            y[i] -= r[j] * y[j];
+        y[i] *= r[i];
     }
 }
 

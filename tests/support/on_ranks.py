@@ -8,9 +8,13 @@ import sys
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import csc_array
 
 import mortarbench as mb
+from harness.distributed import factor
+from harness.distributed.factor import DependentRowsError, local_factor, touched_rows
 from harness.distributed.vectors import DistributedVector, Ranks, distributed
+from solvers.smalbe.rows import equality_rows
 from solvers.smalbe.solver import SMALBE
 from solvers.smalbe.spectrum import lanczos
 
@@ -70,6 +74,60 @@ def vectors(ranks):
     return {"pairs": pairs, "answered": answered, "kept": kept}
 
 
+def factors(ranks):
+    """Factorise a sum of known matrices; and one that is singular on rank 0 only.
+
+    Row i of G has its columns on rank i mod P and, if i is divisible by 3, on the next.
+    """
+    rng, r, size = np.random.default_rng(3), 24, ranks.size
+    i = np.arange(r)
+    here = [
+        (i % size == p) | ((i % 3 == 0) & ((i + 1) % size == p)) for p in range(size)
+    ]
+    G = [rng.standard_normal((r, 40)) * mine[:, None] / 6 for mine in here]
+    t, s = rng.standard_normal((2, r))
+    rows = touched_rows(np.flatnonzero(here[ranks.rank]), ranks)
+    k = rows.rows
+    part = csc_array((G[ranks.rank] @ G[ranks.rank].T)[np.ix_(k, k)])
+    local = local_factor(part, rows, (k % 2 == 0) & ~rows.is_shared)
+    border = [np.isin(i, b)[:, None] for b in ranks.comm.allgather(k[local.border])]
+    held = [g[:, ::5] * on for g, on in zip(G, border, strict=True)]
+    own = held[ranks.rank][k[local.border]]
+    A, less = (sum(g @ g.T for g in parts) for parts in (G, held))
+    errors = []
+    for scale, of_border, M in ((1, None, A), (1.5, own @ own.T, 1.5 * A - less)):
+        whole = local.completed(scale, of_border)
+        a, b = (whole.forward(rows.additive(v[k])) for v in (t, s))
+        y = np.linalg.solve(M, t)
+        errors += [
+            np.abs(whole(rows.additive(t[k])) - y[k]).max(),
+            np.abs(whole.backward(a) - y[k]).max(),
+            abs(a @ b - s @ y),
+            abs(rows.additive(s[k]) @ whole.backward(a) - s @ y),
+        ]
+    bad = part.toarray()
+    if ranks.rank == 0:
+        row = np.flatnonzero(~rows.is_shared)[0]
+        bad[row], bad[:, row] = 0, 0
+    try:
+        local_factor(csc_array(bad), rows)
+        refused = False
+    except DependentRowsError:
+        refused = True
+    return ranks.comm.gather((max(map(float, errors)), refused, rows.shared.tolist()))
+
+
+def projected(qp, most):
+    """Project and solve in a face, where ranks may share that many rows."""
+    kept, factor.FILL = factor.FILL, most
+    rows = equality_rows(qp.A, qp.b, np.isfinite(qp.lb))
+    factor.FILL = kept
+    v = qp.q + rows.x_tilde
+    free = np.isinf(qp.lb) | (v > 0)
+    apply = rows.model(1.0, np.zeros(0), np.zeros((0, v.size)), 100.0).inverse_in(free)
+    return np.asarray(rows.project(v) + apply(v) + rows.C.T @ rows.fitted(free, v))
+
+
 def operator(name, ranks):
     """Compare products with F, its rows and its preconditioners with one process's."""
     qp = mb.build(name).made.qp
@@ -90,6 +148,8 @@ def operator(name, ranks):
         str(k): float(np.abs(np.asarray(a) - b).max() / np.abs(b).max())
         for k, (a, b) in errors.items()
     }
+    by_rank, alike = projected(share.qp, factor.FILL), projected(share.qp, 0)
+    worst["coarse"] = float(np.abs(by_rank - alike).max() / np.abs(alike).max())
     solved = share.whole(SMALBE().prepare(share.qp, TOL)())
     everywhere = ranks.comm.gather((worst, own.size, P.local.parts))
     if solved is None:
@@ -112,7 +172,7 @@ def operator(name, ranks):
 
 def main():
     ranks = Ranks(MPI.COMM_WORLD)
-    found = {"vectors": vectors(ranks)}
+    found = {"vectors": vectors(ranks), "factors": factors(ranks)}
     for name in sys.argv[1:]:
         found[name] = operator(name, ranks)
     if ranks.rank == 0:

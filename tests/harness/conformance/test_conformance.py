@@ -81,8 +81,6 @@ def test_a_planted_point_is_a_solution(shape, dense):
     assert kkt_residuals(qp, expected).worst < 1e-13
 
 
-#: threads of the test runner's own count, too, where tests run in parallel
-ONE_THREAD = "computes in one thread"
 UNBOUNDED = "claims no success: unbounded"
 #: go on to the last of their iterations, for many seconds; `smalbe` is here for its kin
 LONG = [
@@ -113,9 +111,8 @@ def test_by_default_every_shape_is_planted_for_every_solver():
 
 
 def marks(name, check):
-    if (name, check) in LONG or not is_for_all(name, check):
-        return pytest.mark.slow
-    return pytest.mark.alone if check == ONE_THREAD else ()
+    long = (name, check) in LONG or not is_for_all(name, check)
+    return pytest.mark.slow if long else ()
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ ANSWER = dict(
     claimed="solved", message="", iterations=1, counts={"products": 3},
     reported={"linear_solver": "ldl", "seconds": 0.1, "none": None},
     prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6, first_seconds=None,
-    rank_seconds={}, rank_counts={},
+    rank_seconds={}, rank_counts={}, rank_network={}, evaluated=None,
     peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None, inner=1,
     canary_seconds=1e-6,
 )  # fmt: skip

@@ -54,6 +54,13 @@ def test_what_would_see_a_slice_only_is_refused(found):
     assert found["vectors"]["kept"]
 
 
+def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(found):
+    for error, refused, shared in found["factors"]:
+        assert error < 1e-12
+        assert refused  # on all ranks, though one alone has dependent rows
+        assert shared == list(range(0, 24, 3))
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_ranks_multiply_and_precondition_as_one_process_does(found, case):
     for errors in found[case]["errors"]:
@@ -297,3 +304,16 @@ def busy(mark):
         and b"worker" in command
         and resident_mib(pid) > WITH_A_SHARE
     ]
+
+
+def test_ranks_tell_how_fast_they_talk_to_one_another(answers):
+    first, _, alone = answers
+    network = first.record.rank_network
+    assert network.keys() == {
+        "reduction_seconds", "message_seconds", "seconds_per_byte",
+    }  # fmt: skip
+    for mean, largest in network.values():
+        assert 0 <= mean <= largest < 1
+    assert network["reduction_seconds"][0] > 0
+    assert alone.record.rank_network == {}
+    assert "rank_network" not in json.loads(alone.record.to_json())

@@ -56,7 +56,9 @@ class Cluster:
         self.folder = folder
         self.starts = folder / "starts"
         self.starts.touch()
-        self._env = os.environ | {"STARTS": str(self.starts)}
+        locks = folder / "locks"  # of CPUs: another cluster of tests has its own
+        locks.mkdir(exist_ok=True)
+        self._env = os.environ | {"STARTS": str(self.starts), "TMPDIR": str(locks)}
         self._file = folder / "scheduler.json"
         self.scheduler = started(
             "scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
@@ -159,7 +161,16 @@ def meanwhile(action):
     thread.join()
 
 
-@pytest.mark.alone  # each node takes a CPU
+@pytest.fixture
+def all_cpus():
+    """Every CPU of the machine may be used, not only those of a worker of pytest."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, range(os.cpu_count()))
+    yield
+    os.sched_setaffinity(0, before)
+
+
+@pytest.mark.usefixtures("all_cpus")  # each node takes one
 def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cli, cluster, tmp_path
 ):

@@ -6,7 +6,17 @@ from numpy.testing import assert_allclose
 from scipy.sparse import csr_array, eye_array
 
 from harness import Vector
-from problems.feti.spectrum import projector, ritz_bounds, spectrum
+from problems.contact.linearise import linearisation
+from problems.duality.stepping import primal_qp
+from problems.feti.elastic import torn
+from problems.feti.spectrum import (
+    Spectrum,
+    projector,
+    ritz_bounds,
+    spectra_of_equations,
+    spectrum,
+)
+from problems.models.beam_ring import model, subdivided
 from tests.support.torn_bodies import torn_pair
 
 
@@ -74,3 +84,33 @@ def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
     assert_allclose(u @ (u.T @ y), y, atol=1e-12)  # in range B
     inside = dense @ np.cos(np.arange(B.shape[1]))  # what is left out is orthogonal
     assert abs((x - y) @ P(inside)) < 1e-9 * np.linalg.norm(inside)
+
+
+def of_beam_ring(layers: int, cells: int) -> Spectrum:
+    """Supports and gluing of beam and ring, so many layers of cells each."""
+    geometry = layers, layers // 2, layers
+    bodies = model(*geometry, "strain")
+    contact = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, contact)
+    pieces = torn(subdivided(cells, *geometry, "strain"), primal)
+    (found,) = spectra_of_equations(pieces, tol=1e-3)
+    return found
+
+
+#: ‖PFP‖/κ of 2 × 2 squares of 4 × 4 cells, and of 8 × 8 (plate; notes of the issue)
+OF_SQUARES = {4: 5.63810 / 9.9829, 8: 10.92276 / 19.4934}
+
+
+@pytest.mark.parametrize("cells", [4, 8])
+def test_stretched_cells_of_a_ring_leave_the_least_eigenvalue_of_squares(cells) -> None:
+    """Without the factor of their shape, it is 7 and 12 % below."""
+    assert of_beam_ring(2 * cells, cells).smallest == pytest.approx(
+        OF_SQUARES[cells], rel=0.005
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [4, 8])
+def test_the_condition_number_is_flat_from_16_900_unknowns_on(cells) -> None:
+    small, large = (of_beam_ring(layers, cells).condition for layers in (24, 96))
+    assert small < large < 1.04 * small

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from problems.fem.mesh import half_ring_grid, join, rectangle_grid
-from problems.feti.structured import Layout
+from problems.feti.elastic import longitudinal_share
+from problems.feti.structured import Layout, shape_factors, spacings
 from problems.feti.tearing import decompose, structured_bodies
 
 GRIDS = (
@@ -83,3 +85,70 @@ def test_a_block_has_the_points_of_the_whole_mesh(grid):
     for name, chain in mesh.boundaries.items():
         assert np.array_equal(grid.sides[name], chain)
         assert np.array_equal(grid.side(name), mesh.points[chain])
+
+
+def stiffest_saw_tooth(D, r):
+    """The largest stiffness of displacements ±a in turn on a half plane of cells.
+
+    r : cells are 1 along its edge and r deep. Layer on layer: S = A − B(A + S)⁻¹B, with
+    the blocks A, B of a layer of cells on displacements that change sign from node to
+    node.
+    """
+    K = stiffness(
+        rectangle_grid((0, 0), (1, r), (1, 1)).mesh(), D[None], np.zeros(1, int)
+    )
+    sign = np.kron([[1, 0], [-1, 0], [0, 1], [0, -1]], np.eye(2))
+    layer = sign.T @ K.toarray() @ sign
+    top, across, base = layer[:2, :2], layer[:2, 2:], layer[2:, 2:]
+    S = top
+    for _ in range(200):
+        S = top - across @ np.linalg.solve(base + S, across.T)
+    return np.linalg.eigvalsh(S).max()
+
+
+@pytest.mark.parametrize("r", [0.25, 0.8, 1.25, 4.0])
+@pytest.mark.parametrize("nu", [0.0, 0.3])
+def test_the_factor_is_the_stiffness_of_a_saw_tooth_relative_to_squares(nu, r):
+    D = elasticity_matrix(Material(E=3.0, nu=nu), "strain")
+    exact = stiffest_saw_tooth(D, r) / stiffest_saw_tooth(D, 1.0)
+    along_row = shape_factors(
+        np.array([[2.0, 2.0 * r]]), np.array([[True, False]]),
+        longitudinal_share(D[None]),
+    )  # fmt: skip
+
+    assert along_row == pytest.approx([exact], rel=1e-9)
+
+
+def test_the_factor_is_a_mean_where_interfaces_cross_and_one_without_any():
+    lines = np.array([[True, True], [True, False], [False, True], [False, False]])
+    both, row, column, none = shape_factors(np.array([[1.0, 2.0]] * 4), lines, 0.5)
+
+    assert both == pytest.approx((row + column) / 2)
+    assert row > 1 > column
+    assert none == 1
+
+
+def test_spacings_are_those_of_the_cells_around(torn):
+    layout, _ = torn
+    nodes = layout.torn_nodes(np.arange(layout.count))
+    of_blocks = layout.spacings(np.arange(layout.count))
+    whole = [
+        spacings(grid.mesh().points.reshape(grid.rows.size, -1, 2)) for grid in GRIDS
+    ]
+
+    assert np.array_equal(of_blocks, np.concatenate(whole)[layout.number(nodes.at)])
+    assert whole[0] == pytest.approx(np.tile([2 / 13, 0.05], (14 * 6, 1)))
+
+
+def test_sides_of_grids_are_lines_where_they_are_asked_for(torn):
+    layout, whole = torn
+    at = layout.places(np.arange(whole.nodes))
+    inner, all_ = (layout.lines(at, ends=ends) for ends in (False, True))
+    on_side = np.zeros((whole.nodes, 2), dtype=bool)
+    for start, grid in zip(layout.node_start, GRIDS, strict=False):
+        bottom, right, top, left = grid.sides.values()
+        on_side[start + np.append(bottom, top), 0] = True
+        on_side[start + np.append(left, right), 1] = True
+
+    assert np.array_equal(inner.sum(axis=1) > 0, np.bincount(whole.node) > 1)
+    assert np.array_equal(all_, inner | on_side)

@@ -1,15 +1,22 @@
 """Bodies torn into subdomains, and the rows that hold these together."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
 from problems.fem.elasticity import Material, elasticity_matrix
-from problems.fem.mesh import rectangle
+from problems.fem.mesh import rectangle, rectangle_grid
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
-from problems.feti.tearing import blocks, decompose, structured_bodies
+from problems.feti.tearing import (
+    blocks,
+    compact_blocks,
+    decompose,
+    structured_bodies,
+)
 from tests.support.torn_bodies import torn_pair
 
 GLUING = ("orthonormal", "chain", "redundant")
@@ -33,6 +40,35 @@ def test_blocks_of_several_bodies_are_numbered_one_body_after_another() -> None:
     assert label[8:17].reshape(3, 3)[0].tolist() == [2, 2, 3]
     assert label[8:17].reshape(3, 3)[2].tolist() == [4, 4, 5]
     assert label[17:].tolist() == [6]
+
+
+def test_compact_blocks_of_squares_are_squares() -> None:
+    mesh = rectangle((0.0, 0.0), (2.0, 1.0), (16, 8))
+    found = compact_blocks(mesh.points, mesh.cells, (16, 8), 4)
+    pairs = set(zip(found.tolist(), blocks((16, 8), 4).tolist(), strict=True))
+
+    assert len(pairs) == found.max() + 1 == 8
+
+
+def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> None:
+    """Of cells that are 8 times as long as wide, 2 × 16 are a square."""
+    grid = rectangle_grid((0.0, 0.0), (8.0, 1.0), (16, 16))
+    mesh = grid.mesh()
+    label = compact_blocks(mesh.points, mesh.cells, (16, 16), 6)
+
+    assert np.bincount(label).tolist() == [32] * 8
+    for block in range(8):
+        assert np.ptp(mesh.points[mesh.cells[label == block]], axis=(0, 1)) == (
+            pytest.approx([1.0, 1.0])
+        )
+
+
+def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() -> None:
+    grid = rectangle_grid((0.0, 0.0), (1.0, 1.0), (8, 2))
+    mesh = replace(grid, columns=np.array([0, 1, 2, 3, 4, 5, 6, 12, 13.0])).mesh()
+    label = compact_blocks(mesh.points, mesh.cells, (8, 2), 3)
+
+    assert label.tolist() == 2 * [0, 0, 0, 1, 1, 1, 2, 2]
 
 
 def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:

@@ -1,4 +1,4 @@
-"""Strong and weak scaling and their model, of records whose times are planted."""
+"""Strong and weak scaling and their model, of records whose times are manufactured."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from reports.document.figure import Area, Series
 from reports.folder import compose
 from reports.sections.ranks import predicted, ranks
 from reports.statistics.cost_model import CostModel
-from tests.support.planted_ranks import (
+from tests.support.manufactured_ranks import (
     ALIKE,
     BYTE,
     BYTES,
@@ -44,13 +44,13 @@ def evidence(records, cpus=None):
 
 
 @pytest.fixture(scope="module")
-def planted():
+def manufactured():
     return evidence(rank_records(), cpus=4)
 
 
 @pytest.fixture(scope="module")
-def strong(planted):
-    (found,) = (s for s in strong_series(planted) if s.case.endswith("S=100/dual"))
+def strong(manufactured):
+    (found,) = (s for s in strong_series(manufactured) if s.case.endswith("S=100/dual"))
     return found
 
 
@@ -86,7 +86,7 @@ def test_one_run_has_a_value_and_no_interval():
     assert series.model.seconds(8).samples == 1
 
 
-def test_the_model_recovers_planted_work_latency_and_bandwidth(strong):
+def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
     model = strong.model
     assert model.work == pytest.approx(WORK * DOFS)
     assert model.alike == pytest.approx(ALIKE)
@@ -114,8 +114,8 @@ def test_records_that_do_not_say_what_was_sent_have_no_model():
     assert series.model is None
 
 
-def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(planted):
-    found = {s.members[0].dofs: s for s in weak_series(planted)}
+def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(manufactured):
+    found = {s.members[0].dofs: s for s in weak_series(manufactured)}
     assert [(m.ranks, m.dofs) for m in found[50_000].members] == [
         (1, 50_000), (2, 100_000), (4, 200_000),
     ]  # fmt: skip
@@ -153,25 +153,25 @@ def test_parts_are_medians_of_means_and_of_the_largest(strong):
     assert rank_memory(strong.answers[1]) is None
 
 
-def test_copies_are_no_solver_of_a_series_of_sizes(planted):
-    (series,) = size_series(planted)
+def test_copies_are_no_solver_of_a_series_of_sizes(manufactured):
+    (series,) = size_series(manufactured)
     assert not any("copies" in solver for solver in series.solvers)
 
 
 def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
-    planted,
+    manufactured,
 ):
-    section = ranks(planted)
+    section = ranks(manufactured)
     (model,) = (p for p in section.pictures if p.name == "ranks-model")
     assert model.caption.startswith("Model, not measured")
     for panel in model.figure.panels:
         assert any(t.text == "model, not measured" for t in panel.texts)
         (edge,) = panel.rules
-        modelled = [m for m in panel.marks if isinstance(m, Area)]
-        modelled += [m for m in panel.marks if isinstance(m, Series) and not m.runs
+        dashed = [m for m in panel.marks if isinstance(m, Area)]
+        dashed += [m for m in panel.marks if isinstance(m, Series) and not m.runs
                      and m.solver]  # fmt: skip
-        assert len(modelled) == 2
-        assert all(min(m.x) == edge.at for m in modelled)
+        assert len(dashed) == 2
+        assert all(min(m.x) == edge.at for m in dashed)
         (measured,) = (m for m in panel.marks if isinstance(m, Series) and m.runs)
         assert max(measured.x) == edge.at
     told = [t.caption for t in section.tables if "odel" in t.caption]
@@ -194,10 +194,10 @@ def test_no_more_ranks_than_subdomains_are_predicted(strong):
     assert predicted(strong) == (8, 16, 32, 64)
 
 
-def test_a_report_without_ranks_says_what_they_need(planted):
-    alone = evidence(r for r in planted.records if r.ranks == 1)
+def test_a_report_without_ranks_says_what_they_need(manufactured):
+    alone = evidence(r for r in manufactured.records if r.ranks == 1)
     page = compose(alone)
     assert "ranks" not in [s.name for s in page.sections]
     (absent,) = (s for s in page.sections if s.name == "absent")
     assert any("ranks = [1, 2]" in point for point in absent.points)
-    assert "ranks" in [s.name for s in compose(planted).sections]
+    assert "ranks" in [s.name for s in compose(manufactured).sections]

@@ -21,7 +21,7 @@ def sent_on(N):
     )
 
 
-def planted(N, work=2.0, alike=0.1, slowdown=1.0, sent=SENT):
+def modelled(N, work=2.0, alike=0.1, slowdown=1.0, sent=SENT):
     """Do the sum of the model by hand."""
     depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
     waits = 300 * 5e-6 * depth + 120 * 2e-6 * neighbours + (N > 1) * 4e6 / 2e9
@@ -29,22 +29,22 @@ def planted(N, work=2.0, alike=0.1, slowdown=1.0, sent=SENT):
 
 
 @pytest.mark.parametrize("ranks", [(1, 2), (1, 2, 4), (1, 2, 3, 5, 8)])
-def test_planted_work_is_recovered_and_predicted_beyond(ranks):
-    found = cost_model({N: [planted(N)] * 3 for N in ranks}, {}, [sent_on(ranks[-1])])
+def test_known_work_is_recovered_and_predicted_beyond(ranks):
+    found = cost_model({N: [modelled(N)] * 3 for N in ranks}, {}, [sent_on(ranks[-1])])
     assert found.work == pytest.approx(2.0)
     assert found.alike == pytest.approx(0.1)
     assert found.misfit < 1e-12
-    assert found.seconds(64).value == pytest.approx(planted(64))
-    assert found.speed_up(64).value == pytest.approx(2.1 / planted(64))
+    assert found.seconds(64).value == pytest.approx(modelled(64))
+    assert found.speed_up(64).value == pytest.approx(2.1 / modelled(64))
 
 
 def test_ranks_that_slow_one_another_down_are_told_by_copies():
-    times = {N: [planted(N, slowdown=1.25)] * 3 for N in (1, 2, 4)}
+    times = {N: [modelled(N, slowdown=1.25)] * 3 for N in (1, 2, 4)}
     copies = {N: [1.25 * 2.1] * 3 for N in (2, 4)}
     found = cost_model(times, copies, [sent_on(4)])
     assert (found.work, found.alike) == pytest.approx((2.0, 0.1))
     assert found.slowdown == pytest.approx(1.25)
-    assert found.seconds(16).value == pytest.approx(planted(16, slowdown=1.25))
+    assert found.seconds(16).value == pytest.approx(modelled(16, slowdown=1.25))
 
 
 def test_communication_is_what_was_counted_times_what_it_takes():
@@ -57,14 +57,14 @@ def test_communication_is_what_was_counted_times_what_it_takes():
 
 def test_a_network_whose_speed_is_not_known_widens_the_band():
     slow = replace(SENT, reduction_seconds=5e-3)
-    times = {N: [planted(N)] * 4 for N in (1, 2)}
+    times = {N: [modelled(N)] * 4 for N in (1, 2)}
     at = cost_model(times, {}, [SENT, slow, SENT, slow]).seconds(16)
     assert at.high > 1.2 * at.low
 
 
 def test_what_was_sent_on_other_ranks_is_no_basis():
     with pytest.raises(ValueError, match="what 4 ranks have sent"):
-        cost_model({N: [planted(N)] for N in (1, 2, 4)}, {}, [SENT])
+        cost_model({N: [modelled(N)] for N in (1, 2, 4)}, {}, [SENT])
 
 
 def test_better_than_shared_work_is_never_negative_work():
@@ -79,10 +79,10 @@ def test_the_band_of_equal_times_holds_the_fit_and_of_noisy_ones_the_truth():
     rng = np.random.default_rng(3)
     held = 0
     for _ in range(100):
-        times = {N: planted(N) * rng.lognormal(0, 0.02, 5) for N in (1, 2, 4)}
+        times = {N: modelled(N) * rng.lognormal(0, 0.02, 5) for N in (1, 2, 4)}
         at = cost_model(times, {}, [sent_on(4)]).seconds(16)
         assert at.low <= at.value <= at.high
-        held += at.low <= planted(16) <= at.high
+        held += at.low <= modelled(16) <= at.high
     assert held >= 85  # 95 % of a hundred
 
 

@@ -110,6 +110,19 @@ def test_counts_where_stiffnesses_jump(jump, identity, weighted):
         assert s.counts["steps_to_tol"] <= steps + 2
 
 
+@pytest.mark.parametrize("jump", [1e-3, 1e-5])
+def test_weights_without_stiffness_take_more_steps_and_reach_the_tolerance(jump):
+    qp = plate(pattern="column", jump=jump, **PLATE)
+    runs = [
+        FETI(scaling=scaling).prepare(qp, 1e-8)()
+        for scaling in ("stiffness", "multiplicity")
+    ]
+
+    assert all(s.status is Status.SOLVED for s in runs)
+    assert max(kkt_residuals(qp, s).worst for s in runs) <= 5e-8
+    assert runs[0].iterations < runs[1].iterations
+
+
 def test_what_it_does_not_take(random):
     lower = np.where(np.arange(30) == 7, 0.0, -np.inf)
     small = plate(Sx=2, Sy=2, n=2)

@@ -137,6 +137,52 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
     assert fast.nu == pytest.approx(slow.nu, abs=1e-6 * size)
 
 
+def string(n):
+    P = csr_array(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    low = np.sin(4 * np.pi * np.linspace(0, 1, n) - np.pi / 6) / 2 - 2
+    return QP(
+        P=P, q=np.full(n, 30 / n**2), A=no_rows(n), b=np.zeros(0),
+        G=no_rows(n), h=np.zeros(0), lb=low, ub=np.full(n, np.inf),
+    )  # fmt: skip
+
+
+def tight_box(seed):
+    rng = np.random.default_rng(seed)
+    n = 30
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    P = (Q * np.logspace(0, -rng.uniform(0, 4), n)) @ Q.T
+    lb = -rng.exponential(size=n) * 10 ** rng.uniform(-2, 1)
+    ub = rng.exponential(size=n) * 10 ** rng.uniform(-2, 1)
+    ub[rng.random(n) < 0.5] = np.inf
+    return QP(
+        P=(P + P.T) / 2, q=rng.standard_normal(n), A=no_rows(n), b=np.zeros(0),
+        G=no_rows(n), h=np.zeros(0), lb=lb, ub=ub,
+    )  # fmt: skip
+
+
+def test_steps_beyond_the_box_are_those_that_are_written():
+    """In flat spectra; some expansions end as gradient projections."""
+    letters = ""
+    for qp in (string(100), *map(tight_box, range(40))):
+        runs = []
+        for written in (False, True):
+            problem = projected_problem(qp, partial(by_lanczos, steps=5))
+            options = replace(SOLVERS["smalbe"], max_steps=150)
+            solve, _ = outer_loop(problem, qp, options, is_compiled=not written)
+            start = first_iterate(
+                problem, problem.rows.x_tilde * 0, np.zeros(0), M=1.0, rho=1e4
+            )
+            runs.append((solve(1e-6, start), problem.F.count))
+        (fast, products), (slow, also) = runs
+        letters += slow.steps
+
+        assert fast.steps == slow.steps
+        assert products == also
+        assert fast.nu == pytest.approx(slow.nu, abs=1e-6 * (1 + np.abs(slow.nu).max()))
+
+    assert all(letters.count(letter) >= 3 for letter in "cbefp")
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypatch):
     """Rounding may cost a few without a preconditioner."""
@@ -198,7 +244,7 @@ def test_no_point_has_residuals_above_the_bound(seed):
         z = np.where(np.isinf(qp.ub), np.minimum(z, 0), z)
         point = replace(solution, x=x, y=y, z_box=z)
         bound = compiled.residual_bound(
-            qp.q, qp.P.diagonal(), x, y, z, qp.P @ x, qp.lb, qp.ub, qp.b, G=G
+            qp.q, qp.P.diagonal(), x, y, z, qp.P @ x, qp.lb, qp.ub, qp.b, G
         )
 
         assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9)

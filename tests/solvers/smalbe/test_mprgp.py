@@ -1,5 +1,8 @@
 """The path that MPRGP takes, which no test of its answer can see."""
 
+import re
+from collections import Counter
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -403,3 +406,71 @@ def test_every_step_by_the_model_lessens_the_cost():
         ]
 
         assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()
+
+
+def tight_box(seed):
+    """A spectrum of up to four decades, and boxes of which many bounds are active."""
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.standard_normal((30, 30)))[0]
+    A = (Q * np.logspace(0, -rng.uniform(0, 4), 30)) @ Q.T
+    lower = -rng.exponential(size=30) * 10 ** rng.uniform(-2, 1)
+    upper = rng.exponential(size=30) * 10 ** rng.uniform(-2, 1)
+    upper[rng.random(30) < 0.5] = np.inf
+    return (A + A.T) / 2, rng.standard_normal(30), lower, upper
+
+
+def string_and_boxes():
+    A, b, lower = string()
+    return [(A, b, lower, np.full(b.size, np.inf)), *map(tight_box, range(60))]
+
+
+def test_no_more_steps_beyond_the_box_than_inside():
+    """Or one, where there were none: what they cost is at most doubled."""
+    most, steps = 0, 0
+    for A, b, lower, upper in string_and_boxes():
+        run, products = minimise(
+            A, b, lower, upper, B=Model.of_norm(np.linalg.norm(A, 2), b.size),
+            rules=Rules(), tol=1e-8 * np.linalg.norm(b),
+        )  # fmt: skip
+        for face in re.findall("c*b+", run.trace):
+            assert face.count("b") <= max(face.count("c"), 1)
+            most = max(most, face.count("b"))
+        steps += run.trace.count("b")
+        counts = Counter(run.trace)
+
+        assert run.stopped
+        assert products <= len(run.trace) + counts["e"] + 2 * counts["f"]
+
+    assert most >= 5
+    assert steps >= 50
+
+
+def watched(seen, letter, at, face):
+    seen.append(at)
+
+
+def test_each_step_gains_what_the_rate_of_the_book_needs():
+    """G/4τ with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖ and Γ = 1; so f − f* shrinks by
+    1 − λ_min/4‖H‖ at least, the book's factor for steps of 1/‖H‖."""
+    letters = Counter()
+    for A, b, lower, upper in string_and_boxes():
+        tau = np.linalg.norm(A, 2)
+        seen = [Point(np.clip(np.zeros(b.size), lower, upper), b)]
+        run, _ = minimise(
+            A, b, lower, upper, B=Model.of_norm(tau, b.size), rules=Rules(),
+            tol=1e-6 * np.linalg.norm(b), watch=partial(watched, seen),
+        )  # fmt: skip
+        letters.update(run.trace)
+        costs = np.array([0.5 * at.x @ A @ at.x - b @ at.x for at in seen])
+        for (x, _), fall in zip(seen, -np.diff(costs), strict=False):
+            g = A @ x - b
+            G = tau * g @ (x - np.clip(x - g / tau, lower, upper))
+
+            assert fall >= 0.999 * G / (4 * tau) - 1e-14 * np.abs(costs).max()
+
+        least = np.linalg.eigvalsh(A)[0]
+        above = costs - costs[-1]
+        rate = (1 - least / (4 * tau)) ** np.arange(len(costs))
+        assert (above <= above[0] * rate + 1e-10 * above[0]).all()
+
+    assert min(letters[letter] for letter in "cbefp") >= 5

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import spsolve
 
-from harness import Status, kkt_residuals
+from harness import QP, Status, kkt_residuals, no_rows
 from harness.record import VERIFIED_FACTOR
 from problems import PROBLEMS
 from solvers import SOLVERS
@@ -62,6 +64,66 @@ def test_on_300_bodies_it_never_needs_twice_and_seldom_more_than_the_presets(tol
     assert np.median(ratios) <= 0.5
 
 
+def laplacian(seed):
+    """Draw a weighted line or grid with obstacles below, above, or on both sides."""
+    rng = np.random.default_rng(seed)
+    side = int(rng.integers(5, 20))
+    rows, columns = (1, side**2) if rng.random() < 0.5 else (side, side)
+    n, k = side**2, np.arange(side**2).reshape(rows, columns)
+    edges = [(k[:, :-1], k[:, 1:]), (k[:-1], k[1:])]
+    i, j = (np.concatenate([pair[s].ravel() for pair in edges]) for s in (0, 1))
+    w = 10 ** rng.uniform(-rng.uniform(0, 3), 0, i.size)
+    graph = csr_array((w, (i, j)), shape=(n, n))
+    graph = graph + graph.T
+    held = 10 ** rng.uniform(-3, 0) * rng.random(n)  # to the ground
+    P = csr_array(diags_array(graph.sum(axis=0) + held) - graph)
+    at = np.linspace(0, 1, n)
+    f = np.sin(np.pi * rng.integers(1, 6) * at + rng.uniform(0, 6)) + rng.choice([0, 1])
+    size = np.abs(spsolve(P.tocsc(), f)).max() * 10 ** rng.uniform(-2, 0)
+    far = size * (0.5 + 0.5 * rng.random() * np.sin(np.pi * rng.integers(1, 9) * at))
+    kind = rng.integers(3)
+    return boxed(
+        P, -f, np.where(kind == 1, -np.inf, -far), np.where(kind == 0, np.inf, far)
+    )
+
+
+def dense(seed):
+    """Draw a dense P whose spectrum falls, or is flat but for some outliers."""
+    rng = np.random.default_rng(seed)
+    n, kind = int(rng.integers(10, 200)), rng.integers(3)
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    j = np.arange(1, n + 1)
+    spectrum = (
+        j ** -rng.uniform(0.5, 4),
+        np.exp(-j / n * rng.uniform(1, 14)),
+        np.where(j <= rng.integers(1, 20), 10 ** rng.uniform(0, 4), 1 + j / n),
+    )[kind]
+    P = (Q * np.maximum(spectrum, 1e-8 * spectrum.max())) @ Q.T
+    lower = -rng.choice([0, 0.1, 1]) * rng.random(n)
+    width = rng.exponential(size=n) if rng.random() < 0.3 else np.inf
+    return boxed((P + P.T) / 2, rng.standard_normal(n), lower, lower + width)
+
+
+def boxed(P, q, lb, ub):
+    n = q.size
+    return QP(
+        P=P, q=q, A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0), lb=lb, ub=ub
+    )
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(15), pytest.param(range(15, 300), marks=pytest.mark.slow)], ids=str
+)
+@pytest.mark.parametrize("draw", [laplacian, dense])
+def test_a_search_finds_no_problem_on_which_it_needs_twice_as_many(draw, seeds):
+    """Beyond the twelve products of Lanczos, which a short run does not repay."""
+    for seed in seeds:
+        qp = draw(seed)
+        better = min(products(p, qp, 1e-6) for p in PRESETS)
+
+        assert products("smalbe", qp, 1e-6) <= max(2 * better, better + 12), seed
+
+
 def test_bodies_of_all_kinds_are_solved():
     for seed in range(300, 324):
         qp = generated_case(seed).qp
@@ -96,8 +158,13 @@ def test_a_model_that_leaves_the_chopped_gradient_gives_way():
     assert s.counts["P_products"] <= 200
 
 
-def test_a_string_of_a_thousand_points_does_not_cycle():
+@pytest.mark.parametrize(
+    ("n", "most"),
+    [(1000, 3177), pytest.param(10_000, 41_801, marks=pytest.mark.slow)],
+)
+def test_a_long_string_takes_no_more_than_permon_itself(n, most):
+    """At its best for that length: with standard or with projected CG expansion."""
     family = PROBLEMS["string"]
-    case = family.build("primal", family.complete({"n": 1000}), reference_solution)
+    case = family.build("primal", family.complete({"n": n}), reference_solution)
 
-    assert products("smalbe", case.qp, 1e-6) <= 4000
+    assert products("smalbe", case.qp, 1e-6) <= most

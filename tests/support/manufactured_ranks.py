@@ -1,6 +1,6 @@
 """Records of solves on ranks whose every time is made by the model of their cost.
 
-    python -m tests.support.planted_ranks DIR [SCATTER]
+    python -m tests.support.manufactured_ranks DIR [SCATTER]
 
 writes a result folder of them.
 """
@@ -104,13 +104,13 @@ def _record(dofs, n, repeat, label, role, times):
 
 def write(folder: Path, scatter: float = 0.02) -> Path:
     """Write journal, environment and suite; return the folder."""
-    journal = folder / "journal" / "planted.jsonl"
+    journal = folder / "journal" / "ranks.jsonl"
     journal.parent.mkdir(parents=True, exist_ok=True)
     records = rank_records(ranks=(1, 2, 4, 8), repeats=5, scatter=scatter)
     journal.write_text("".join(r.to_json() + "\n" for r in records))
     machine = {"cpu": "a processor", "usable_cores": 4, "memory_mib": 8192}
     (folder / "environment.json").write_text(json.dumps({"machine": machine}))
-    (folder / "suite.toml").write_text('name = "planted"\nrepeats = 5\n')
+    (folder / "suite.toml").write_text('name = "manufactured"\nrepeats = 5\n')
     return folder
 
 

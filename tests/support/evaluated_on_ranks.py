@@ -1,0 +1,61 @@
+"""What tests/harness/verify/test_over_ranks.py runs on several ranks; prints JSON.
+
+Run as ``mpiexec -n N python -m mpi4py evaluated_on_ranks.py CASE…``.
+"""
+
+import json
+import sys
+
+import numpy as np
+from mpi4py import MPI
+
+from harness import certify
+from harness.distributed.vectors import Ranks
+from harness.names import parse
+from harness.verify.certificate import UncertifiableError
+from harness.verify.kkt import kkt_residuals
+from harness.verify.verdicts import evaluated_by_ranks
+from problems import PROBLEMS
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.solver import SMALBE
+
+TOLS = (1e-4, 1e-6)
+
+
+def evaluated(name, ranks):
+    """Evaluate answers by all ranks, and what they are together by one process."""
+    case_id = parse(name, PROBLEMS)
+    emitted = case_id.family.emitted(case_id.form, case_id.params, ranks)
+    found = []
+    for tol in TOLS:
+        share = emitted.share()
+        s = SMALBE().prepare(share.qp, tol)()
+        by_ranks = evaluated_by_ranks(emitted, s, ranks)
+        same = ranks.comm.allgather(by_ranks["bounds"].get("energy_bound"))
+        whole = share.whole(s)
+        if whole is None:
+            continue
+        case = case_id.build(reference_solution)
+        one = {"objective": case.qp.objective(whole.x)}
+        one |= kkt_residuals(case.qp, whole)._asdict()
+        try:
+            certificate = certify(case.mechanics, case.mechanics.back(whole))
+            bound, parts = certificate.bound, certificate.parts
+        except UncertifiableError:
+            bound, parts = np.nan, {}
+        found.append({
+            "by_ranks": by_ranks, "same": len(set(same)) == 1,
+            "by_one": {"values": one, "bound": bound, "parts": parts},
+        })  # fmt: skip
+    return found
+
+
+def main():
+    ranks = Ranks(MPI.COMM_WORLD)
+    found = {name: evaluated(name, ranks) for name in sys.argv[1:]}
+    if ranks.rank == 0:
+        print(json.dumps(found, default=float))
+
+
+if __name__ == "__main__":
+    main()
