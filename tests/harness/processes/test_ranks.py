@@ -230,8 +230,14 @@ def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-LARGE = SUITE.replace("{ S = 2, n = 4 }", "{ S = 56, n = 16 }").replace(
-    "ranks = [1, 2]", "ranks = [2]"
+#: of two load steps, the first: one process emits it, so that a rank which has a share
+#: is preparing or solving
+LARGE = (
+    SUITE.replace(
+        "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"
+    )
+    .replace("ranks = [1, 2]", "ranks = [2]")
+    .replace("membranes", "beam-ring")
 )
 WITH_A_SHARE = 110  #: MiB; a rank that waits for an order has 90
 FAULTS = {
