@@ -43,7 +43,7 @@ test: setup browser  ## check, and run the tests on all CPUs
 
 .PHONY: tests
 tests:
-	$(BIN)/pytest -q -n auto --dist loadgroup
+	$(BIN)/pytest -q -n auto --dist loadscope
 
 mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
 	@$(BIN)/python tools/mutants.py

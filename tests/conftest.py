@@ -4,13 +4,16 @@ import gc
 import os
 from collections.abc import Callable
 from contextlib import contextmanager
+from functools import cache
 
 import pytest
+from xdist.scheduler import LoadScopeScheduling
 
 from harness import QP, Solution
 from harness.conformance.manufactured import manufactured as drawn
 from harness.limits import ONE_THREAD
 from harness.processes import supervisor
+from tests.support import ROOT
 from tests.support.fork_server import Forks
 
 
@@ -19,6 +22,26 @@ def pytest_xdist_auto_num_workers() -> int:
     """Run two tests per CPU where CPUs are few: a third of the time, tests wait."""
     cpus = len(os.sched_getaffinity(0))
     return max(cpus, min(2 * cpus, 8))
+
+
+class OneProcessPerModule(LoadScopeScheduling):
+    """Tests of a module marked `together` run in one process, others anywhere."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        module = nodeid.partition("::")[0]
+        return module if shares(module) else nodeid
+
+
+@cache
+def shares(module: str) -> bool:
+    """Whether a module of tests, by its path from the root, is marked `together`."""
+    return "pytestmark = pytest.mark.together" in (ROOT / module).read_text("utf-8")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config) -> OneProcessPerModule:
+    """Group by modules; groups by marks need names of tests to change in collection."""
+    return OneProcessPerModule(config)
 
 
 def pytest_configure(config: pytest.Config) -> None:

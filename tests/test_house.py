@@ -11,6 +11,8 @@ import pytest
 from solvers import SOLVERS
 from solvers.common.libraries import PACKAGES as LIBRARIES
 
+pytestmark = pytest.mark.together
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("harness", "problems", "solvers", "reports", "mortarbench")
 

@@ -23,6 +23,8 @@ from reports.folder import compose
 from reports.render.markdown import markdown
 from tests.support import ROOT, TOY_PROBLEM
 
+pytestmark = pytest.mark.together
+
 
 def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
     lines = [f"{key} = {value}" for key, value in settings.items()]

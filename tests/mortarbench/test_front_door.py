@@ -19,6 +19,8 @@ from mortarbench.registries import Registries
 from solvers import SOLVERS
 from tests.support import ROOT, TOY_PROBLEM
 
+pytestmark = pytest.mark.together
+
 SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
 
 

@@ -14,6 +14,8 @@ from reports.export.vtu import write_vtu
 from solvers import SOLVERS
 from tests.support import ROOT
 
+pytestmark = pytest.mark.together
+
 PAGE = (ROOT / "docs" / "own-geometry.md").read_text("utf-8")
 LOAD, RADIUS, E_STAR = 2e6, 0.01, 210e9 / (2 * (1 - 0.3**2))  # N/m, m, Pa
 HALF_WIDTH = np.sqrt(4 * LOAD * RADIUS / (np.pi * E_STAR))

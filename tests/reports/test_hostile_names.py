@@ -13,7 +13,7 @@ from reports.document.formatting import clean
 from reports.render.latex import escaped as tex
 from reports.render.markdown import escaped as md
 
-pytestmark = pytest.mark.xdist_group("hostile-names")  # one report for all of them
+pytestmark = pytest.mark.together  # one report for all of them
 
 NAMES = (
     "<b onmouseover=a()>&amp;</b><!--",

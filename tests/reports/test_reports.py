@@ -25,6 +25,8 @@ from reports.render.writing import write_figures
 from reports.sections.summary import sentences
 from reports.statistics.intervals import power_law
 
+pytestmark = pytest.mark.together
+
 HOSTILE = (
     '<script>alert(1)</script>"><img src=http://evil.example/x onerror=alert(1)>',
     r"\input{/etc/passwd}$^$_#&%~{}",

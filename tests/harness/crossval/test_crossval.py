@@ -30,6 +30,8 @@ from reports.validation.report import compose, write_validation
 from solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
 
+pytestmark = pytest.mark.together
+
 PLUGIN = load_plugin(FALSE_CLAIMS)
 FAMILIES = {**PROBLEMS, **PLUGIN.problems}
 BEAM = "beam-ring/Nr=2/Nh=1/steps=2"

@@ -20,6 +20,8 @@ from mortarbench.registries import Registries
 from tests.support import ROOT, SUPPORT
 from tests.support.waiting import soon
 
+pytestmark = pytest.mark.together
+
 CASES = (
     "beam-ring/Nr=4/Nh=3/feti=4/dual",
     "membranes/S=2/n=4/glue=redundant/dual",

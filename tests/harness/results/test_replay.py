@@ -18,7 +18,7 @@ from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
 #: one process has the run that all replay
-pytestmark = pytest.mark.xdist_group("replay")
+pytestmark = pytest.mark.together
 
 PLUGIN = load_plugin(TOY_PROBLEM)
 SUITE = """

@@ -10,6 +10,8 @@ import pytest
 from harness.distributed import mpi
 from tests.support import ROOT, SUPPORT
 
+pytestmark = pytest.mark.together
+
 HELD = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",

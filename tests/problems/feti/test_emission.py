@@ -12,6 +12,8 @@ from harness.distributed import mpi
 from problems.ranges import emitted_on_ranks
 from tests.support import ROOT, SUPPORT
 
+pytestmark = pytest.mark.together
+
 CASES = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",

@@ -20,6 +20,8 @@ from problems.feti.tearing import blocks
 from problems.models.beam_ring import model
 from problems.models.membranes import Membranes
 
+pytestmark = pytest.mark.together
+
 GLUING = ("orthonormal", "chain", "redundant")
 SCALINGS = ("multiplicity", "stiffness")
 KINDS = ("lumped", "dirichlet")

@@ -9,6 +9,8 @@ from problems.feti.elastic import longitudinal_share
 from problems.feti.structured import Layout, shape_factors, spacings
 from problems.feti.tearing import decompose, structured_bodies
 
+pytestmark = pytest.mark.together
+
 GRIDS = (
     rectangle_grid((0.0, 0.5), (2.0, 0.25), (13, 5)),
     half_ring_grid((1.0, 0.0), (0.3, 0.49), (11, 7)),

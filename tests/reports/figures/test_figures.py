@@ -21,6 +21,8 @@ from reports.folder import compose
 from reports.validation.error_figure import error_figure
 from tests.support.synthetic_results import records
 
+pytestmark = pytest.mark.together
+
 SOLVERS, CASES, REPEATS = 3, 60, 2
 TOLS = (1e-2, 1e-4, 1e-6)
 

@@ -39,7 +39,7 @@ from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import PAPER, SMALBE
 
 #: it measures and draws once: one process has all of it
-pytestmark = pytest.mark.xdist_group("paper")
+pytestmark = pytest.mark.together
 
 FIGURES = [
     *(f"figure{i}" for i in range(1, 8)),

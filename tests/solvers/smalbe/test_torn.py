@@ -9,6 +9,8 @@ from solvers.reference.solve import reference_solution
 from solvers.smalbe.rows import SparseRows, equality_rows
 from solvers.smalbe.solver import SMALBE
 
+pytestmark = pytest.mark.together
+
 
 def case(**keys):
     family = PROBLEMS["beam-ring"]
