@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from functools import cache
 
 import pytest
+from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 
 from harness import QP, Solution
@@ -39,9 +40,11 @@ def shares(module: str) -> bool:
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config) -> OneProcessPerModule:
+def pytest_xdist_make_scheduler(
+    config: pytest.Config, log: Producer
+) -> OneProcessPerModule:
     """Group by modules; groups by marks need names of tests to change in collection."""
-    return OneProcessPerModule(config)
+    return OneProcessPerModule(config, log)
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -27,25 +27,24 @@ def modules(*packages):
     ]
 
 
-def users(name):
-    """Modules that import or look up a thing by its dotted name, or from its module."""
-    module, _, attribute = name.rpartition(".")
+@cache
+def users():
+    """Modules that use a thing, by its dotted name: import it, or look it up."""
+    found = defaultdict(dict)
     for path, tree in modules():
         for node in ast.walk(tree):
             match node:
                 case ast.Import(names=aliases):
-                    found = name in [alias.name for alias in aliases]
-                case ast.ImportFrom(module=source, names=aliases):
-                    found = source == name or (
-                        source == module and attribute in [a.name for a in aliases]
-                    )
+                    used = [alias.name for alias in aliases]
+                case ast.ImportFrom(module=str(source), names=aliases):
+                    used = [source, *(f"{source}.{alias.name}" for alias in aliases)]
                 case ast.Attribute(value=ast.Name(id=source), attr=attr):
-                    found = (source, attr) == (module, attribute)
+                    used = [f"{source}.{attr}"]
                 case _:
-                    found = False
-            if found:
-                yield path
-                break
+                    continue
+            for name in used:
+                found[name][path] = True
+    return {name: list(paths) for name, paths in found.items()}
 
 
 @pytest.mark.parametrize(
@@ -61,7 +60,7 @@ def users(name):
     ],
 )
 def test_one_thing_is_done_in_one_place(name, homes):
-    assert list(users(name)) == homes
+    assert users().get(name, []) == homes
 
 
 #: rooms that are collections of equals: one module each for an adapter, …
