@@ -106,7 +106,7 @@ class StrongSeries:
 
     @property
     def most(self) -> int | None:
-        """Count the subdomains, the most ranks that could share them; None if told."""
+        """Count the subdomains, the most ranks that could share them; None if unknown."""
         return self.answers[1].size("subdomains")
 
 

@@ -205,7 +205,7 @@ def _part_tables(found: Sequence[StrongSeries]) -> list[Table]:
             text_columns=2,
             notes=(
                 "Waiting is what a rank spends in MPI until the others' numbers have "
-                "come; the rest is what no part is told of.",
+                "come; the rest is what is in none of the parts, as work on vectors.",
             ),
         ))  # fmt: skip
     if any(counts):
@@ -300,7 +300,7 @@ def _prediction_table(found: Sequence[StrongSeries]) -> Table:
 def predicted(s: StrongSeries) -> tuple[int, ...]:
     """List the ranks beyond the measured ones that the model is asked about.
 
-    None where it does not even fit the measured ones.
+    Empty where it does not even fit the measured ones.
     """
     assert s.model is not None
     if s.model.misfit > MISFIT:
