@@ -89,11 +89,11 @@ class LocalFactor:
 
     at: Touched
     order: Rows  #: (k,) of its rows: unchanging, changing, shared
-    changing: int  #: how many there are
-    factor: (
-        Factor | None
-    )  #: of A_p in that order; shared rows raised. None without rows
-    L_bb: Dense  #: of it, the border's
+    changing: int  #: how many of these may change
+    #: of A_p in that order, with 1 added to the diagonal of shared rows; None without
+    #: rows
+    factor: Factor | None
+    L_bb: Dense  #: (b, b) its last block, of the border
 
     @property
     def border(self) -> Rows:
@@ -161,9 +161,9 @@ class SummedFactor:
 
     local: LocalFactor
     root: float  #: √scale
-    L_cc: Dense  #: of the changing rows of this rank
-    L_sc: Dense  #: of its shared rows
-    L_ss: Dense  #: (s, s) on all ranks
+    L_cc: Dense  #: (c, c) of the changing rows of this rank
+    L_sc: Dense  #: (s_p, c) of its shared rows
+    L_ss: Dense  #: (s, s) of the shared rows of all, the same on all ranks
 
     @property
     def least_pivot(self) -> float:
@@ -176,7 +176,7 @@ class SummedFactor:
         return self.local.at.ranks.extreme(float(own.min(initial=np.inf)), np.min)
 
     def forward(self, t: Dense) -> DistributedVector:
-        """Take an additive t (k,) to L⁻¹t, orthonormal."""
+        """Take an additive t (k,) to L⁻¹t (k - s_p + s,), orthonormal."""
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
             u, r = self.local.reduced(np.asarray(t))
@@ -187,7 +187,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Take an orthonormal a to L⁻ᵀa (k,), consistent."""
+        """Take an orthonormal a (k - s_p + s,) to L⁻ᵀa (k,), consistent."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)
@@ -211,7 +211,7 @@ class SummedFactor:
             return distributed(y, local.at.ranks)
 
     def _gathered(self, r: Dense) -> Dense:
-        """Add what all ranks have for the shared rows (s,)."""
+        """Add what all ranks have for the shared rows that they touch (s_p,): (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared)

@@ -50,8 +50,8 @@ class Communication:
     """What a rank sends in one solve on `ranks` ranks, and how fast that was there."""
 
     ranks: int  #: at least two
-    reductions: float
-    messages: float
+    reductions: float  #: over all ranks
+    messages: float  #: to neighbours
     sent: float  #: bytes
     reduction_seconds: float  #: of one number, over all ranks
     message_seconds: float  #: of the shortest
