@@ -77,9 +77,9 @@ _MODEL = (
     "for, are fitted to the measured times of the solve; s is how much slower copies "
     "are together than one alone; reductions, messages and bytes are counted, and take "
     "what the network was measured to take when the ranks began. Beyond the measured "
-    "ranks a reduction takes as long as a tree is deep, a rank has up to six "
-    "neighbours, and s and the bytes of a rank stay. Its band is what the scatter of "
-    "the repeats allows; whether the model holds there, it cannot say."
+    "ranks the time of a reduction grows with the depth of a tree of ranks, a rank has "
+    "up to six neighbours, and s and the bytes of a rank stay. The band is what the "
+    "scatter of the repeats allows; it does not tell whether the model holds there."
 )
 
 
