@@ -30,6 +30,7 @@ from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
 from harness.distributed.vectors import DistributedVector, Ranks, distributed
+from harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
@@ -235,12 +236,12 @@ def local_factor(
     first = np.flatnonzero(~changes & ~at.is_shared)
     second = np.flatnonzero(changes & ~at.is_shared)
     if first.size:
-        first = first[analyze(_int32(A[first][:, first]), use_long=False).P()]
+        first = first[analyze(with_int32(A[first][:, first]), use_long=False).P()]
     order = np.concatenate([first, second, np.flatnonzero(at.is_shared)])
     factor, L_bb, fails = None, np.zeros((0, 0)), 0.0
     if order.size:
         raised = np.where(at.is_shared[order], 1.0, 0.0)  # A_p may be singular there
-        M = _int32(csc_array(A[order][:, order]) + diags_array(raised))
+        M = with_int32(csc_array(A[order][:, order]) + diags_array(raised))
         factor = analyze(M, ordering_method="natural", use_long=False)
         try:
             factor.cholesky_inplace(M)
@@ -266,8 +267,8 @@ def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
     return np.asarray(blas.dtrsv(L, x, lower=1, trans=int(transposed)))
 
 
-def _int32(M: csc_array) -> csc_matrix:
-    """Have entries numbered by 32-bit integers, as the factor does."""
+def with_int32(M: Matrix) -> csc_matrix:
+    """Have the entries of a sparse M (k, l) numbered as `Factor` does: 32 bits."""
     M = csc_matrix(M)
     M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
     return M
