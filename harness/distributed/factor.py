@@ -30,6 +30,7 @@ from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
 from harness.distributed.vectors import DistributedVector, Ranks, distributed
+from harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
@@ -89,11 +90,11 @@ class LocalFactor:
 
     at: Touched
     order: Rows  #: (k,) of its rows: unchanging, changing, shared
-    changing: int  #: how many there are
-    factor: (
-        Factor | None
-    )  #: of A_p in that order; shared rows raised. None without rows
-    L_bb: Dense  #: of it, the border's
+    changing: int  #: how many of these may change
+    #: of A_p in that order, with 1 added to the diagonal of shared rows; None without
+    #: rows
+    factor: Factor | None
+    L_bb: Dense  #: (b, b) its last block, of the border
 
     @property
     def border(self) -> Rows:
@@ -161,9 +162,9 @@ class SummedFactor:
 
     local: LocalFactor
     root: float  #: √scale
-    L_cc: Dense  #: of the changing rows of this rank
-    L_sc: Dense  #: of its shared rows
-    L_ss: Dense  #: (s, s) on all ranks
+    L_cc: Dense  #: (c, c) of the changing rows of this rank
+    L_sc: Dense  #: (s_p, c) of its shared rows
+    L_ss: Dense  #: (s, s) of the shared rows of all, the same on all ranks
 
     @property
     def least_pivot(self) -> float:
@@ -176,7 +177,7 @@ class SummedFactor:
         return self.local.at.ranks.extreme(float(own.min(initial=np.inf)), np.min)
 
     def forward(self, t: Dense) -> DistributedVector:
-        """Take an additive t (k,) to L⁻¹t, orthonormal."""
+        """Take an additive t (k,) to L⁻¹t (k - s_p + s,), orthonormal."""
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
             u, r = self.local.reduced(np.asarray(t))
@@ -187,7 +188,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Take an orthonormal a to L⁻ᵀa (k,), consistent."""
+        """Take an orthonormal a (k - s_p + s,) to L⁻ᵀa (k,), consistent."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)
@@ -211,7 +212,7 @@ class SummedFactor:
             return distributed(y, local.at.ranks)
 
     def _gathered(self, r: Dense) -> Dense:
-        """Add what all ranks have for the shared rows (s,)."""
+        """Add what all ranks have for the shared rows that they touch (s_p,): (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared)
@@ -235,12 +236,12 @@ def local_factor(
     first = np.flatnonzero(~changes & ~at.is_shared)
     second = np.flatnonzero(changes & ~at.is_shared)
     if first.size:
-        first = first[analyze(_int32(A[first][:, first]), use_long=False).P()]
+        first = first[analyze(with_int32(A[first][:, first]), use_long=False).P()]
     order = np.concatenate([first, second, np.flatnonzero(at.is_shared)])
     factor, L_bb, fails = None, np.zeros((0, 0)), 0.0
     if order.size:
         raised = np.where(at.is_shared[order], 1.0, 0.0)  # A_p may be singular there
-        M = _int32(csc_array(A[order][:, order]) + diags_array(raised))
+        M = with_int32(csc_array(A[order][:, order]) + diags_array(raised))
         factor = analyze(M, ordering_method="natural", use_long=False)
         try:
             factor.cholesky_inplace(M)
@@ -266,8 +267,8 @@ def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
     return np.asarray(blas.dtrsv(L, x, lower=1, trans=int(transposed)))
 
 
-def _int32(M: csc_array) -> csc_matrix:
-    """Have entries numbered by 32-bit integers, as the factor does."""
+def with_int32(M: Matrix) -> csc_matrix:
+    """Have the entries of a sparse M (k, l) numbered as `Factor` does: 32 bits."""
     M = csc_matrix(M)
     M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
     return M

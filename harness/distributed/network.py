@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
 LARGE = 2**20  #: bytes of a message that only bandwidth matters to
-_BATCHES = 5
+_BATCHES = 5  #: of calls that are timed together, the first included
 
 
 def network(comm: Comm) -> dict[str, float]:
@@ -24,9 +24,9 @@ def network(comm: Comm) -> dict[str, float]:
 
     Returns
     -------
-    reduction_seconds : of one number over all ranks
-    message_seconds : of eight bytes to a neighbour
-    seconds_per_byte : of long messages to a neighbour
+    reduction_seconds : of one number over all ranks, s
+    message_seconds : of eight bytes to a neighbour, s
+    seconds_per_byte : of long messages to a neighbour, s
 
     """
     right, left = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
@@ -49,7 +49,7 @@ def network(comm: Comm) -> dict[str, float]:
 
 
 def _seconds(act: Callable[[], None], times: int) -> float:
-    """Take the median over batches of the time of one act; the first batch warms up."""
+    """Take the median over batches of the time of one act, s; the first warms up."""
     found = []
     for _ in range(_BATCHES):
         start = perf_counter()

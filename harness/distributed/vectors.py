@@ -62,7 +62,8 @@ class Ranks:
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
-    #: what it takes, as measured by `harness.distributed.network.network`, if it was
+    #: s: how fast they talk to one another, as `harness.distributed.network.network`
+    #: measured it; empty where it did not
     network: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -54,7 +54,7 @@ class OwnBodies:
     coarse: NDArray[np.int64]  #: (r,) of each column of R, among those of all ranks
     motions: int  #: of all subdomains of all ranks
     f: Vector  #: (N,) the load of a component is the sum of those of its copies
-    held: NDArray[np.int64]  #: places in `components` of those that are prescribed
+    held: NDArray[np.int64]  #: (h,) places in `components` of those prescribed
     contact: Contact
 
     @cached_property
@@ -199,7 +199,7 @@ def certify_over_ranks(
 
 
 def _at_rows(own: OwnBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows on the components they touch (w,), and 1/Kᵢᵢ there."""
+    """Return the rows on the components they touch (w,), and 1/Kᵢᵢ there, (w,)."""
     contact, k = own.contact, own.contact.bound.size
     B, contacts = csr_array(contact.rows[:, at]), contact.c.size - k
     places, here = own.among.places(at)

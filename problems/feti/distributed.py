@@ -6,7 +6,7 @@ others get its multiplier before they multiply, and send what they add to it:
 
     F λ = Σ_ranks B_p K_p⁺ B_pᵀ λ
 
-Nothing of the size of the whole is anywhere: a rank has the columns of B, and the rows
+No rank makes anything of the size of the whole: it has the columns of B, and the rows
 of all vectors, that its subdomains touch. Subdomains go to ranks so that these do
 alike much work and share few rows, by graph partitioning (METIS). Of a kind that
 several ranks have, one forms the explicit blocks, and sends them to the others.
@@ -136,9 +136,11 @@ class Halo:
     ranks: Ranks
     rows: Nodes  #: (t,) all that its subdomains touch or that it owns, ascending
     own: Nodes  #: (o,) places of the owned ones in `rows`
-    lent: Nodes  #: places in the owned ones of what others need, neighbour by neighbour
-    borrowed: Nodes  #: places in `rows` of what others own, neighbour by neighbour
-    lends: NDArray[np.int64]  #: (ranks,) how many go to each
+    #: (l,) places in the owned ones of what others need, neighbour by neighbour
+    lent: Nodes
+    #: (t − o,) places in `rows` of what others own, neighbour by neighbour
+    borrowed: Nodes
+    lends: NDArray[np.int64]  #: (ranks,) how many go to each, l in all
     borrows: NDArray[np.int64]  #: (ranks,) how many come from each
 
     @property

@@ -7,8 +7,8 @@ no rank has anything of the size of the whole but what a coarse problem has: a f
 numbers for each subdomain.
 
 What ranks tell one another: a representative of each kind of subdomain, so that
-subdomains of one kind have one frame on all ranks; and what they add to rows that
-another one owns, of the right side q and of RᵀBᵀ.
+subdomains of one kind have one frame on all ranks; what they add to rows that another
+one owns, of the right side q and of RᵀBᵀ; and their part of Rᵀf.
 
 The QP is that of `problems.feti.gluing` and `problems.duality.torn_dual`, row by row.
 """
@@ -77,9 +77,9 @@ class StructuredBodies:
 class Entries(NamedTuple):
     """Entries of B in own columns, and who else has entries in the same rows."""
 
-    row: NDArray[np.int64]
-    column: NDArray[np.int64]
-    value: Vector
+    row: NDArray[np.int64]  #: (e,) of the whole
+    column: NDArray[np.int64]  #: (e,) own torn unknowns
+    value: Vector  #: (e,)
     reached: NDArray[np.int64]  #: (k, 2) pairs: a row of B, and a rank that touches it
 
 
@@ -219,10 +219,10 @@ class OwnSubdomains:
 class _OwnNodes(NamedTuple):
     """As `problems.feti.structured.TornNodes`, with what is known of the whole."""
 
-    block: Integers
-    at: Places
-    copy: Integers
-    start: NDArray[np.int64]
+    block: Integers  #: (M,)
+    at: Places  #: of M nodes
+    copy: Integers  #: (M,)
+    start: NDArray[np.int64]  #: (blocks + 1,)
     number: Nodes  #: (M,) of the whole
     times: NDArray[np.int64]  #: (M,) copies of it on all ranks together
 
@@ -360,6 +360,7 @@ class _Copies(NamedTuple):
 
 
 def _own_copies(own: OwnSubdomains, at: Places) -> _Copies:
+    """Find the copies of some nodes, and which of them this rank holds."""
     of, start = own.problem.layout, own.nodes.start
     times = of.times(at)
     node = np.repeat(np.arange(times.size), times)
@@ -437,7 +438,7 @@ def _turned(
     k: NDArray[np.int64],
     value: Vector,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
-    """Give entries in the axes of subdomains, of components k of torn nodes."""
+    """Give entries (e,) in the axes of subdomains, of components k of nodes (j,)."""
     d = own.problem.components
     if d == 1:
         return row, node, value
@@ -460,7 +461,7 @@ def _equalities(problem: StructuredBodies) -> int:
 
 
 def _contact_scale(problem: StructuredBodies) -> Vector:
-    """Return √(E/‖B_i‖²) of each contact row, E of the softest body that it touches."""
+    """Return √(E/‖B_i‖²) of contact rows (m,), E of the softest body they touch."""
     rows, of = problem.contact.rows, problem.layout
     if not rows.shape[0]:
         return np.zeros(0)

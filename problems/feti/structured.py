@@ -118,7 +118,7 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return of blocks the first column and row, and how many of both (k,)."""
+        """Return (k,) of blocks the first columns and rows, and how many of both."""
         at = Places(*(x[block] for x in self.block))
         first, last = (
             [
@@ -151,26 +151,29 @@ class Layout:
         return TornNodes(small[0], Places(*small[1:]), copy, start)
 
     def places(self, node: Nodes) -> Places:
-        """Find nodes by their numbers."""
+        """Find nodes by their numbers (k,)."""
         body = np.searchsorted(self.node_start, node, side="right") - 1
         wide = np.array([grid.columns.size for grid in self.grids])
         row, column = np.divmod(node - self.node_start[body], wide[body])
         return Places(body, column, row)
 
     def number(self, at: Places) -> Nodes:
-        """Return the numbers of nodes."""
+        """Return the numbers (k,) of nodes."""
         wide = np.array([grid.columns.size for grid in self.grids])
         return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
 
     def times(self, at: Places) -> NDArray[np.int64]:
-        """Count the copies of nodes."""
+        """Count the copies (k,) of nodes."""
         return np.asarray(
             self._columns.times[self._columns.start[at.body] + at.column]
             * self._rows.times[self._rows.start[at.body] + at.row]
         )
 
     def holder(self, at: Places, copy: Integers) -> Nodes:
-        """Find the block of a copy of each node."""
+        """Find the block (k,) of a copy of each node.
+
+        copy : (k,) which one, from 0 on
+        """
         column = self._columns.start[at.body] + at.column
         row = self._rows.start[at.body] + at.row
         up, right = np.divmod(copy, self._columns.times[column])
@@ -196,7 +199,7 @@ class Layout:
         return np.stack(found, axis=1)
 
     def shapes(self, share: Vector, *, ends: bool) -> Vector:
-        """Return the `shape_factors` of all nodes.
+        """Return the `shape_factors` of all nodes (nodes,).
 
         share : (grids,) of the materials
         """
@@ -224,7 +227,7 @@ class Layout:
         return np.concatenate(found)
 
     def before(self, at: Places) -> NDArray[np.int64]:
-        """Count, of each node, those before it that have as many copies."""
+        """Count, of each node (k,), those before it that have as many copies."""
         columns, rows = self._columns, self._rows
         column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
         m = columns.times[column] * rows.times[row]
@@ -260,7 +263,7 @@ class Layout:
         }
 
     def shared_sides(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """List pairs of blocks that share a side, and how many nodes (k,) are on it."""
+        """List pairs of blocks that share a side, and its number of nodes: all (k,)."""
         body, column, row = self.block
         all_ = np.arange(self.count)
         _, _, columns, rows = self.corner(all_)
@@ -323,12 +326,15 @@ def shape_factors(
 class _Lines(NamedTuple):
     """Columns, or rows, of all grids one after another."""
 
-    start: NDArray[np.int64]  #: first of each grid, and how many there are
-    times: NDArray[np.int64]  #: how many blocks meet there along this direction, 1 or 2
-    first: NDArray[np.int64]  #: the first block that has it
-    before: NDArray[np.int64]  #: (2, k) of one grid, before it, with times 1 and 2
-    cut: NDArray[np.int64]  #: the lines where blocks begin and end
-    cut_start: NDArray[np.int64]  #: first of these of each grid
+    start: NDArray[np.int64]  #: (grids + 1,) first of each grid, and k, how many in all
+    times: NDArray[
+        np.int64
+    ]  #: (k,) blocks that meet there along this direction, 1 or 2
+    first: NDArray[np.int64]  #: (k,) the first block that has it
+    #: (2, k) those before it in its grid, with times 1 and with 2
+    before: NDArray[np.int64]
+    cut: NDArray[np.int64]  #: (c,) the lines where blocks begin and end
+    cut_start: NDArray[np.int64]  #: (grids + 1,) first of these of each grid, and c
 
 
 def _lines(cuts: list[Nodes]) -> _Lines:

@@ -58,11 +58,6 @@ class Regressions:
     cells: int  #: that could be judged one by one
     why_not: str = ""  #: why nothing could be judged
 
-    @property
-    def comparisons(self) -> int:
-        """Count the intervals that were looked at."""
-        return self.solvers + self.cells
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Change:

@@ -87,26 +87,28 @@ class StrongSeries:
 
         Ranks that shared CPUs are left out.
         """
-        free = [n for n in self.answers if not self.crowded(n)]
-        if len(free) < 2:
+        seconds = {
+            n: [*blocks(o, "solve").values()]
+            for n, o in self.answers.items()
+            if not self.crowded(n)
+        }
+        free = [n for n, of in seconds.items() if of]
+        if len(free) < 2 or free[0] != 1:
             return None
         sent = [_communication(r) for r in self.answers[free[-1]].records]
         known = [c for c in sent if c is not None]
         if not known:
             return None
-        return cost_model(
-            {n: [*blocks(self.answers[n], "solve").values()] for n in free},
-            {
-                n: [*blocks(self.copies[n], "solve").values()]
-                for n in free
-                if n in self.copies
-            },
-            known,
-        )
+        copies = {
+            n: of
+            for n in free
+            if n in self.copies and (of := [*blocks(self.copies[n], "solve").values()])
+        }
+        return cost_model({n: seconds[n] for n in free}, copies, known)
 
     @property
     def most(self) -> int | None:
-        """Count the subdomains, the most ranks that could share them; None if told."""
+        """Count the subdomains, at most one rank for each; None if unknown."""
         return self.answers[1].size("subdomains")
 
 
@@ -282,7 +284,7 @@ def rank_memory(o: Outcome) -> Part | None:
     """Give the peak memory of a rank, MiB."""
     ends = ("mean", "largest")
     told = [[r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records]
-    known = [values for values in told if None not in values]
+    known = [of for of in told if all(isinstance(v, int | float) for v in of)]
     if not known:
         return None
     mean, largest = np.median(np.array(known, dtype=float), axis=0)
@@ -300,13 +302,14 @@ def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
 
 def _communication(r: Any) -> Communication | None:
     counts, network = r.rank_counts, r.rank_network
-    named = ("reductions", "messages", "bytes")
-    if r.ranks < 2 or not network or any(name not in counts for name in named):
+    counted = ("reductions", "messages", "bytes")
+    timed = ("reduction_seconds", "message_seconds", "seconds_per_byte")
+    if r.ranks < 2 or not {*counted} <= {*counts} or not {*timed} <= {*network}:
         return None
-    reductions, messages, sent = (float(counts[name][1]) for name in named)
+    reductions, messages, sent = (float(counts[name][1]) for name in counted)
     return Communication(
         ranks=r.ranks, reductions=reductions, messages=messages, sent=sent,
-        **{name: float(mean) for name, (mean, _) in network.items()},
+        **{name: float(network[name][0]) for name in timed},
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ _PALE = "#a9cde6"  #: a band in the first colour, in a legend
 _LONG = 72  #: letters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: times the values that an axis goes on for intervals
-_REST = "#9aa2ad"  #: time that no part is told of
+_REST = "#9aa2ad"  #: time that is in none of the parts
 _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)  #: between measured and model
 
 

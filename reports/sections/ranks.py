@@ -77,9 +77,9 @@ _MODEL = (
     "for, are fitted to the measured times of the solve; s is how much slower copies "
     "are together than one alone; reductions, messages and bytes are counted, and take "
     "what the network was measured to take when the ranks began. Beyond the measured "
-    "ranks a reduction takes as long as a tree is deep, a rank has up to six "
-    "neighbours, and s and the bytes of a rank stay. Its band is what the scatter of "
-    "the repeats allows; whether the model holds there, it cannot say."
+    "ranks the time of a reduction grows with the depth of a tree of ranks, a rank has "
+    "up to six neighbours, and s and the bytes of a rank stay. The band is what the "
+    "scatter of the repeats allows; it does not tell whether the model holds there."
 )
 
 
@@ -205,7 +205,7 @@ def _part_tables(found: Sequence[StrongSeries]) -> list[Table]:
             text_columns=2,
             notes=(
                 "Waiting is what a rank spends in MPI until the others' numbers have "
-                "come; the rest is what no part is told of.",
+                "come; the rest is what is in none of the parts, as work on vectors.",
             ),
         ))  # fmt: skip
     if any(counts):
@@ -300,7 +300,7 @@ def _prediction_table(found: Sequence[StrongSeries]) -> Table:
 def predicted(s: StrongSeries) -> tuple[int, ...]:
     """List the ranks beyond the measured ones that the model is asked about.
 
-    None where it does not even fit the measured ones.
+    Empty where it does not even fit the measured ones.
     """
     assert s.model is not None
     if s.model.misfit > MISFIT:

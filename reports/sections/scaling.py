@@ -184,8 +184,8 @@ def _predicted(fit: Growth | None, n: int) -> Cell:
     return Cell(text=seconds(time), value=time.value)
 
 
-#: what is read before other counts; the rest in a solver's own order
 MOST_DRAWN = 8  #: pictures of counts; all are tabulated
+#: what is read before other counts; the rest in a solver's own order
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 
 

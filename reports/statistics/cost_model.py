@@ -15,7 +15,8 @@ counted, all on the ranks that there were. Beyond these, the model goes on:
 - α_R grows with ⌈log₂N⌉, the depth of a tree of ranks;
 - M grows with the neighbours of a rank, N − 1 and at most six: a planar graph has fewer
   than three edges for each vertex (Euler);
-- b stays: halving a square costs a rank one side, and so do four sides of a sixteenth.
+- b stays: half of a square borders on the other half along one side of it, an inner
+  sixteenth on its neighbours along four quarters of one.
 
 References
 ----------
@@ -49,8 +50,8 @@ class Communication:
     """What a rank sends in one solve on `ranks` ranks, and how fast that was there."""
 
     ranks: int  #: at least two
-    reductions: float
-    messages: float
+    reductions: float  #: over all ranks
+    messages: float  #: to neighbours
     sent: float  #: bytes
     reduction_seconds: float  #: of one number, over all ranks
     message_seconds: float  #: of the shortest

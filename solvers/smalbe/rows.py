@@ -39,6 +39,7 @@ from harness.distributed.factor import (
     SummedFactor,
     local_factor,
     touched_rows,
+    with_int32,
 )
 from harness.distributed.vectors import DistributedColumns, distributed
 from solvers.smalbe import compiled
@@ -209,7 +210,7 @@ class _Whole:
         if self.bordered is not None:
             return self.bordered.solver(~free, shift)
         held = _gram(self.unit, ~free)
-        factor = self.factor.cholesky(_csc((1 + shift) * self.matrix - held))
+        factor = self.factor.cholesky(with_int32((1 + shift) * self.matrix - held))
         return lambda t: np.asarray(factor(t))
 
 
@@ -310,9 +311,9 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
     if c.size > MOST_BORDER:
         return None
     if rest.size:
-        rest = rest[analyze(_csc(gram[rest][:, rest]), use_long=False).P()]
+        rest = rest[analyze(with_int32(gram[rest][:, rest]), use_long=False).P()]
     order = np.concatenate([rest, c])
-    S = _csc(gram[order][:, order])
+    S = with_int32(gram[order][:, order])
     factor = analyze(S, ordering_method="natural", use_long=False)
     factor.cholesky_inplace(S)
     L_cc = factor.L()[rest.size :, rest.size :].toarray()
@@ -449,7 +450,7 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
     if not (size > 0).all():
         return None
     unit = _scaled(1 / size, G)
-    gram = _csc(_gram(unit))
+    gram = with_int32(_gram(unit))
     factor = analyze(gram, use_long=False)
     try:
         factor.cholesky_inplace(gram)
@@ -525,13 +526,6 @@ def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
     if isinstance(G, DistributedColumns):
         return G.scaled(s)
     return csr_array(diags_array(s) @ G)
-
-
-def _csc(M: Matrix) -> csc_matrix:
-    """Have entries numbered by 32-bit integers, as the factor does."""
-    M = csc_matrix(M)
-    M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
-    return M
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:

@@ -114,6 +114,38 @@ def test_records_that_do_not_say_what_was_sent_have_no_model():
     assert series.model is None
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rank_network": {"hops": (1.0, 1.0)}},
+        {"rank_network": {"reduction_seconds": (1.0, 1.0)}},
+        {"rank_counts": {"reductions": (1.0, 1.0)}},
+        {"solve_seconds": None},
+    ],
+)
+def test_records_with_other_entries_have_no_model_either(change):
+    records = [r.but(**change) for r in rank_records(sizes=[DOFS])]
+    (series,) = strong_series(evidence(records))
+    assert series.model is None
+    assert ranks(evidence(records)).name == "ranks"
+
+
+def test_a_network_may_be_told_of_more_than_the_model_takes():
+    records = [
+        r.but(rank_network={**r.rank_network, "hops": (1.0, 1.0)}) if r.ranks > 1 else r
+        for r in rank_records(sizes=[DOFS])
+    ]
+    (series,) = strong_series(evidence(records))
+    assert series.model.work == pytest.approx(WORK * DOFS)
+
+
+def test_memory_that_is_no_number_is_not_known():
+    words = {"rank_peak_mib_mean": "much", "rank_peak_mib_largest": "more"}
+    records = [r.but(reported=words) for r in rank_records(sizes=[DOFS])]
+    (series,) = strong_series(evidence(records))
+    assert rank_memory(series.answers[2]) is None
+
+
 def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(manufactured):
     found = {s.members[0].dofs: s for s in weak_series(manufactured)}
     assert [(m.ranks, m.dofs) for m in found[50_000].members] == [
