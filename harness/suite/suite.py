@@ -121,7 +121,9 @@ def load_suite(
             time_limit=checked.positive("time_limit", table["time_limit"]),
             memory_limit=checked.positive("memory_limit", table["memory_limit"]),
             solvers=_with_null(
-                _on_ranks(_solvers(table["solvers"], solvers), table, solvers),
+                _on_ranks(
+                    _solvers(table["solvers"], solvers), table, solvers, sequences
+                ),
                 table["null_arm"],
             ),
             cases=cases,
@@ -192,10 +194,12 @@ def _on_ranks(
     specs: tuple[SolverSpec, ...],
     table: Mapping[str, Any],
     registry: Mapping[str, Solver],
+    sequences: object,
 ) -> tuple[SolverSpec, ...]:
     """Ask every solver that can for each number of ranks; others run on one.
 
-    With `copies`, beside several ranks as many independent solves are asked for.
+    With `copies`, beside several ranks as many independent solves are asked for. What a
+    solver carries through a sequence lies in one process, so these are refused.
     """
     ranks, copies = table["ranks"], table["copies"]
     counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
@@ -208,6 +212,11 @@ def _on_ranks(
         )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
+    if counts != [1] and sequences:
+        raise InputError(
+            f"ranks = {shown(counts)}: one process drives a sequence; expected problems "
+            "without sequence, or no ranks"
+        )
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
     if counts != [1] and not any(able.values()):
         raise InputError(

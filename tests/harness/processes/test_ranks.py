@@ -232,6 +232,19 @@ def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
+def test_a_sequence_on_several_ranks_is_refused(tmp_path):
+    suite = tmp_path / "ranks.toml"
+    suite.write_text(
+        SUITE.replace(
+            "{ S = 2, n = 4 }",
+            '{ Nr = 4, steps = 2, step = [1, 2], feti = 4 }\nsequence = "step"',
+        ).replace("membranes", "beam-ring")
+    )
+
+    with pytest.raises(InputError, match="one process drives a sequence"):
+        mb.run(suite, out=tmp_path / "out")
+
+
 #: of two load steps, the first: one process emits it, so that a rank which has a share
 #: is preparing or solving
 LARGE = (
