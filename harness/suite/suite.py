@@ -214,8 +214,8 @@ def _on_ranks(
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
     if counts != [1] and sequences:
         raise InputError(
-            f"ranks = {shown(counts)}: one process drives a sequence; expected problems "
-            "without sequence, or no ranks"
+            f"ranks = {shown(counts)}: one process drives a sequence; expected "
+            "problems without sequence, or no ranks"
         )
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
     if counts != [1] and not any(able.values()):
