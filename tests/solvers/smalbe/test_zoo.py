@@ -56,12 +56,11 @@ def test_on_the_named_families_it_needs_hardly_more_than_the_better_preset(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
-def test_on_300_bodies_it_seldom_needs_more_and_once_twice_what_a_preset_does(tol):
+def test_on_300_bodies_it_never_needs_twice_and_seldom_more_than_the_presets(tol):
     ratios = np.array([ratio(generated_case(seed).qp, tol) for seed in range(300)])
 
     assert (ratios <= 1.2).mean() >= 0.95
-    assert np.flatnonzero(ratios > 2).tolist() in ([], [76])  # docs/smalbe.md
-    assert ratios.max() <= 2.1
+    assert ratios.max() <= 2
     assert np.median(ratios) <= 0.5
 
 
