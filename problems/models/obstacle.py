@@ -55,10 +55,10 @@ from problems.duality.torn_dual import torn_dual, torn_quantities
 from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
 from problems.feti.gluing import glue
-from problems.feti.membrane import membrane_kind
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
+from problems.models.membranes import membrane_kind
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
