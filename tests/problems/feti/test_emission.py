@@ -23,6 +23,7 @@ CASES = (
     "plate/Sx=3/Sy=2/n=3/ny=2/pattern=checkerboard/jump=10/load=edge/dual",
     "beam-ring/Nr=4/Nh=3/steps=5/step=1/contact=mortar/feti=4/dual",
     "hertz-plane/n=2/feti=5/dual",
+    "obstacle/n=11/shape=hemisphere/feti=4/dual",
     "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e5/slave=lower/dual",
 )
 ROUNDING = 1e-14
@@ -101,6 +102,10 @@ def generated(rng, count=8):
             f"load={rng.choice(['point', 'edge', 'nodal'])}/glue={glue}/dual"
         )
         yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/glue={glue}/dual"
+        yield (
+            f"obstacle/n={n[4] + 6}/shape={rng.choice(['flat', 'hemisphere'])}/"
+            f"feti={n[5] % 3 + 2}/glue={glue}/dual"
+        )
         yield f"hertz-plane/n={n[0] % 3 + 1}/feti={n[1] + 2}/glue={glue}/dual"
         yield (
             f"hertz-cylinder/n={n[2] % 3 + 1}/m={n[3] % 3 + 1}/feti={n[4] + 3}/"
@@ -116,6 +121,7 @@ def generated(rng, count=8):
         "beam-ring/kinematics=finite/steps=1/dual",
         "contact-patch/friction=coulomb/mu=0.3/feti=3/dual",
         "plate/supports=eliminated/dual", "hertz-plane/dual",
+        "obstacle/dim=1/feti=5/dual",
         "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/feti=5/dual",
     ],
 )  # fmt: skip
