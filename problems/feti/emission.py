@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from harness import QP, Vector, no_rows
+from harness import QP, InputError, Vector, no_rows
+from harness.digest import hex_digest
 from harness.distributed.vectors import (
     DistributedColumns,
     Emitted,
@@ -260,10 +261,10 @@ def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks.
+        Where there are fewer subdomains than ranks, or ranks know different ones.
 
     """
-    own = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    own = OwnSubdomains(problem, ranks, _agreed(problem, ranks))
     rows, domains = own.rows, own.domains
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
     mine = at.own
@@ -286,6 +287,27 @@ def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
 
     answer = answers(own, at, _contact_scale(problem))
     return Emitted(total, b.size, share, answer)
+
+
+def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
+    """Give subdomains to ranks (S,), if all ranks know the same subdomains.
+
+    Partitions of graphs are made on every rank, by whatever library it has.
+
+    Raises
+    ------
+    InputError
+        Where they know others, or there are fewer subdomains than ranks.
+
+    """
+    found = subdomains_of(problem, ranks.size)
+    known = hex_digest(x.tobytes() for x in (found, *problem.layout.sharing()))
+    if len(set(ranks.comm.allgather(known))) > 1:
+        raise InputError(
+            "ranks have cut the bodies into different subdomains; expected the same "
+            "version of METIS on all nodes"
+        )
+    return found
 
 
 def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:

@@ -11,7 +11,7 @@ import pytest
 from harness.distributed import mpi
 from harness.names import parse
 from problems import PROBLEMS
-from tests.support import ROOT, SUPPORT
+from tests.support import ROOT, SUPPORT, press
 
 pytestmark = pytest.mark.together
 
@@ -40,6 +40,36 @@ def emitted(ranks, cases):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def described(tmp_path_factory):
+    """Bodies of a description, in parts, the case by what it is about."""
+    path = press.described(tmp_path_factory.mktemp("press"))
+    name = f"bodies:{path}/parts=8"
+    return {
+        "first": f"{name}/step=1/dual",
+        "friction": f"{name}/steps=1/friction=tresca/bound=1e7/glue=redundant/dual",
+        "second": f"{name}/steps=2/step=2/dual",
+        "coulomb": f"{name}/steps=1/friction=coulomb/mu=0.2/dual",
+        "whole": f"bodies:{path}/steps=1/dual",
+    }
+
+
+def test_ranks_assemble_their_parts_of_a_mesh_that_all_read(described):
+    for case in emitted(2, [described["first"], described["friction"]]).values():
+        assert case["sizes"][0] == case["sizes"][1]
+        assert case["entries"][0] == case["entries"][1]
+        assert max(*case["errors"].values(), *case["bounds"]) < ROUNDING
+        assert set(case["owners"]) == {1}
+        assert case["torn"] == 0
+
+
+@pytest.mark.parametrize("what", ["second", "coulomb", "whole"])
+def test_of_a_description_one_process_emits_what_needs_more(described, what):
+    case = parse(described[what], PROBLEMS)
+
+    assert case.family.emission(case.form, case.params) is None
 
 
 @pytest.fixture(
