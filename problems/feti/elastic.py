@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Friction, Value, Vector, no_rows
+from harness import QP, Friction, Value, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import (
     Bodies,
@@ -21,12 +21,14 @@ from problems.contact.bodies import (
 )
 from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.linearise import linearisation
+from problems.contact.node_to_segment import ContactRows
 from problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes
-from problems.fem.mesh import Mesh, Nodes, StructuredGrid, boundary_edges, dofs_of
-from problems.feti.emission import Contact, StructuredBodies
+from problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
+from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
 from problems.feti.structured import Layout
+from problems.feti.subdivision import Subdivision
 from problems.feti.tearing import Decomposition, Part, decompose
 from problems.feti.torn import Kind, Torn
 
@@ -123,48 +125,43 @@ def torn(
     )  # fmt: skip
 
 
-Side = tuple[int, str]  #: a body, and the name of a side of its grid
-
-
-def structured(
-    grids: tuple[StructuredGrid, ...],
-    most: int | tuple[int, int],
+def in_parts(
+    layout: Subdivision,
     *,
     materials: tuple[Material, ...],
     plane: Plane,
     units: tuple[float, float],
     fixed: Nodes,
     load: tuple[Nodes, Vector],
-    pairs: Sequence[tuple[Side, Side]],
-    method: tuple[str, Any],
-    laws: Sequence[FrictionLaw],
+    pairs: Sequence[ContactPair],
+    linearise: Callable[[ContactSides], ContactRows],
+    laws: Sequence[FrictionLaw] = (),
     glue: str,
-) -> StructuredBodies:
-    """Describe the first load step of elastic bodies on grids, one after another.
+) -> ProblemInParts:
+    """Describe elastic bodies in contact, linearised at rest, before they are torn.
 
     It is the problem of `problems.contact.bodies.assemble` and `torn`, of which every
     rank can emit its share (`problems.feti.emission`).
 
     Parameters
     ----------
-    most : cells along a side of a subdomain, or along each
-    materials, plane, units, fixed : as of `assemble`
+    materials, plane, units, fixed, pairs : as of `assemble`
     load : components with a force, and the forces, N/m; each component once
-    pairs : slave and master of each contact
-    method : the keys contact and basis, see `problems.contact.linearise`
+    linearise : takes the rows at rest from the nodes of the sides alone
     laws : of friction with a given bound, one per pair
 
     """
     length, force = units
-    layout = Layout.of(grids, most)
     D = elasticity_matrices(materials, plane) * (length / force)
     E = np.array([m.E for m in materials]) * (length / force)
-    return StructuredBodies(
-        layout=layout, components=2, material=layout.block.body,
-        kind=partial(elastic_kind, D=D, E=E), E=E, share=longitudinal_share(D),
+    share = longitudinal_share(D)
+    return ProblemInParts(
+        layout=layout, components=2, material=layout.body,
+        kind=partial(elastic_kind, D=D, E=E), E=E,
+        shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         held=fixed,
         load=forces_at(load[0], load[1] / force), glue=glue,
-        contact=_contact_of_sides(layout, pairs, method, laws, units),
+        contact=_contact_of_sides(layout, pairs, linearise, laws, units),
     )  # fmt: skip
 
 
@@ -182,39 +179,37 @@ def forces_at(component: Nodes, force: Vector) -> Callable[[Nodes], Vector]:
     return of
 
 
+def at_rest(
+    contact: str, basis: Any, laws: Sequence[FrictionLaw] = ()
+) -> Callable[[ContactSides], ContactRows]:
+    """Make what linearises contact of sides at rest, see `linearisation`."""
+    return lambda sides: linearisation(sides, contact, basis, laws)(
+        np.zeros(sides.mesh.dofs)
+    )
+
+
 def _contact_of_sides(
-    layout: Layout,
-    pairs: Sequence[tuple[Side, Side]],
-    method: tuple[str, Any],
+    layout: Subdivision,
+    pairs: Sequence[ContactPair],
+    linearise: Callable[[ContactSides], ContactRows],
     laws: Sequence[FrictionLaw],
     units: tuple[float, float],
 ) -> Contact:
     """Linearise contact at rest from the nodes of the sides alone."""
-    n = 2 * int(layout.node_start[-1])
-    if not pairs:
-        return Contact(no_rows(n), np.zeros(0), np.zeros(0))
+    n = 2 * layout.nodes
     length, force = units
-    sides = list(dict.fromkeys(side for pair in pairs for side in pair))
-    chain = {
-        (b, name): layout.grids[b].sides[name] + layout.node_start[b]
-        for b, name in sides
-    }
-    node, first = np.unique(
-        np.concatenate([chain[side] for side in sides]), return_index=True
-    )
-    points = np.concatenate([layout.grids[b].side(name) for b, name in sides])
-    bodies = ContactSides(
-        mesh=Mesh(points[first], np.zeros((0, 4), dtype=np.int64), {}),
+    node = np.unique(np.concatenate([side for pair in pairs for side in pair]))
+    sides = ContactSides(
+        mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
         pairs=tuple(
-            ContactPair(*(np.searchsorted(node, chain[side]) for side in pair))
+            ContactPair(*(np.searchsorted(node, side) for side in pair))
             for pair in pairs
         ),
         force=force,
     )  # fmt: skip
-    at_rest = np.zeros(bodies.mesh.dofs)
-    rows = linearisation(bodies, *method, laws)(at_rest)
-    pressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
-    friction = friction_of(bodies, rows, laws, at_rest, pressed)
+    rows = linearise(sides)
+    pressed = np.zeros(sum(pair.slave.size for pair in pairs))
+    friction = friction_of(sides, rows, laws, np.zeros(sides.mesh.dofs), pressed)
     B = csr_array(vstack([rows.B, friction.T])) if friction.bound.size else rows.B
     of_whole = csr_array(
         (B.data, dofs_of(node)[B.indices], B.indptr), shape=(B.shape[0], n)

@@ -60,8 +60,14 @@ from problems.fem.mesh import (
     rectangle_grid,
 )
 from problems.fem.stress import gauss_stress
-from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
-from problems.feti.emission import StructuredBodies
+from problems.feti.elastic import (
+    SubdividedBodies,
+    at_rest,
+    in_parts,
+    posed_on,
+    subdivide,
+)
+from problems.feti.emission import ProblemInParts
 from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 from problems.ranges import SHORTEST
@@ -246,26 +252,31 @@ def model(params: Mapping[str, Value]) -> Bodies:
     sides, (component, force) = mesh.boundaries, _pressure(grids)
     load = np.zeros(mesh.dofs)
     load[component] = force
-    lower, upper = sides["lower_top"], sides["upper_bottom"]
     return assemble(
         mesh, body, names=("lower", "upper"), materials=_materials(params),
         plane=p["plane"], units=UNITS, fixed=_rollers(sides), load=load,
-        pairs=(ContactPair(lower, upper) if p["slave"] == "lower"
-               else ContactPair(upper, lower),),
+        pairs=(_pair(params, sides),),
     )  # fmt: skip
 
 
-def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
-    """Describe the dual of the linear problem in subdomains."""
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the linear problem in subdomains."""
     p: Any = params
-    grids = _grids(params)
-    lower, upper = (0, "lower_top"), (1, "upper_bottom")
-    return structured(
-        grids, p["feti"], materials=_materials(params), plane=p["plane"], units=UNITS,
-        fixed=_rollers(joined_sides(grids)), load=_pressure(grids),
-        pairs=[(lower, upper) if p["slave"] == "lower" else (upper, lower)],
-        method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+    grids, laws = _grids(params), (law_of(params),)
+    sides = joined_sides(grids)
+    return in_parts(
+        Layout.of(grids, p["feti"]), materials=_materials(params), plane=p["plane"],
+        units=UNITS, fixed=_rollers(sides), load=_pressure(grids),
+        pairs=(_pair(params, sides),),
+        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
     )  # fmt: skip
+
+
+def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
+    lower, upper = sides["lower_top"], sides["upper_bottom"]
+    return ContactPair(
+        *((lower, upper) if params["slave"] == "lower" else (upper, lower))
+    )
 
 
 def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
