@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -39,16 +39,20 @@ class Membranes(Family):
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
+    def emission(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Ranks], Emitted] | None:
         """Have each rank make its share of the dual."""
         if form != "dual":
             return None
-        from problems.feti.emission import emitted
-        from problems.models.membranes import structured_problem
 
-        return emitted(structured_problem(params), ranks)
+        def emit(ranks: Ranks) -> Emitted:
+            from problems.feti.emission import emitted
+            from problems.models.membranes import structured_problem
+
+            return emitted(structured_problem(params), ranks)
+
+        return emit
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -90,16 +90,20 @@ class ContactPatch(Family):
             )
         return {**params, **doubled(params, "lower", "upper")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
+    def emission(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Ranks], Emitted] | None:
         """Have each rank make its share of the dual."""
         if form != "dual" or not emitted_on_ranks(params):
             return None
-        from problems.feti.emission import emitted
-        from problems.models.patch import structured_problem
 
-        return emitted(structured_problem(params), ranks)
+        def emit(ranks: Ranks) -> Emitted:
+            from problems.feti.emission import emitted
+            from problems.models.patch import structured_problem
+
+            return emitted(structured_problem(params), ranks)
+
+        return emit
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -45,6 +45,7 @@ from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
+NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
 
@@ -92,7 +93,7 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     load = np.zeros(mesh.dofs)
     load[_tip(sides)[1]] = -LOAD
     return assemble(
-        mesh, body, names=("beam", "ring"), materials=(BEAM, RING), plane=plane,
+        mesh, body, names=NAMES, materials=(BEAM, RING), plane=plane,
         units=(LENGTH, LOAD), fixed=_clamps(sides), load=load,
         pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
@@ -103,12 +104,14 @@ def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
     p: Any = params
     grids = _grids(p["Nr"], p["Nh"], p["radial"])
     sides = joined_sides(grids)
+    tip = _tip(sides)
     return structured(
         grids, p["feti"], materials=(BEAM, RING), plane=p["plane"],
-        units=(LENGTH, LOAD), fixed=_clamps(sides),
-        load=(_tip(sides)[1:], np.array([-LOAD])),
+        units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
+        load=(tip[1:], np.array([-LOAD])),
         pairs=[((1, "outer"), (0, "bottom"))],
         method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+        results=lambda found: {"tip": (found.at(tip) * LENGTH).tolist()},
     )  # fmt: skip
 
 
