@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import GLUES, PLANES, at_least, doubled, fits, one_of, positive
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
-    from harness.distributed.vectors import Emitted, Ranks
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class Plate(Family):
+class Plate(InSubdomains):
     """A clamped plate in subdomains, with jumps of E: linear, to measure FETI on."""
 
     name: str = "plate"
@@ -57,20 +58,15 @@ class Plate(Family):
         """Return the case with every cell halved, in the same subdomains."""
         return {**params, **doubled(params, "n", "ny")}
 
-    def emission(
-        self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks], Emitted] | None:
-        """Have each rank make its share of the dual."""
-        if form != "dual" or params["supports"] == "eliminated":
-            return None
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether supports are rows of the dual."""
+        return params["supports"] == "rows"
 
-        def emit(ranks: Ranks) -> Emitted:
-            from problems.feti.emission import emitted
-            from problems.models.plate import structured_problem
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.plate import in_subdomains
 
-            return emitted(structured_problem(params), ranks)
-
-        return emit
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

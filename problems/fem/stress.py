@@ -59,11 +59,11 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     offset = (centre[cells] - mesh.points[nodes]) / size
     basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, y about the node
     normal, right = np.empty((N, 3, 3)), np.empty((N, 3, k))
-    for i, j in combinations_with_replacement(range(3), 2):
-        sums = np.bincount(nodes, basis[:, i] * basis[:, j], N)
-        normal[:, i, j] = normal[:, j, i] = sums
-    for i, j in np.ndindex(3, k):
-        right[:, i, j] = np.bincount(nodes, basis[:, i] * values[cells, j], N)
+    for p, q in combinations_with_replacement(range(3), 2):
+        sums = np.bincount(nodes, basis[:, p] * basis[:, q], N)
+        normal[:, p, q] = normal[:, q, p] = sums
+    for p, q in np.ndindex(3, k):
+        right[:, p, q] = np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
     interior = ~_on_boundary(mesh)
     polynomial = np.zeros((N, 3, k))
@@ -112,6 +112,7 @@ def _neighbours(
     cells = mesh.cells[first[mesh.cells].any(axis=1)]
     a, b = np.repeat(cells, 4, axis=1).ravel(), np.tile(cells, 4).ravel()
     keep = first[a] & second[b]
-    N = first.size
-    a, b = np.divmod(np.unique(a[keep] * N + b[keep]), N)
-    return a, b
+    from_first, to_second = np.divmod(
+        np.unique(a[keep] * first.size + b[keep]), first.size
+    )
+    return from_first, to_second

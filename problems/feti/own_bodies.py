@@ -19,7 +19,7 @@ from problems.feti.substructures import LocalProblems
 from problems.feti.torn import Torn
 
 if TYPE_CHECKING:
-    from problems.feti.emission import OwnSubdomains, StructuredBodies
+    from problems.feti.emission import OwnSubdomains, ProblemInParts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -133,37 +133,31 @@ def _spread(own: OwnSubdomains, place: Nodes, n: int) -> csr_array:
     d, N = own.problem.components, place.size
     if d == 1:
         return csr_array((np.ones(N), place, np.arange(N + 1)), shape=(N, n))
-    turn = own.rotation[own.nodes.block].transpose(0, 2, 1)
+    turn = own.rotation[own.nodes.subdomain].transpose(0, 2, 1)
     blocks = np.ascontiguousarray(turn), place[::d] // d, np.arange(N // d + 1)
     T = csr_array(bsr_array(blocks, shape=(N, n)))
     T.eliminate_zeros()
     return T
 
 
-def _carrying(problem: StructuredBodies) -> Nodes:
+def _carrying(problem: ProblemInParts) -> Nodes:
     """List the rows of contact, and those of friction with a bound above zero."""
     m, bound = problem.contact.rows.shape[0], problem.contact.bound
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
-def _is_held(problem: StructuredBodies) -> bool:
+def _is_held(problem: ProblemInParts) -> bool:
     """Whether the supports leave no rigid motion of any body."""
     of, d = problem.layout, problem.components
     node, k = np.divmod(problem.held, d)
-    at = of.places(node)
-    for b, grid in enumerate(of.grids):
-        own = at.body == b
+    body = of.body[of.holder(node)]
+    for b in range(problem.E.size):
+        own = body == b
         if d == 1:
             if not own.any():
                 return False
             continue
-        points = np.concatenate([
-            np.zeros((0, 2)),
-            *(
-                grid.block(slice(i, i + 1), slice(j, j + 1))
-                for i, j in zip(at.column[own], at.row[own], strict=True)
-            ),
-        ])  # fmt: skip
+        points = of.position(node[own])
         size = np.ptp(points, axis=0).max(initial=0.0) or 1.0
         x, y = ((points - points[:1]) / size).T
         along_x = k[own] == 0

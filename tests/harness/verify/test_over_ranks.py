@@ -17,6 +17,7 @@ HELD = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
     "plate/Sx=4/Sy=2/n=4/dual",
+    "obstacle/n=10/shape=hemisphere/feti=3/dual",
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 PATCH = "contact-patch/feti=3/dual"
