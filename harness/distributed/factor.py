@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, cho_factor
+from scipy.linalg import blas, lapack
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -181,11 +181,20 @@ class SummedFactor:
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
             u, r = self.local.reduced(np.asarray(t))
-            c = len(self.L_cc)
-            z_c = _solved(self.L_cc, r[:c])
-            z_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
+            z_c, r_s = self._changing(r)
+            z_s = _solved(self.L_ss, self._gathered(r_s))
             z_s /= np.sqrt(ranks.size)
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
+
+    def norm(self, t: Dense) -> float:
+        """Return ‖L⁻¹t‖ of an additive t (k,), in one reduction."""
+        with self.local.at.ranks.clocked("coarse"):
+            u, r = self.local.reduced(np.asarray(t))
+            z_c, r_s = self._changing(r)
+            inner = float(u @ u) / self.root**2 + float(z_c @ z_c)
+            told = self._gathered(r_s, inner)
+            z_s = _solved(self.L_ss, told[:-1])
+            return float(np.sqrt(told[-1] + z_s @ z_s))
 
     def backward(self, a: Dense) -> DistributedVector:
         """Take an orthonormal a (k - s_p + s,) to L⁻ᵀa (k,), consistent."""
@@ -201,21 +210,29 @@ class SummedFactor:
 
     def __call__(self, t: Dense) -> DistributedVector:
         """Solve for the consistent y (k,) of an additive t (k,)."""
-        local, c = self.local, len(self.L_cc)
+        local = self.local
         with local.at.ranks.clocked("coarse"):
             u, r = local.reduced(np.asarray(t))
-            z_c = _solved(self.L_cc, r[:c])
-            x_s = _solved(self.L_ss, self._gathered(r[c:] - self.L_sc @ z_c))
-            x_s = _solved(self.L_ss, x_s, transposed=True)[local.at.place]
+            z_c, r_s = self._changing(r)
+            z_s = _solved(self.L_ss, self._gathered(r_s))
+            x_s = _solved(self.L_ss, z_s, transposed=True)[local.at.place]
             x_c = _solved(self.L_cc, z_c - x_s @ self.L_sc, transposed=True)
             y = local.extended(u / self.root**2, np.concatenate([x_c, x_s]))
             return distributed(y, local.at.ranks)
 
-    def _gathered(self, r: Dense) -> Dense:
-        """Add what all ranks have for the shared rows that they touch (s_p,): (s,)."""
-        shared = np.zeros(len(self.L_ss))
-        shared[self.local.at.place] = r
-        return self.local.at.ranks.total(shared)
+    def _changing(self, r: Dense) -> tuple[Dense, Dense]:
+        """Eliminate changing rows of a border (c + s_p,); what is left of the others."""
+        c = len(self.L_cc)
+        z_c = _solved(self.L_cc, r[:c])
+        return z_c, r[c:] - self.L_sc @ z_c
+
+    def _gathered(self, r: Dense, *more: float) -> Dense:
+        """Add what all ranks have for shared rows (s_p,), and more: (s + more,)."""
+        s = len(self.L_ss)
+        told = np.zeros(s + len(more))
+        told[self.local.at.place] = r
+        told[s:] = more
+        return self.local.at.ranks.total(told)
 
 
 def local_factor(
@@ -257,7 +274,10 @@ def _cholesky(M: Dense) -> Dense:
     """Return L with LLᵀ = M, its upper triangle not to be read."""
     if not len(M):
         return np.zeros((0, 0), order="F")
-    return np.asfortranarray(cho_factor(M, lower=True)[0])
+    L, failed = lapack.dpotrf(M, lower=1, clean=0)
+    if failed:
+        raise np.linalg.LinAlgError
+    return np.asarray(L)
 
 
 def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:

@@ -24,7 +24,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ from harness.distributed.factor import (
     with_int32,
 )
 from harness.distributed.vectors import DistributedColumns, distributed
-from solvers.smalbe import compiled
+from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
 
@@ -95,6 +95,10 @@ class Rows(ABC):
             np.linalg.norm(Cnu) <= tol * size
             and np.linalg.norm(self.error(nu, Cnu)) <= tol * self.e_size
         )
+
+    def violation(self, nu: Vector) -> float:
+        """Return ‖Cν‖."""
+        return float(np.linalg.norm(self.C @ nu))
 
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
@@ -149,6 +153,9 @@ class SparseRows(Rows):
     unit: SparseColumns  #: (r, n) the rows of G divided by their norms
     gram: GramFactor  #: of these
 
+    def violation(self, nu: Vector) -> float:
+        return self.gram.norm(self.unit @ nu)
+
     @property
     def no_multipliers(self) -> Vector:
         return self.C @ np.zeros_like(self.x_tilde)
@@ -179,6 +186,9 @@ class GramFactor(Protocol):
     def forward(self, t: Vector) -> Vector:
         """Return L⁻¹t."""
 
+    def norm(self, t: Vector) -> float:
+        """Return ‖L⁻¹t‖."""
+
     def backward(self, a: Vector) -> Vector:
         """Return L⁻ᵀa."""
 
@@ -202,6 +212,9 @@ class _Whole:
         t = self.factor.apply_P(t)
         return np.asarray(self.factor.solve_L(t, use_LDLt_decomposition=False))
 
+    def norm(self, t: Vector) -> float:
+        return float(np.linalg.norm(self.forward(t)))
+
     def backward(self, a: Vector) -> Vector:
         x = self.factor.solve_Lt(a, use_LDLt_decomposition=False)
         return np.asarray(self.factor.apply_Pt(x))
@@ -212,6 +225,36 @@ class _Whole:
         held = _gram(self.unit, ~free)
         factor = self.factor.cholesky(with_int32((1 + shift) * self.matrix - held))
         return lambda t: np.asarray(factor(t))
+
+
+class OuterProducts(NamedTuple):
+    """The entries of gⱼgⱼᵀ for columns gⱼ (b,) of a sparse matrix."""
+
+    size: int  #: b
+    place: NDArray[np.int64]  #: (e,) of each entry in (b, b), row by row
+    value: Vector  #: (e,)
+    column: NDArray[np.int64]  #: (e,) the j of each
+
+    @classmethod
+    def of(cls, G: csr_array, columns: Mask) -> OuterProducts:
+        """List those of some columns (n,) of G (b, n)."""
+        part = csc_array(G)[:, columns]
+        entries = np.diff(part.indptr)[np.repeat(
+            np.arange(part.shape[1]), np.diff(part.indptr)
+        )]  # fmt: skip
+        left = np.repeat(np.arange(part.nnz), entries)
+        first = np.repeat(part.indptr[:-1], np.diff(part.indptr) ** 2)
+        within = np.arange(left.size) - np.repeat(np.cumsum(entries) - entries, entries)
+        right = first + within
+        number = np.repeat(np.flatnonzero(columns), np.diff(part.indptr) ** 2)
+        place = part.indices[left].astype(np.int64) * G.shape[0] + part.indices[right]
+        return cls(G.shape[0], place, part.data[left] * part.data[right], number)
+
+    def summed(self, some: Mask) -> NDArray[np.float64]:
+        """Add them up for some of all columns (n,): (b, b)."""
+        value = np.where(some[self.column], self.value, 0.0)
+        found = np.bincount(self.place, value, self.size**2)
+        return found.reshape(self.size, self.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +268,7 @@ class _OverRanks:
     matrix: csc_array  #: G_p G_pᵀ of the columns of this rank
     local: LocalFactor
     factor: SummedFactor
-    bounded: Mask  #: (n_p,) its bounded components
-    touching: csc_array  #: of G_p, rows on the border and bounded components
+    bounded: OuterProducts  #: of its bounded components, on the border
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
@@ -234,13 +276,16 @@ class _OverRanks:
     def forward(self, t: Vector) -> Vector:
         return self.factor.forward(t)
 
+    def norm(self, t: Vector) -> float:
+        return self.factor.norm(t)
+
     def backward(self, a: Vector) -> Vector:
         return self.factor.backward(a)
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         with self.local.at.ranks.clocked("coarse"):
-            held = self.touching[:, ~np.asarray(free)[self.bounded]]
-            return self.local.completed(1 + shift, (held @ held.T).toarray())
+            held = self.bounded.summed(~np.asarray(free))
+            return self.local.completed(1 + shift, held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,14 +329,15 @@ class _Bordered:
     order: NDArray[np.int64]  #: (r,) rows, those of c last
     factor: Factor  #: of S in that order
     L_cc: NDArray[np.float64]
-    touching: SparseColumns  #: G_c (c, n)
+    #: held components H (n,) → (G_H G_Hᵀ)_cc
+    held: Callable[[Mask], NDArray[np.float64]]
 
     def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
         """Return solves with (1 + shift)S − G_H G_Hᵀ."""
         L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
         schur = cho_factor(
-            scale * (L_cc @ L_cc.T) - _gram(self.touching, held).toarray(), lower=True
+            scale * (L_cc @ L_cc.T) - self.held(held), lower=True
         )
 
         def solve(t: Vector) -> Vector:
@@ -318,9 +364,9 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
     factor.cholesky_inplace(S)
     L_cc = factor.L()[rest.size :, rest.size :].toarray()
     touching = unit[c]
-    if not isinstance(touching, DistributedColumns):
-        touching = csc_array(touching)
-    return _Bordered(order, factor, L_cc, touching)
+    if isinstance(touching, DistributedColumns):
+        return _Bordered(order, factor, L_cc, lambda held: touching.gram(held).toarray())
+    return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,10 +418,11 @@ class PenaltyModel:
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
         """Return v → B_FF⁻¹v_F, zero off the face F."""
         G, solve = self.rows.unit, self.rows.gram.in_face(free, self.tau / self.w)
+        inverse = np.where(free, 1 / self.tau, 0.0)
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
-            return np.where(free, v - G.T @ solve(G @ v), 0.0) / self.tau
+            return kernels.weighted_difference(v, G.T @ solve(G @ v), inverse)
 
         return apply
 
@@ -495,10 +542,8 @@ def rows_over_ranks(
             return None
         if factor.least_pivot <= np.sqrt(RANK):
             return None
-        gram = _OverRanks(
-            matrix, local, factor, here,
-            csc_array(csr_array(of_bounded)[local.border]),
-        )  # fmt: skip
+        of_border = OuterProducts.of(csr_array(unit[local.border]), here)
+        gram = _OverRanks(matrix, local, factor, of_border)
 
     def multipliers(a: Vector) -> Vector:
         whole = np.zeros(e.size)
