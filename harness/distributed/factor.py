@@ -221,7 +221,7 @@ class SummedFactor:
             return distributed(y, local.at.ranks)
 
     def _changing(self, r: Dense) -> tuple[Dense, Dense]:
-        """Eliminate changing rows of a border (c + s_p,); what is left of the others."""
+        """Eliminate changing rows of a border (c + s_p,); and what the others keep."""
         c = len(self.L_cc)
         z_c = _solved(self.L_cc, r[:c])
         return z_c, r[c:] - self.L_sc @ z_c

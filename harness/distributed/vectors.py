@@ -115,9 +115,9 @@ class Ranks:
 
         """
         out, found = np.ascontiguousarray(out), np.empty(int(coming.sum()))
-        sends, ends = np.flatnonzero(sizes), np.cumsum(sizes)
-        comes, at = np.flatnonzero(coming), np.cumsum(coming)
-        self.counts["messages"] += sends.size
+        ends, at = np.cumsum(sizes), np.cumsum(coming)
+        sends, comes = (np.flatnonzero(n).tolist() for n in (sizes, coming))
+        self.counts["messages"] += len(sends)
         self.counts["bytes"] += out.nbytes
         posted = [
             self.comm.Irecv(found[at[r] - coming[r] : at[r]], source=r) for r in comes

@@ -216,9 +216,11 @@ class RowsOverRanks:
 
     at: Halo
     own: csr_array  #: (o, M) of owned rows
-    own_T: csr_array  #: (M, o)
+    transposed: csr_array  #: (M, o)
     borrowed: csr_array  #: (t − o, M) of the neighbours' rows
-    borrowed_T: csr_array  #: (k, t − o) those rows of its transpose that are not zero
+    borrowed_transposed: (
+        csr_array  #: (k, t − o) rows of its transpose, without zero ones
+    )
     reached: Nodes  #: (k,) which ones they are
 
     @classmethod
@@ -235,8 +237,8 @@ class RowsOverRanks:
         """Return Bᵀx (M,) of this rank's slice x (o,)."""
         arrived = self.at.borrowing(x)
         with self.at.ranks.clocked("products"):
-            X = self.own_T @ x
-            X[self.reached] += self.borrowed_T @ arrived()
+            X = self.transposed @ x
+            X[self.reached] += self.borrowed_transposed @ arrived()
         return np.asarray(X)
 
     def times(self, X: Vector) -> Vector:

@@ -23,7 +23,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -41,10 +41,10 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
-from harness.distributed.vectors import DistributedColumns, distributed
+from harness.distributed.vectors import DistributedColumns, Ranks, distributed
 from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
-from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
+from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
 
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
@@ -152,6 +152,8 @@ class SparseRows(Rows):
 
     unit: SparseColumns  #: (r, n) the rows of G divided by their norms
     gram: GramFactor  #: of these
+    bounded: NDArray[np.int64]  #: (b,) components that have a bound
+    of_bounded: SparseColumns  #: (r, b) the columns of `unit` of these
 
     def violation(self, nu: Vector) -> float:
         return self.gram.norm(self.unit @ nu)
@@ -254,7 +256,7 @@ class OuterProducts(NamedTuple):
         """Add them up for some of all columns (n,): (b, b)."""
         value = np.where(some[self.column], self.value, 0.0)
         found = np.bincount(self.place, value, self.size**2)
-        return found.reshape(self.size, self.size)
+        return np.asarray(found.reshape(self.size, self.size), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,23 +292,31 @@ class _OverRanks:
 
 @dataclass(frozen=True, eq=False)
 class _LocalRows:
-    """The rows of distributed columns that a rank touches: products are additive."""
+    """The rows of distributed columns that a rank touches: products are additive.
 
-    part: csr_array  #: (k, n_p)
-    transposed: csr_array  #: (n_p, k), by rows: it is multiplied with as often
-    columns: DistributedColumns
+    Held once, column by column. Both products then go along the components, and jump
+    about among the rows alone, which are few and stay in the cache.
+    """
+
+    part: csc_array  #: (k, n_p)
+    ranks: Ranks
 
     @property
     def shape(self) -> tuple[int, int]:
         rows, columns = self.part.shape
         return rows, columns
 
+    @cached_property
+    def transposed(self) -> csr_array:
+        """(n_p, k), the same entries."""
+        return self.part.T
+
     @property
     def T(self) -> _LocalRowsTransposed:
         return _LocalRowsTransposed(self)
 
     def __matmul__(self, v: Vector) -> Vector:
-        return distributed(self.part @ np.asarray(v), self.columns.ranks)
+        return distributed(self.part @ np.asarray(v), self.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,8 +324,7 @@ class _LocalRowsTransposed:
     rows: _LocalRows
 
     def __matmul__(self, y: Vector) -> Vector:
-        part = self.rows.transposed @ np.asarray(y)
-        return distributed(part, self.rows.columns.ranks)
+        return distributed(self.rows.transposed @ np.asarray(y), self.rows.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,9 +345,7 @@ class _Bordered:
         """Return solves with (1 + shift)S − G_H G_Hᵀ."""
         L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
-        schur = cho_factor(
-            scale * (L_cc @ L_cc.T) - self.held(held), lower=True
-        )
+        schur = cho_factor(scale * (L_cc @ L_cc.T) - self.held(held), lower=True)
 
         def solve(t: Vector) -> Vector:
             u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
@@ -365,7 +372,9 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
     L_cc = factor.L()[rest.size :, rest.size :].toarray()
     touching = unit[c]
     if isinstance(touching, DistributedColumns):
-        return _Bordered(order, factor, L_cc, lambda held: touching.gram(held).toarray())
+        return _Bordered(
+            order, factor, L_cc, lambda held: touching.gram(held).toarray()
+        )
     return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
 
 
@@ -383,20 +392,35 @@ class PenaltyModel:
         """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
 
         As `Model.step`, with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs: the gradient of
-        the dual function is Gs(y) − GGᵀy/w.
+        the dual function is Gs(y) − GGᵀy/w. Of components without bounds s is
+        −(g + Gᵀy)/τ, so that only those with bounds, b, are looked at for each y:
+
+            Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
         """
-        G, gram, tau, w = self.rows.unit, self.rows.gram, self.tau, self.w
+        rows, gram, tau, w = self.rows, self.rows.gram, self.tau, self.w
+        b, G_b = rows.bounded, rows.of_bounded
+        x_b, g_b, box = x[b], g[b], (bounds[0][b], bounds[1][b])
+        Gg = rows.unit @ g
 
         def at(y: Vector) -> Tilted:
-            return tilted(
-                x, g + G.T @ y, tau, bounds, lambda s: G @ s - gram.product(y) / w
-            )
+            tilt = g_b + G_b.T @ y
+            s_b, piece = kernels.tilted_step(x_b, tilt, tau, *box)
+            held = G_b @ kernels.combined(1 / tau, tilt, 1.0, s_b)
+            shift = kernels.combined(1 / tau, Gg, 1 / tau + 1 / w, gram.product(y))
+            return Tilted(s_b, piece, held - shift)
 
         def newton(slope: Vector, free: Mask) -> Vector:
-            return tau * gram.in_face(free, tau / w)(slope)
+            of_all = np.ones(x.size, dtype=bool)
+            of_all[b] = free
+            return tau * gram.in_face(of_all, tau / w)(slope)
 
-        s = minimised(at, newton, G.shape[0])
-        return Model.of_norm(tau + w, x.size).step(x, g, bounds) if s is None else s
+        found = minimised(at, newton, rows.unit.shape[0])
+        if found is None:
+            return Model.of_norm(tau + w, x.size).step(x, g, bounds)
+        y, there = found
+        s: Vector = kernels.combined(-1 / tau, g, -1 / tau, rows.unit.T @ y)
+        s[b] = there.s
+        return s
 
     def raised(self, s: Vector, sHs: float) -> BoxModel:
         """As `Model.raised`."""
@@ -506,12 +530,14 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
     least = float(factor.D().min())  # pivots may be negative, too
     if least <= RANK:
         return None
+    b = np.flatnonzero(np.asarray(bounded))
     whole = _Whole(unit, gram, factor, _bordered(unit, gram, bounded))
     return SparseRows(
         G=G, C=_Factored(unit, whole, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
         multipliers=lambda a: whole.backward(a) / size,
         unit=unit, gram=whole,
+        bounded=b, of_bounded=_columns(unit, b),
     )  # fmt: skip
 
 
@@ -550,11 +576,13 @@ def rows_over_ranks(
         whole[rows] = np.asarray(factor.backward(a)) / at.touching
         return ranks.total(whole) / size
 
-    own = _LocalRows(unit, csr_array(unit.T), G)
+    own = _LocalRows(csc_array(unit), ranks)
     return SparseRows(
         G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
         x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
+        bounded=np.flatnonzero(here),
+        of_bounded=_LocalRows(of_bounded, ranks),
     )  # fmt: skip
 
 
@@ -564,6 +592,13 @@ def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
         return G.gram(columns)
     part = G if columns is None else G[:, np.flatnonzero(columns)]
     return csc_array(part @ part.T)
+
+
+def _columns(G: SparseColumns, at: NDArray[np.int64]) -> SparseColumns:
+    """Return some of the columns."""
+    if isinstance(G, DistributedColumns):
+        return DistributedColumns(csr_array(G.part[:, at]), G.ranks)
+    return csr_array(G[:, at])
 
 
 def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
