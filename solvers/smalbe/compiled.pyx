@@ -327,6 +327,7 @@ cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
+    KEPT = 200  # directions of CG on a face
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
     MOST_IDLE = 2
@@ -438,6 +439,68 @@ cdef class Model:
         return 0
 
 
+cdef class Directions:
+    """The last conjugate directions of CG on a face, as `solvers.smalbe.mprgp` has them.
+
+    free : the face, 1 where a component is off its bounds (n,)
+    """
+
+    cdef Py_ssize_t n, count, most, oldest
+    cdef double[:, ::1] p, Hp
+    cdef double[::1] share, free
+
+    def __cinit__(self, Py_ssize_t n, Py_ssize_t most):
+        self.n, self.most = n, most
+        self.p = self.Hp = np.empty((0, n))
+        self.share, self.free = np.empty(most), np.empty(n)
+
+    cdef void begin(self, const double *free) noexcept:
+        """Forget all, on another face."""
+        self.count = self.oldest = 0
+        if self.n:
+            memcpy(&self.free[0], free, self.n * sizeof(double))
+
+    cdef bint is_on(self, const double *free) noexcept:
+        """Whether they are directions on that face."""
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            if self.free[i] != free[i]:
+                return False
+        return True
+
+    cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
+        """Add one with pᵀHp, in place of the oldest where there are too many."""
+        cdef Py_ssize_t at = self.count, room = self.p.shape[0]
+        if not self.most:
+            return 0
+        if at == self.most:
+            at, self.oldest = self.oldest, (self.oldest + 1) % self.most
+        elif at == room:
+            more = np.empty((min(max(16, 2 * room), self.most) - room, self.n))
+            self.p = np.concatenate((self.p, more))
+            self.Hp = np.concatenate((self.Hp, more))
+        memcpy(&self.p[at, 0], p, self.n * sizeof(double))
+        memcpy(&self.Hp[at, 0], Hp, self.n * sizeof(double))
+        scale(1 / sqrt(curvature), &self.p[at, 0], self.n)
+        scale(1 / sqrt(curvature), &self.Hp[at, 0], self.n)
+        self.count = min(self.count + 1, self.most)
+        return 0
+
+    cdef void conjugate(self, double *p) noexcept:
+        """Take from p its part along them."""
+        if self.count:
+            rows_times(&self.Hp[0, 0], p, &self.share[0], self.count, self.n)
+            add_combination(-1.0, &self.p[0, 0], &self.share[0], p, self.count, self.n)
+
+    cdef void minimise(self, const double *g, double *s, double *Hs) noexcept:
+        """Find s and Hs, for which x − s minimises the cost along all of them."""
+        rows_times(&self.p[0, 0], g, &self.share[0], self.count, self.n)
+        memset(s, 0, self.n * sizeof(double))
+        memset(Hs, 0, self.n * sizeof(double))
+        add_combination(1.0, &self.p[0, 0], &self.share[0], s, self.count, self.n)
+        add_combination(1.0, &self.Hp[0, 0], &self.share[0], Hs, self.count, self.n)
+
+
 def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
 
@@ -504,6 +567,7 @@ cdef class Solver:
     cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
+    cdef Directions directions
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
 
@@ -524,6 +588,7 @@ cdef class Solver:
         self.newton_proportions = options.proportioning == "model"
         self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
+        self.directions = Directions(self.n, KEPT if options.recycle and not F.data else 0)
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), vectors, rows.C)
@@ -951,9 +1016,11 @@ cdef class Solver:
         cdef double chopped = INFINITY
         cdef double weight, began
         self.split()
+        self.minimise_along_directions()
         self.enter_face()
         began = self.phi_square
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        self.directions.conjugate(self.p)
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
@@ -974,7 +1041,9 @@ cdef class Solver:
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
+                    self.directions.add(self.p, self.Hp, self.told[3])
                     self.minimise_along_p()
+                    self.directions.conjugate(self.p)
                     self.tell(b"c", trace, note)
                     inside += 1
                     continue
@@ -986,10 +1055,24 @@ cdef class Solver:
             if not letter:
                 return 0
             self.split()
+            self.directions.begin(self.free)
             self.enter_face()
             inside, began = 0, self.phi_square
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
+
+    cdef int minimise_along_directions(self) except -1:
+        """Minimise along the directions known on this face, as far as is feasible."""
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
+        if self.directions.count and self.directions.is_on(self.free):
+            self.directions.minimise(self.g, s, Hs)
+            lengths(self.x, self.g, s, Hs, self.lower, self.upper, self.n, self.told)
+            self.to(fmin(1.0, self.told[1]), s, Hs)
+            self.split()
+        if not self.directions.is_on(self.free):
+            self.directions.begin(self.free)
+        return 0
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
@@ -1106,6 +1189,8 @@ cdef class Solver:
         if n:
             memcpy(self.x, &nu[0], n * sizeof(double))
             memcpy(self.g, &g[0], n * sizeof(double))
+        if at.rho != self.rho or not at.outer:
+            self.directions.begin(self.free)
         self.rho, self.most_products = at.rho, 0
         cdef double[::1] mu = np.array(at.mu)
         cdef double b_size = sqrt(dot(self.b, self.b, n))
@@ -1180,6 +1265,7 @@ cdef class Solver:
         for i in range(self.r):
             add((rho - self.rho) * self.Cv[i], &self.C[i, 0], self.g, self.n)
         self.rho = rho
+        self.directions.begin(self.free)  # of another H
 
     # back to the problem as given
 
