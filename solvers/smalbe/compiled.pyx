@@ -12,8 +12,11 @@ counts, and the same points up to rounding.
 * `recover`: `solvers.smalbe.driver`
 
 P is dense (then one triangle is read), sparse, or an operator, which is asked by Python.
-Between two products a step makes three passes over its vectors. Its loops
-over vectors are in `vectors.h`.
+A sparse P whose entries lie on few diagonals, as differences and finite elements on a
+grid have them, is multiplied with by these: neighbouring rows at once, and half the
+entries, for P is symmetric. A CG step goes through memory three times: product and
+lengths, the step and the new gradient, the next direction. Its loops over vectors are in
+`vectors.h`.
 """
 
 from cpython.exc cimport PyErr_CheckSignals
@@ -28,8 +31,22 @@ import numpy as np
 from scipy.sparse import csr_array, issparse
 
 cdef extern from "vectors.h" nogil:
-    void sparse_product(const int *indptr, const int *indices, const double *data,
-                        double s, const double *v, double *y, Py_ssize_t n)
+    ctypedef struct sparse:
+        Py_ssize_t n, count
+        const int *indptr
+        const int *indices
+        const Py_ssize_t *offset
+        const double *data
+        const double *diagonals
+    int MOST_DIAGONALS
+    Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
+                              signed char *slot)
+    void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
+    void sparse_product(const sparse *F, double s, const double *v, double *y)
+    double sparse_curvature(const sparse *F, double s, const double *p, double *Hp)
+    void sparse_lengths(const sparse *F, double s, const double *x, const double *g,
+                        const double *p, double *Hp, const double *lower,
+                        const double *upper, double *told)
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
@@ -37,7 +54,7 @@ cdef extern from "vectors.h" nogil:
                     Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
-    void lengths(const double *x, const double *g, const double *p, const double *Hp,
+    void lengths(const double *x, const double *g, const double *p, double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
     void move(double alpha, double *x, double *g, const double *p, const double *Hp,
               const double *lower, const double *upper, Py_ssize_t n)
@@ -49,7 +66,10 @@ cdef extern from "vectors.h" nogil:
                  double *free, Py_ssize_t n, double *told)
     void within(const double *x, const double *origin, const double *lower,
                 const double *upper, double *s, Py_ssize_t n)
-    void turn(const double *z, double gamma, double *p, Py_ssize_t n)
+    double turn(const double *z, double gamma, double *p, Py_ssize_t n)
+    void advance_freely(double alpha, double *x, double *g, const double *p,
+                        const double *Hp, const double *free, double *phi, Py_ssize_t n,
+                        double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
     void add_gram(double s, const double *v, double *S, Py_ssize_t k)
@@ -74,15 +94,11 @@ cdef class Product:
     cdef public long count
     cdef object matrix
     cdef const double *dense
-    cdef const double *data
-    cdef const int *indptr
-    cdef const int *indices
+    cdef sparse rows  # its data is NULL where P is not sparse
     cdef object held
 
     def __cinit__(self, P, Py_ssize_t n):
         cdef const double[:, ::1] rows
-        cdef const double[::1] data
-        cdef const int[::1] indptr, indices
         self.n, self.matrix = n, P
         if isinstance(P, np.ndarray) and n:
             whole = P if P.flags.c_contiguous else P.T
@@ -90,11 +106,28 @@ cdef class Product:
             self.held, self.dense = rows, &rows[0, 0]
         elif issparse(P) and P.nnz and P.nnz < 2**31:
             M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
-            data = np.ascontiguousarray(M.data, dtype=float)
-            indptr = np.ascontiguousarray(M.indptr, dtype=np.int32)
-            indices = np.ascontiguousarray(M.indices, dtype=np.int32)
-            self.held = (data, indptr, indices)
-            self.data, self.indptr, self.indices = &data[0], &indptr[0], &indices[0]
+            self.hold_rows(M.data, M.indptr, M.indices)
+
+    cdef int hold_rows(self, told_data, told_indptr, told_indices) except -1:
+        """Take a sparse P by rows; by diagonals where these take no more room."""
+        cdef const double[::1] data = _whole(told_data)
+        cdef const int[::1] indptr = np.ascontiguousarray(told_indptr, dtype=np.int32)
+        cdef const int[::1] indices = np.ascontiguousarray(told_indices, dtype=np.int32)
+        cdef Py_ssize_t most = min(data.shape[0] // self.n, MOST_DIAGONALS), count
+        cdef double[:, ::1] diagonals
+        cdef Py_ssize_t[::1] offset = np.zeros(max(most, 1), dtype=np.intp)
+        cdef signed char[::1] slot = np.empty(self.n, dtype=np.int8)
+        self.rows.n, self.rows.data = self.n, &data[0]
+        self.rows.indptr, self.rows.indices = &indptr[0], &indices[0]
+        self.held = (data, indptr, indices)
+        count = find_diagonals(&self.rows, most, &offset[0], &slot[0])
+        if count:
+            diagonals = np.zeros((count, self.n))
+            fill_diagonals(&self.rows, &slot[0], &diagonals[0, 0])
+            self.rows.offset, self.rows.diagonals = &offset[0], &diagonals[0, 0]
+            self.rows.count, self.rows.indptr, self.rows.indices = count, NULL, NULL
+            self.held = (data, diagonals, offset)
+        return 0
 
     def __call__(self, v):
         """Return Pv for v (n,)."""
@@ -113,10 +146,10 @@ cdef class Product:
         if self.dense and self.n < BY_BLAS:
             symmetric_product(self.dense, s, v, y, self.n)
         elif self.dense:
-            dsymv(b"U", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
+            dsymv(b"L", &n, &s, <double *> self.dense, &n, <double *> v, &one, &zero,
                   y, &one)
-        elif self.data:
-            sparse_product(self.indptr, self.indices, self.data, s, v, y, self.n)
+        elif self.rows.data:
+            sparse_product(&self.rows, s, v, y)
         elif self.n:
             told = np.empty(self.n)
             vector = told
@@ -536,6 +569,7 @@ cdef class Solver:
     cdef double *b
     cdef double *lower
     cdef double *upper
+    cdef double *upper_if_any  # NULL where all are inf
     cdef double *rhs
     cdef double *x
     cdef double *g
@@ -596,6 +630,10 @@ cdef class Solver:
         n = self.n
         self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
         self.lower, self.upper = pointer(self.least), pointer(self.most)
+        for i in range(n):
+            if self.upper[i] < INFINITY:
+                self.upper_if_any = self.upper
+                break
         self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
         self.room = np.zeros(19 * n + 2 * self.r + (9 + k) * (k + 3))
         cdef double *at = pointer(self.room)
@@ -649,6 +687,26 @@ cdef class Solver:
             self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
         add_combination(1.0, first(self.C), self.Cw, out, self.r, n)
         return 0
+
+    cdef int lengths_along(self, const double *p, double *Hp) except -1:
+        """Hp ← H p, and the `lengths` of x − αp, which are kept in `told`; one product."""
+        if self.r or not self.F.rows.data:
+            self.H(p, Hp)
+            lengths(self.x, self.g, p, Hp, self.lower, self.upper_if_any, self.n,
+                    self.told)
+            return 0
+        self.F.count += 1
+        sparse_lengths(&self.F.rows, self.inverse_norm, self.x, self.g, p, Hp,
+                       self.lower, self.upper_if_any, self.told)
+        return 0
+
+    cdef double curvature_along(self, const double *p, double *Hp) except? -1:
+        """Hp ← H p; returns pᵀHp; one product."""
+        if self.r or not self.F.rows.data:
+            self.H(p, Hp)
+            return dot(p, Hp, self.n)
+        self.F.count += 1
+        return sparse_curvature(&self.F.rows, self.inverse_norm, p, Hp)
 
     cdef double infeasibility(self, const double *x):
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
@@ -836,11 +894,8 @@ cdef class Solver:
             moves = moves or s[i] != 0
         if not moves:
             return 0
-        self.H(s, Hs)
         scale(-1.0, s, n)
-        scale(-1.0, Hs, n)
-        lengths(self.x, self.g, s, Hs, self.lower, self.upper, n,
-                self.told)
+        self.lengths_along(s, Hs)
         return fmin(self.told[0], fmax(1.0, self.told[1]))
 
     cdef int step_by_model(self) except -1:
@@ -875,9 +930,7 @@ cdef class Solver:
                 or (self.g[i] > 0 and self.x[i] > self.lower[i])
             ):
                 beta[i] = self.g[i]
-        self.H(beta, self.Hs)
-        lengths(self.x, self.g, beta, self.Hs, self.lower,
-                self.upper, n, self.told)
+        self.lengths_along(beta, self.Hs)
         if isinf(fmin(self.told[0], self.told[1])):
             return 0
         self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
@@ -964,23 +1017,21 @@ cdef class Solver:
 
     cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
         """Go on with CG from z on the face as if it had no bounds."""
-        cdef Py_ssize_t i, n = self.n
+        cdef Py_ssize_t n = self.n
         cdef long step
-        cdef double curvature = dot(self.p, self.Hp, n), length
+        cdef double curvature = dot(self.p, self.Hp, n), slope
+        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, self.phi, n,
+                       self.told)
         for step in range(most):
-            for i in range(n):
-                self.phi[i] = self.free[i] * self.g2[i]
-            if dot(self.phi, self.phi, n) <= enough:
+            if self.told[0] <= enough:
                 break
-            turn(self.phi, dot(self.phi, self.Hp, n) / curvature, self.p, n)
-            self.H(self.p, self.Hp)
+            slope = turn(self.phi, self.told[1] / curvature, self.p, n)
+            curvature = self.curvature_along(self.p, self.Hp)
             trace.append(c'b')
-            curvature = dot(self.p, self.Hp, n)
             if curvature <= 0:
                 break
-            length = dot(self.phi, self.p, n) / curvature
-            add(-length, self.p, self.x2, n)
-            add(-length, self.Hp, self.g2, n)
+            advance_freely(slope / curvature, self.x2, self.g2, self.p, self.Hp,
+                           self.free, self.phi, n, self.told)
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
@@ -1035,9 +1086,7 @@ cdef class Solver:
                 by_model = by_model and self.newton_proportions
                 letter = b"p" if self.proportion(by_model) else 0
             else:
-                self.H(self.p, self.Hp)
-                lengths(self.x, self.g, self.p, self.Hp,
-                        self.lower, self.upper, self.n, self.told)
+                self.lengths_along(self.p, self.Hp)
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
@@ -1085,7 +1134,7 @@ cdef class Solver:
         cdef double curvature = self.told[3], z_Hp
         cdef const double *z
         advance(self.told[0], self.x, self.g, self.p, self.Hp,
-                self.lower, self.upper, self.B.tau, self.phi,
+                self.lower, self.upper_if_any, self.B.tau, self.phi,
                 self.free, self.n, self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
         self.reduced_square, z_Hp = self.told[2], self.told[3]
