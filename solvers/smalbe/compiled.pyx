@@ -622,7 +622,8 @@ cdef class Solver:
         self.newton_proportions = options.proportioning == "model"
         self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
-        self.directions = Directions(self.n, KEPT if options.recycle and not F.data else 0)
+        kept = KEPT if options.recycle and not issparse(F.matrix) else 0
+        self.directions = Directions(self.n, kept)
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), vectors, rows.C)

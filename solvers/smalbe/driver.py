@@ -323,6 +323,8 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     qp, problem = task.inner, task.problem
     found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
     x, a, z_box, Fx = found or recovered(problem, qp, at)
+    if not (Fx + qp.q).any():  # a minimum of the cost without any constraint
+        a, z_box = np.zeros_like(a), np.zeros_like(z_box)
     letters = at.steps
     taken = ((name, letters.count(letter)) for letter, name in STEPS.items())
     point = Solution(
