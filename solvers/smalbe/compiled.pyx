@@ -284,20 +284,24 @@ def orthonormal(G, e):
 cdef double RANK = 1e-13  # pivots of the normalised rows below this are rounding errors
 
 
-def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
-                const double[::1] size, const double[::1] a):
-    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
-    cdef Py_ssize_t i, j
+def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
+
+    triangle, rows_kept, sizes, told_a : R (r, r), the rows kept (r,), their sizes (m,), a
+    """
+    cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
     result = np.zeros(m)
-    if not m:
-        return result
-    cdef double[::1] y = result
-    for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
+    cdef double *y = numbers(result)
+    cdef const double *R = numbers(triangle)
+    cdef const double *size = numbers(sizes)
+    cdef const double *a = numbers(told_a)
+    cdef const int[::1] kept = rows_kept
+    for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
-        for j in range(i + 1, R.shape[0]):
-            s -= R[i, j] * y[kept[j]] * size[kept[j]]
-        y[kept[i]] = s / (R[i, i] * size[kept[i]])
+        for j in range(i + 1, r):
+            s -= R[i * r + j] * y[kept[j]] * size[kept[j]]
+        y[kept[i]] = s / (R[i * r + i] * size[kept[i]])
     return result
 
 
