@@ -248,13 +248,12 @@ def fits_dense(family: str, n: int) -> None:
 
 
 def emitted_on_ranks(params: Mapping[str, Value]) -> bool:
-    """Whether ranks can emit their shares: bodies in blocks, linearised once at rest.
+    """Whether bodies are in subdomains, and nothing needs a solution of the whole.
 
-    Later load steps and Coulomb's law need solutions of the whole.
+    Coulomb's law and Newton's method do.
     """
-    once: Mapping[str, Value] = {"steps": 1, "relin": 1, "kinematics": "linear"}
     return (
         bool(params["feti"])
         and params.get("friction") != "coulomb"
-        and all(params.get(key, value) == value for key, value in once.items())
+        and params.get("kinematics") != "finite"
     )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from harness import InputError, Matrix
-from problems.contact.bodies import Bodies
+from problems.contact.bodies import UnassembledBodies
 
 #: part of the load that may be left: rounding of coordinates, normals and tractions
 UNBALANCED = 1e-6
@@ -36,7 +36,7 @@ class _Moving(NamedTuple):
     turn: float  #: anticlockwise, as a velocity at a `size` from the centre
 
 
-def check_balance(bodies: Bodies, B: Matrix) -> None:
+def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     """Refuse loads that neither supports nor contacts can balance.
 
     B : (m, n) contact rows at u = 0
@@ -78,7 +78,7 @@ def check_balance(bodies: Bodies, B: Matrix) -> None:
     raise InputError(_named(moving, size))
 
 
-def _motions(bodies: Bodies) -> tuple[Floats, Floats, float]:
+def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
     """Return R (n, 3 bodies), the centres (bodies, 2) of the turns, and a size, both m.
 
     Of each body: x, y, and a turn about its centre that moves what is `size` away by 1,
@@ -104,7 +104,7 @@ def _kernel(A: Floats) -> Floats:
     return np.asarray(turn[rank:].T)
 
 
-def _slides(bodies: Bodies, r: Floats, B: Matrix, sign: float) -> bool:
+def _slides(bodies: UnassembledBodies, r: Floats, B: Matrix, sign: float) -> bool:
     """Whether the motion sign·r is allowed by the supports and closes no gap."""
     closing = sign * (B @ r)
     free = not (bodies.B_D @ r).any()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -40,16 +40,19 @@ class ContactSides:
     """The sides of bodies that may touch, and nothing else of the bodies."""
 
     mesh: Mesh  #: their nodes, without cells, m
+    body_of_node: NDArray[np.int64]  #: (N,)
+    names: tuple[str, ...]  #: of all bodies
     pairs: tuple[ContactPair, ...]
+    length: float  #: l, m, as of `Bodies`
     force: float  #: F₀, N/m, as of `Bodies`
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Bodies:
+class UnassembledBodies:
     """Bodies numbered one after another, their supports, load and contact sides.
 
-    K, f and what is derived from them are non-dimensional: lengths by `length`, forces
-    per thickness by `force`, hence K' = K·l/F₀ and u' = u/l.
+    f and the moduli are non-dimensional: lengths by `length`, forces per thickness by
+    `force`.
 
     Raises
     ------
@@ -65,7 +68,6 @@ class Bodies:
     plane: Plane
     length: float  #: l, m
     force: float  #: F₀, N/m
-    K: csc_array  #: (n, n)
     f: Vector  #: (n,) full load
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component
     pairs: tuple[ContactPair, ...]  #: sides that may touch
@@ -124,6 +126,13 @@ class Bodies:
         return elasticity_matrices(self.materials, self.plane)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bodies(UnassembledBodies):
+    """Bodies with their stiffness, non-dimensional: K' = K·l/F₀ and u' = u/l."""
+
+    K: csc_array  #: (n, n)
+
+
 def assemble(
     mesh: Mesh,
     body: NDArray[np.int64],
@@ -136,7 +145,28 @@ def assemble(
     load: Vector,
     pairs: tuple[ContactPair, ...],
 ) -> Bodies:
-    """Assemble the bodies of a joined mesh.
+    """Assemble the bodies of a joined mesh; arguments as of `unassembled`."""
+    return assembled(
+        unassembled(
+            mesh, body, names=names, materials=materials, plane=plane, units=units,
+            fixed=fixed, load=load, pairs=pairs,
+        )
+    )  # fmt: skip
+
+
+def unassembled(
+    mesh: Mesh,
+    body: NDArray[np.int64],
+    *,
+    names: tuple[str, ...],
+    materials: tuple[Material, ...],
+    plane: Plane,
+    units: tuple[float, float],
+    fixed: Nodes,
+    load: Vector,
+    pairs: tuple[ContactPair, ...],
+) -> UnassembledBodies:
+    """Put together what is known of the bodies of a joined mesh before any stiffness.
 
     Parameters
     ----------
@@ -148,13 +178,18 @@ def assemble(
 
     """
     length, force = units
-    D = elasticity_matrices(materials, plane)
-    return Bodies(
+    return UnassembledBodies(
         mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-        length=length, force=force, K=stiffness(mesh, D * (length / force), body),
-        f=load / force, B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]),
-        pairs=pairs,
+        length=length, force=force, f=load / force,
+        B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]), pairs=pairs,
     )  # fmt: skip
+
+
+def assembled(bodies: UnassembledBodies) -> Bodies:
+    """Assemble their stiffness."""
+    known = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
+    D = bodies.elasticity * (bodies.length / bodies.force)
+    return Bodies(**known, K=stiffness(bodies.mesh, D, bodies.body))
 
 
 def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:

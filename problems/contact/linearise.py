@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from harness import InputError, Vector
-from problems.contact.bodies import Bodies, ContactSides
+from problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
 from problems.contact.friction import FrictionLaw
 from problems.contact.mortar import mortar
 from problems.contact.node_to_segment import (
@@ -25,7 +25,7 @@ from problems.fem.mesh import Nodes
 
 
 def linearisation(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies | ContactSides,
     contact: str,
     basis: Any,
     laws: Sequence[FrictionLaw] = (),
@@ -119,7 +119,7 @@ def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
 
 
 def _of_pairs(
-    bodies: Bodies | ContactSides, values: NDArray[Any]
+    bodies: UnassembledBodies | ContactSides, values: NDArray[Any]
 ) -> list[NDArray[Any]]:
     """Split what there is one of per slave node by the pairs."""
     ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]

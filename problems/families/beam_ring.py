@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import (
     CONTACT_FORMS,
     CONTACT_STIFFNESS,
@@ -31,13 +32,13 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
-    from harness.distributed.vectors import Emitted, Ranks
+    from problems.feti.emission import ProblemInParts
 
 MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 
 @dataclass(frozen=True)
-class BeamRing(Family):
+class BeamRing(InSubdomains):
     """The paper's benchmark: beam on a half ring, plane elasticity."""
 
     name: str = "beam-ring"
@@ -93,16 +94,15 @@ class BeamRing(Family):
         without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of the dual of a single load step."""
-        if form != "dual" or not emitted_on_ranks(params):
-            return None
-        from problems.feti.emission import emitted
-        from problems.models.beam_ring import structured_problem
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are subdomains, and no load step before this one."""
+        return params["step"] == params["relin"] == 1 and emitted_on_ranks(params)
 
-        return emitted(structured_problem(params), ranks)
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.beam_ring import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -8,8 +8,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import Family, InputError
+from harness import InputError
 from harness.checked import located
+from problems.families.in_subdomains import InSubdomains
 from problems.files.file_digest import check_digest, digest
 from problems.ranges import (
     CONTACT_FORMS,
@@ -29,10 +30,11 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class GmshBodies(Family):
+class GmshBodies(InSubdomains):
     """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
     The digest of the content of both files is a parameter of the case, so that a
@@ -91,6 +93,23 @@ class GmshBodies(Family):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
         check_digest(p["path"], p["sha256"], digest(path, mesh))
+
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are parts, no load step before, and no law of Coulomb's."""
+        if not params["parts"] or params["kinematics"] == "finite":
+            return False
+        from problems.models.gmsh_bodies import laws_of
+
+        return params["step"] == params["relin"] == 1 and not any(
+            law.mu for law in laws_of(params)
+        )
+
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.gmsh_bodies import in_subdomains
+
+        self.check(params)
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

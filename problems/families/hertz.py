@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import (
     DECOMPOSITION,
     FRICTION,
@@ -18,6 +19,7 @@ from problems.ranges import (
     at_least,
     at_most,
     deformed,
+    emitted_on_ranks,
     fits,
     one_of,
     positive,
@@ -29,10 +31,11 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class HertzPlane(Family):
+class HertzPlane(InSubdomains):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
     name: str = "hertz-plane"
@@ -66,6 +69,16 @@ class HertzPlane(Family):
             return None
         return {**params, "halvings": int(params["halvings"]) + 1}
 
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are subdomains, and no Newton iterations."""
+        return emitted_on_ranks(params)
+
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.hertz import on_plane_in_subdomains
+
+        return on_plane_in_subdomains(params)
+
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
@@ -77,7 +90,7 @@ class HertzPlane(Family):
 
 
 @dataclass(frozen=True)
-class HertzCylinder(Family):
+class HertzCylinder(InSubdomains):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
     name: str = "hertz-cylinder"
@@ -145,6 +158,16 @@ class HertzCylinder(Family):
         """Return the case with every cell halved; the arcs are other polygons."""
         without_friction(self.name, params)
         return {**params, "halvings": int(params["halvings"]) + 1}
+
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are subdomains, and no friction that needs a solution."""
+        return emitted_on_ranks(params)
+
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.hertz import on_cylinder_in_subdomains
+
+        return on_cylinder_in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

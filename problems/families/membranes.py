@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import GLUES, at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
-    from harness.distributed.vectors import Emitted, Ranks
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class Membranes(Family):
+class Membranes(InSubdomains):
     """Two membranes in contact along an edge, the right one floating."""
 
     name: str = "membranes"
@@ -39,16 +39,15 @@ class Membranes(Family):
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of the dual."""
-        if form != "dual":
-            return None
-        from problems.feti.emission import emitted
-        from problems.models.membranes import structured_problem
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether ranks can emit it: always."""
+        return True
 
-        return emitted(structured_problem(params), ranks)
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.membranes import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -7,15 +7,25 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
-from problems.ranges import DECOMPOSITION, at_least, doubled, fits, one_of, torn_by
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
+from problems.ranges import (
+    DECOMPOSITION,
+    at_least,
+    doubled,
+    emitted_on_ranks,
+    fits,
+    one_of,
+    torn_by,
+)
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class Obstacle(Family):
+class Obstacle(InSubdomains):
     """A string or membrane over an obstacle, with known exact solution."""
 
     name: str = "obstacle"
@@ -39,6 +49,16 @@ class Obstacle(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
+
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether it is a membrane in subdomains."""
+        return params["dim"] == 2 and emitted_on_ranks(params)
+
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.obstacle import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import (
     DECOMPOSITION,
     FRICTION,
@@ -28,11 +29,11 @@ from problems.ranges import (
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
-    from harness.distributed.vectors import Emitted, Ranks
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class ContactPatch(Family):
+class ContactPatch(InSubdomains):
     """Contact patch test: two blocks on each other under uniform pressure."""
 
     name: str = "contact-patch"
@@ -90,16 +91,15 @@ class ContactPatch(Family):
             )
         return {**params, **doubled(params, "lower", "upper")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of the dual."""
-        if form != "dual" or not emitted_on_ranks(params):
-            return None
-        from problems.feti.emission import emitted
-        from problems.models.patch import structured_problem
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are subdomains, and nothing needs a solution first."""
+        return emitted_on_ranks(params)
 
-        return emitted(structured_problem(params), ranks)
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.patch import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

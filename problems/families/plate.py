@@ -7,16 +7,17 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import GLUES, PLANES, at_least, doubled, fits, one_of, positive
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
-    from harness.distributed.vectors import Emitted, Ranks
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class Plate(Family):
+class Plate(InSubdomains):
     """A clamped plate in subdomains, with jumps of E: linear, to measure FETI on."""
 
     name: str = "plate"
@@ -57,16 +58,15 @@ class Plate(Family):
         """Return the case with every cell halved, in the same subdomains."""
         return {**params, **doubled(params, "n", "ny")}
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of the dual."""
-        if form != "dual" or params["supports"] == "eliminated":
-            return None
-        from problems.feti.emission import emitted
-        from problems.models.plate import structured_problem
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether supports are rows of the dual."""
+        return params["supports"] == "rows"
 
-        return emitted(structured_problem(params), ranks)
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.plate import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,20 @@ class StructuredGrid:
             points = self.block(last if at == 1 else slice(1), all_)
         return np.asarray(points if at < 2 else points[::-1])
 
+    def position(self, node: Nodes) -> NDArray[np.float64]:
+        """Return the points of some nodes (k, 2), as `block` does."""
+        row, column = np.divmod(node, self.columns.size)
+        found = np.empty((node.size, 2))
+        by_rows = np.unique(row).size <= np.unique(column).size
+        for line in np.unique(row if by_rows else column):
+            of = np.flatnonzero((row if by_rows else column) == line)
+            places = (
+                (self.columns[column[of]], self.rows[[line]]) if by_rows
+                else (self.columns[[line]], self.rows[row[of]])
+            )  # fmt: skip
+            found[of] = self.place(*places).reshape(-1, 2)
+        return found
+
     def prefixed(self, prefix: str) -> StructuredGrid:
         """Put `prefix` before the names of the sides."""
         first, second, third, fourth = (prefix + name for name in self.names)
@@ -95,6 +110,86 @@ class StructuredGrid:
     def mesh(self) -> Mesh:
         """Connect all points."""
         return _structured(self.place(self.columns, self.rows), self.names)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfDisc:
+    """Rings of cells that end in triangles at the centre of half a disc.
+
+    Of a angles and r radii, node (ring j, angle i) has the number  j·a + i,  and the
+    centre is the last one. Cells are numbered ring by ring, the triangles last.
+    """
+
+    centre: tuple[float, float]
+    angles: Vector  #: (a,) increasing, over half a turn; the arc is between the ends
+    radii: Vector  #: (r,) decreasing, all positive: those of the arc and within
+    names: tuple[str, str] = ("arc", "flat")  #: of the sides
+
+    @property
+    def divisions(self) -> tuple[int, int]:
+        """Cells along a ring, and rings of cells, triangles being one."""
+        return self.angles.size - 1, self.radii.size
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes there are."""
+        return self.angles.size * self.radii.size + 1
+
+    @property
+    def sides(self) -> Mapping[str, Nodes]:
+        """Nodes of the arc, anticlockwise, and of the flat side through the centre."""
+        a, r = self.angles.size, self.radii.size
+        rings = a * np.arange(r)
+        flat = np.concatenate([rings + a - 1, [a * r], rings[::-1]])
+        return dict(zip(self.names, (np.arange(a), flat), strict=True))
+
+    @cached_property
+    def _direction(self) -> NDArray[np.float64]:
+        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=-1)
+
+    def position(self, node: Nodes) -> NDArray[np.float64]:
+        """Return the points of some nodes (k, 2)."""
+        ring, angle = np.divmod(node, self.angles.size)
+        radius = np.append(self.radii, 0.0)[ring][:, None]
+        return np.asarray(np.asarray(self.centre) + radius * self._direction[angle])
+
+    def block(self, angles: slice, rings: slice) -> tuple[Nodes, Nodes]:
+        """List the nodes (k,) of some cells, and these cells (E, 4), as `mesh` does.
+
+        angles, rings : of cells; corners of cells are places in the list of nodes
+        """
+        a, r = self.angles.size, self.radii.size
+        has_centre = rings.stop == r
+        i = np.arange(angles.start, angles.stop + 1)
+        j = np.arange(rings.start, rings.stop + (not has_centre))
+        nodes = (j[:, None] * a + i).ravel()
+        cells = cells_of_block(i.size, j.size)
+        if has_centre:
+            inner, last = np.arange(nodes.size - i.size, nodes.size), nodes.size
+            ends = [inner[:-1], inner[1:], *np.full((2, i.size - 1), last)]
+            nodes = np.append(nodes, a * r)
+            cells = np.concatenate([cells, np.stack(ends, axis=-1)])
+        return nodes, cells
+
+    def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
+        """Return the mean sides of cells, along radii and along arcs.
+
+        Each as two factors, one of each ring of cells and one of each angle.
+        """
+        half, r = np.diff(self.angles) / 2, np.append(self.radii, 0.0)
+        return (-np.diff(r), np.cos(half)), ((r[1:] + r[:-1]) / 2, 2 * np.sin(half))
+
+    def prefixed(self, prefix: str) -> HalfDisc:
+        """Put `prefix` before the names of the sides."""
+        arc, flat = (prefix + name for name in self.names)
+        return replace(self, names=(arc, flat))
+
+    def mesh(self) -> Mesh:
+        """Connect all points."""
+        (a, r), all_ = self.divisions, np.arange(self.nodes)
+        return Mesh(
+            self.position(all_), self.block(slice(0, a), slice(0, r))[1], self.sides
+        )
 
 
 def cells_of_block(columns: int, rows: int) -> Nodes:
@@ -161,20 +256,7 @@ def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mes
     radii : decreasing, all positive: those of the arc and of the rings of nodes within
 
     """
-    direction = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    grid = np.asarray(centre) + radii[:, None, None] * direction
-    rings = _structured(grid, ("arc", "left", "inner", "right"))
-    sides, middle = rings.boundaries, np.array([len(rings.points)])
-    inner = sides["inner"][::-1]
-    triangles = [inner[:-1], inner[1:], *np.broadcast_to(middle, (2, inner.size - 1))]
-    return Mesh(
-        np.vstack([rings.points, centre]),
-        np.vstack([rings.cells, np.column_stack(triangles)]),
-        {
-            "arc": sides["arc"],
-            "flat": np.concatenate([sides["left"], middle, sides["right"]]),
-        },
-    )
+    return HalfDisc(centre, angles, radii).mesh()
 
 
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
@@ -194,13 +276,13 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     return Mesh(points, np.concatenate(cells), boundaries), body
 
 
-def joined_sides(grids: Sequence[StructuredGrid]) -> Mapping[str, Nodes]:
-    """Return the sides of grids with the numbers that `join` gives their nodes."""
-    starts = np.cumsum([0] + [grid.nodes for grid in grids])
+def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, Nodes]:
+    """Return the sides of bodies with the numbers that `join` gives their nodes."""
+    starts = np.cumsum([0] + [body.nodes for body in bodies])
     return {
         name: nodes + start
-        for grid, start in zip(grids, starts, strict=False)
-        for name, nodes in grid.sides.items()
+        for body, start in zip(bodies, starts, strict=False)
+        for name, nodes in body.sides.items()
     }
 
 
@@ -220,9 +302,9 @@ def boundary_edges(cells: Nodes) -> Nodes:
     """List the edges (k, 2) of exactly one cell, the body on their left."""
     edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
-    _, first, times = np.unique(
-        np.sort(edges), axis=0, return_index=True, return_counts=True
-    )
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    name = low * (high.max(initial=0) + 1) + high  # in the order of low, then high
+    _, first, times = np.unique(name, return_index=True, return_counts=True)
     return np.asarray(edges[first[times == 1]])
 
 

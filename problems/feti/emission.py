@@ -1,14 +1,15 @@
-"""The dual of structured bodies, made by the ranks that hold it.
+"""The dual of bodies in subdomains, made by the ranks that hold it.
 
 Each rank builds its own subdomains only: their meshes, stiffness, loads and the rows of
-B that touch them. What is numbered in the whole follows from tables as long as the
-sides of the grids (`problems.feti.structured`), contact rows from the sides alone. So
-no rank has anything of the size of the whole but what a coarse problem has: a few
-numbers for each subdomain.
+B that touch them. What is numbered in the whole follows from what all ranks know of the
+subdivision (`problems.feti.subdivision`): tables as long as the sides of structured
+grids, or a list of the nodes of interfaces. Contact rows are linearised from the sides
+alone. Beyond that, a rank has a few numbers for each subdomain of the whole, as a
+coarse problem has.
 
-What ranks tell one another: a representative of each kind of subdomain, so that
-subdomains of one kind have one frame on all ranks; what they add to rows that another
-one owns, of the right side q and of RᵀBᵀ; and their part of Rᵀf.
+What ranks tell one another: of subdomains that may be alike, the points of one of each
+kind, so that subdomains of one kind have one frame on all ranks; what they add to rows
+that another one owns, of the right side q and of RᵀBᵀ; and their part of Rᵀf.
 
 The QP is that of `problems.feti.gluing` and `problems.duality.torn_dual`, row by row.
 """
@@ -17,23 +18,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
+from itertools import chain, pairwise
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
 
-from harness import QP, Vector, no_rows
+from harness import QP, InputError, Vector, no_rows
+from harness.digest import hex_digest
 from harness.distributed.vectors import (
+    EMITTED,
     DistributedColumns,
     Emitted,
     Ranks,
     Share,
     distributed,
 )
-from problems.fem.mesh import Nodes, cells_of_block
+from problems.fem.mesh import Nodes
 from problems.feti.distributed import (
     RankOperator,
     balanced,
@@ -42,15 +46,20 @@ from problems.feti.distributed import (
     owners,
 )
 from problems.feti.gluing import GLUE
-from problems.feti.operators import DualOperator, explicit_kinds
-from problems.feti.own_bodies import answers
-from problems.feti.structured import Integers, Layout, Places, shape_factors
-from problems.feti.tearing import Part, classify, images
+from problems.feti.operators import (
+    DualOperator,
+    block_bytes,
+    explicit_kinds,
+    touched,
+)
+from problems.feti.own_bodies import Results, answers
+from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
+from problems.feti.tearing import ALIKE, Part, classify, images, spread_of
 from problems.feti.torn import Kind, Subdomains
 
 
 class Contact(NamedTuple):
-    """Rows of contact, then of friction, of the whole; no longer than the sides."""
+    """Rows of contact, then of friction, of the whole; every rank has them."""
 
     rows: csr_array  #: (m_I, n) columns are components of the whole
     c: Vector  #: (m_I,)
@@ -58,20 +67,23 @@ class Contact(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StructuredBodies:
-    """A contact problem on structured grids, without dimensions, before it is torn."""
+class ProblemInParts:
+    """A contact problem on bodies in subdomains, without dimensions, nothing made."""
 
-    layout: Layout  #: the grids of the bodies, and their subdomains, S in all
+    layout: Subdivision  #: of the bodies into subdomains, S in all
     components: int  #: of a node: 2 of displacements, 1 of heights
     material: Integers  #: (S,) of each subdomain
     kind: Callable[[Part], Kind]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
-    #: (bodies,) as of `problems.feti.structured.shape_factors`; None for squares
-    share: Vector | None = None
+    #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
+    #: `problems.feti.structured.Layout.shaping`; None for 1
+    shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
     contact: Contact
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
+    #: what an answer means physically; None where only the whole tells
+    results: Results | None = None
 
 
 class Entries(NamedTuple):
@@ -87,7 +99,7 @@ class Entries(NamedTuple):
 class OwnSubdomains:
     """What one rank holds of torn bodies."""
 
-    problem: StructuredBodies
+    problem: ProblemInParts
     ranks: Ranks
     rank: NDArray[np.int64]  #: (S,) of each subdomain
 
@@ -97,14 +109,17 @@ class OwnSubdomains:
         return np.flatnonzero(self.rank == self.ranks.rank)
 
     @cached_property
-    def nodes(self) -> _OwnNodes:
+    def nodes(self) -> TornNodes:
         """Its torn nodes, (M_p,)."""
-        layout = self.problem.layout
-        torn = layout.torn_nodes(self.number)
-        return _OwnNodes(
-            torn.block, torn.at, torn.copy, torn.start,
-            layout.number(torn.at), layout.times(torn.at),
-        )  # fmt: skip
+        return self.problem.layout.torn_nodes(self.number)
+
+    def torn(self, subdomain: Nodes, node: Nodes) -> Nodes:
+        """Find own torn nodes (k,) by their subdomains and their nodes, (k,) both."""
+        nodes, N = self.nodes, self.problem.layout.nodes
+        known = nodes.subdomain * np.int64(N) + nodes.number
+        return np.searchsorted(
+            known, np.searchsorted(self.number, subdomain) * np.int64(N) + node
+        )
 
     @property
     def component(self) -> Nodes:
@@ -121,37 +136,57 @@ class OwnSubdomains:
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
         """Sort subdomains into kinds, which have the same frame on all ranks."""
         problem, of = self.problem, self.problem.layout
-        left, low, columns, rows = of.corner(self.number)
-        body = of.block.body[self.number]
-        material = problem.material[self.number]
-        points = [
-            of.grids[b].block(slice(i, i + k), slice(j, j + n))
-            for b, i, j, k, n in zip(body, left, low, columns, rows, strict=True)
-        ]
-        keys: list[Hashable] = [
-            (int(k), int(n), int(m))
-            for k, n, m in zip(columns, rows, material, strict=True)
-        ]
+        material = problem.material[self.number].tolist()
+        keys = list(zip(of.keys(self.number), material, strict=True))
+        points = of.points(self.number)
         first, kind, rotation = classify(keys, points)
-        told = [(int(self.number[s]), keys[s], points[s]) for s in first]
-        of_all = chain.from_iterable(self.ranks.comm.allgather(told))
-        known = sorted(of_all, key=lambda one: one[0])
-        leader, group, _ = classify(
-            [key for _, key, _ in known], [at for *_, at in known]
+        leader = self._leaders(
+            [(int(self.number[s]), keys[s], points[s]) for s in first]
         )
-        place = {number: k for k, (number, *_) in enumerate(known)}
         kinds = []
         for k, s in enumerate(first):
-            number, (wide, high, m), at = known[
-                leader[group[place[int(self.number[s])]]]
-            ]
+            number, at = leader[int(self.number[s])]
             if number != self.number[s]:
                 mine = np.flatnonzero(kind == k)
-                turn = images(np.stack([at, *(points[s] for s in mine)]))[1]
+                turn = images(np.stack([at, *(points[s] for s in mine.tolist())]))[1]
                 rotation[mine] = turn[1:]
-            cells = cells_of_block(wide, high)
-            kinds.append(problem.kind(Part(at, cells, np.full(len(cells), m))))
+            cells = of.cells(int(self.number[s]))
+            kinds.append(
+                problem.kind(Part(at, cells, np.full(len(cells), material[s])))
+            )
         return Subdomains(tuple(kinds), kind), rotation
+
+    def _leaders(
+        self, own: list[tuple[int, Hashable, Points]]
+    ) -> dict[int, tuple[int, Points]]:
+        """Find the first subdomain of each kind on all ranks, with its points.
+
+        own : number, key and points of the first subdomains of own kinds, by whose
+            numbers the leaders are told
+        """
+        comm = self.ranks.comm
+        told = comm.allgather([(n, key, spread_of(at)) for n, key, at in own])
+        elsewhere: dict[Hashable, list[float]] = {}
+        for rank, theirs in enumerate(told):
+            for _, key, spread in theirs if rank != self.ranks.rank else ():
+                elsewhere.setdefault(key, []).append(spread)
+
+        def may_be_elsewhere(key: Hashable, at: Points) -> bool:
+            spread = np.array(elsewhere.get(key, []))
+            off = 3 * ALIKE * np.sqrt(at.size)  # a little more than `classify` allows
+            return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
+
+        asked = [one for one in own if may_be_elsewhere(*one[1:])]
+        known = sorted(chain.from_iterable(comm.allgather(asked)), key=itemgetter(0))
+        found = {number: (number, at) for number, _, at in own}
+        if known:
+            first, group, _ = classify(
+                [key for _, key, _ in known], [at for *_, at in known]
+            )
+            for (number, *_), k in zip(known, group, strict=True):
+                of, _, at = known[first[k]]
+                found[number] = of, at
+        return found
 
     @property
     def domains(self) -> Subdomains:
@@ -175,7 +210,7 @@ class OwnSubdomains:
         found = self.problem.load(self.component) / self.times
         if d > 1:
             loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
-            turn = self.rotation[self.nodes.block[loaded]]
+            turn = self.rotation[self.nodes.subdomain[loaded]]
             shared = found.reshape(-1, d)
             shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
         return np.asarray(found)
@@ -197,34 +232,22 @@ class OwnSubdomains:
         return number, R[at] * value[:, None]
 
     @cached_property
-    def spacings(self) -> NDArray[np.float64]:
-        """(M_p, 2) sides of the cells around each torn node."""
-        return self.problem.layout.spacings(self.number)
+    def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
+        shaping = self.problem.shaping
+        return None if shaping is None else shaping(self.number)
 
     def stiffness(self, node: Nodes, *, held: bool) -> Vector:
         """Return what rows of supports, or gluing, at torn nodes (k,) are scaled by."""
-        at = Places(*(x[node] for x in self.nodes.at))
-        E, share = self.problem.E[at.body], self.problem.share
-        if share is None:
+        body = self.problem.layout.body[self.number]
+        E = self.problem.E[body[self.nodes.subdomain[node]]]
+        if self._shape is None:
             return E
-        lines = self.problem.layout.lines(at, ends=held)
-        return E * shape_factors(self.spacings[node], lines, share[at.body])
+        return np.asarray(E * self._shape(node, self.nodes.number[node], held))
 
     @cached_property
     def rows(self) -> _Rows:
         """Its rows of B."""
         return _rows(self)
-
-
-class _OwnNodes(NamedTuple):
-    """As `problems.feti.structured.TornNodes`, with what is known of the whole."""
-
-    block: Integers  #: (M,)
-    at: Places  #: of M nodes
-    copy: Integers  #: (M,)
-    start: NDArray[np.int64]  #: (blocks + 1,)
-    number: Nodes  #: (M,) of the whole
-    times: NDArray[np.int64]  #: (M,) copies of it on all ranks together
 
 
 class _Rows(NamedTuple):
@@ -240,16 +263,16 @@ class _Rows(NamedTuple):
     total: int  #: rows of the whole
 
 
-def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
+def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
     """Make this rank's share of the dual; called by all ranks.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks.
+        Where there are fewer subdomains than ranks, or ranks know different ones.
 
     """
-    own = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    own = OwnSubdomains(problem, ranks, _agreed(problem, ranks))
     rows, domains = own.rows, own.domains
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
     mine = at.own
@@ -270,11 +293,87 @@ def emitted(problem: StructuredBodies, ranks: Ranks) -> Emitted:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    answer = answers(own, at, _contact_scale(problem))
-    return Emitted(total, b.size, share, answer)
+    finite = sum(np.count_nonzero(np.isfinite(v)) for v in (lower, upper))
+    answer = answers(own, at, _contact_scale(problem), _torn(own, explicit))
+    return Emitted(
+        variables=total, equality_rows=b.size,
+        bounds=int(ranks.total(np.array([finite]))[0]), share=share,
+        digest=partial(_digest, own), answer=answer,
+    )  # fmt: skip
 
 
-def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
+def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
+    """Report how bodies are torn, as `problems.duality.torn_dual.torn_quantities`.
+
+    explicit_mib: what blocks take on all ranks together; one of a kind that several
+    ranks have is on each of these.
+    """
+    domains, rows, ranks = own.domains, own.rows, own.ranks
+    sizes = np.array([part.size for part in touched(rows.B, domains)])
+    taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
+    counts = [own.f.size, explicit[domains.kind].sum(), taken]
+    torn_dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
+    kinds = ranks.comm.allgather({_name_of(kind) for kind in domains.kinds})
+    return {
+        "subdomains": own.rank.size, "kinds": len(set().union(*kinds)),
+        "torn_dofs": int(torn_dofs), "multipliers": rows.total,
+        "explicit_subdomains": int(formed), "explicit_mib": mib,
+    }  # fmt: skip
+
+
+def _name_of(kind: Kind) -> str:
+    """Name a kind of subdomain by its numbers."""
+    return hex_digest(map(np.ndarray.tobytes, (
+        kind.K.data, kind.K.indices, kind.K.indptr, kind.R, kind.fixing, kind.boundary,
+    )), 32)  # fmt: skip
+
+
+def _digest(own: OwnSubdomains) -> str:
+    """Name the numbers of the QP, whichever rank has which subdomain.
+
+    That of each subdomain: its kind, its load, and its columns of B; and of all of them
+    in turn, with what every rank has of the contact.
+    """
+    domains, rows, contact = own.domains, own.rows, own.problem.contact
+    names = [_name_of(kind).encode() for kind in domains.kinds]
+    B = csc_array(rows.B)
+    B.sort_indices()
+    told = []
+    for s, (begin, end) in enumerate(pairwise(domains.start)):
+        ends = B.indptr[begin : end + 1]
+        entries = slice(ends[0], ends[-1])
+        parts = rows.number[B.indices[entries]], B.data[entries], ends - ends[0]
+        numbers = (*map(np.ndarray.tobytes, parts), own.f[begin:end].tobytes())
+        name = hex_digest((names[domains.kind[s]], *numbers))
+        told.append((int(own.number[s]), name))
+    of_all = sorted(chain.from_iterable(own.ranks.comm.allgather(told)))
+    shared = contact.rows.data, contact.c, contact.bound
+    content = (*(name.encode() for _, name in of_all), *(v.tobytes() for v in shared))
+    return EMITTED + hex_digest(content, 16)
+
+
+def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
+    """Give subdomains to ranks (S,), if all ranks know the same subdomains.
+
+    Partitions of graphs are made on every rank, by whatever library it has.
+
+    Raises
+    ------
+    InputError
+        Where they know others, or there are fewer subdomains than ranks.
+
+    """
+    found = subdomains_of(problem, ranks.size)
+    known = hex_digest(x.tobytes() for x in (found, *problem.layout.sharing()))
+    if len(set(ranks.comm.allgather(known))) > 1:
+        raise InputError(
+            "ranks have cut the bodies into different subdomains; expected the same "
+            "version of METIS on all nodes"
+        )
+    return found
+
+
+def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
     """Give subdomains to ranks (S,), so that these do alike much and share few rows.
 
     Raises
@@ -285,18 +384,18 @@ def subdomains_of(problem: StructuredBodies, ranks: int) -> NDArray[np.int64]:
     """
     of, d = problem.layout, problem.components
     S = of.count
-    one, other, nodes = of.shared_sides()
+    one, other, nodes = of.sharing()
     graph = coo_array((d * nodes, (one, other)), shape=(S, S))
     touched = of.glued()
     node = np.unique(np.concatenate([problem.held, problem.contact.rows.indices]) // d)
-    at = of.places(node)
-    single = of.times(at) == 1
-    block = of.holder(at, np.zeros_like(node))
-    touched += np.bincount(block[single], minlength=S)
+    single = of.times(node) == 1
+    touched = touched + np.bincount(of.holder(node[single]), minlength=S)
     entries = problem.contact.rows.tocoo()
-    block = of.holder(of.places(entries.col // d), np.zeros_like(entries.col))
     touches = csr_array(
-        (np.ones(block.size, dtype=np.int64), (entries.row, block)),
+        (
+            np.ones(entries.nnz, dtype=np.int64),
+            (entries.row, of.holder(entries.col // d)),
+        ),
         shape=(entries.shape[0], S),
     )
     touches.data[:] = 1
@@ -339,9 +438,8 @@ def _supports(own: OwnSubdomains) -> Entries:
     """One row for each copy of a component that is held, the last copy first."""
     problem, d = own.problem, own.problem.components
     node, k = np.divmod(problem.held, d)
-    at = problem.layout.places(node)
-    times = problem.layout.times(at)
-    copies = _own_copies(own, at)
+    times = problem.layout.times(node)
+    copies = _own_copies(own, node)
     of = copies.node[copies.mine]
     row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
     value = np.sqrt(own.stiffness(copies.torn, held=True))
@@ -359,20 +457,17 @@ class _Copies(NamedTuple):
     torn: NDArray[np.int64]  #: (l,) which of the own torn nodes they are
 
 
-def _own_copies(own: OwnSubdomains, at: Places) -> _Copies:
-    """Find the copies of some nodes, and which of them this rank holds."""
-    of, start = own.problem.layout, own.nodes.start
-    times = of.times(at)
-    node = np.repeat(np.arange(times.size), times)
-    copy = np.arange(node.size) - np.repeat(np.cumsum(times) - times, times)
-    every = Places(*(x[node] for x in at))
-    block = of.holder(every, copy)
-    rank = own.rank[block]
+def _own_copies(own: OwnSubdomains, node: Nodes) -> _Copies:
+    """Find the copies of some nodes (k,), and which of them this rank holds."""
+    of = own.problem.layout
+    times = of.times(node)
+    place = np.repeat(np.arange(times.size), times)
+    copy = np.arange(place.size) - np.repeat(np.cumsum(times) - times, times)
+    subdomain = of.holder(node[place], copy)
+    rank = own.rank[subdomain]
     mine = np.flatnonzero(rank == own.ranks.rank)
-    left, low, columns, _ = of.corner(block[mine])
-    within = (every.row[mine] - low) * columns + every.column[mine] - left
-    torn = start[np.searchsorted(own.number, block[mine])] + within
-    return _Copies(node, copy, rank, mine, torn)
+    torn = own.torn(subdomain[mine], node[place[mine]])
+    return _Copies(place, copy, rank, mine, torn)
 
 
 def _glued(own: OwnSubdomains) -> Entries:
@@ -380,21 +475,19 @@ def _glued(own: OwnSubdomains) -> Entries:
     problem, nodes, of = own.problem, own.nodes, own.problem.layout
     d = problem.components
     held = np.sort(problem.held)
-    held_times = of.times(of.places(held // d))
+    held_times = of.times(held // d)
     base = int(held_times.sum())
-    found = []
-    for m in (2, 4):
+    none = np.zeros(0, dtype=np.int64)
+    found = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
+    for m, nodes_with in sorted(of.having.items()):
         W = GLUE[problem.glue](m)
         held_m = held[held_times == m]
         several = np.flatnonzero(nodes.times == m)
-        at = Places(*(x[several] for x in nodes.at))
-        before = of.before(at)
-        ranks = np.stack(
-            [own.rank[of.holder(at, np.full(several.size, p))] for p in range(m)],
-            axis=1,
-        )
+        number = nodes.number[several]
+        before = of.before(number)
+        ranks = np.stack([own.rank[of.holder(number, p)] for p in range(m)], axis=1)
         for k in range(d):
-            component = d * nodes.number[several] + k
+            component = d * number + k
             free = ~np.isin(component, held_m)
             first = d * before + k - np.searchsorted(held_m, component)
             for r, weights in enumerate(W):
@@ -411,7 +504,7 @@ def _glued(own: OwnSubdomains) -> Entries:
                     [np.repeat(row, there.shape[1]), there.ravel()], axis=1
                 )
                 found.append(Entries(*entries, reached))
-        base += len(W) * (d * of.having(m) - held_m.size)
+        base += len(W) * (d * nodes_with - held_m.size)
     return Entries(*(np.concatenate(p) for p in zip(*found, strict=True)))
 
 
@@ -420,13 +513,11 @@ def _contact(own: OwnSubdomains) -> Entries:
     problem, d = own.problem, own.problem.components
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
-    at = problem.layout.places(node)
-    copies = _own_copies(own, at)
+    copies = _own_copies(own, node)
     row = _equalities(problem) + entries.row.astype(np.int64)
     reached = np.stack([row[copies.node], copies.rank], axis=1)
-    share = (
-        _contact_scale(problem)[entries.row] * entries.data / problem.layout.times(at)
-    )
+    times = problem.layout.times(node)
+    share = _contact_scale(problem)[entries.row] * entries.data / times
     of = copies.node[copies.mine]
     return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
 
@@ -442,32 +533,33 @@ def _turned(
     d = own.problem.components
     if d == 1:
         return row, node, value
-    turn = own.rotation[own.nodes.block[node], k]  # row k of Q: u_k = Σ Q_kq v_q
+    turn = own.rotation[own.nodes.subdomain[node], k]  # row k of Q: u_k = Σ Q_kq v_q
     kept = turn != 0
     column = d * node[:, None] + np.arange(d)
     rows = np.broadcast_to(row[:, None], kept.shape)
     return rows[kept], column[kept], (turn * value[:, None])[kept]
 
 
-def _equalities(problem: StructuredBodies) -> int:
+def _equalities(problem: ProblemInParts) -> int:
     """Count the rows of supports and gluing."""
     of, d = problem.layout, problem.components
-    times = of.times(of.places(problem.held // d))
+    times = of.times(problem.held // d)
     glued = sum(
-        len(GLUE[problem.glue](m)) * (d * of.having(m) - int((times == m).sum()))
-        for m in (2, 4)
+        len(GLUE[problem.glue](m)) * (d * count - int((times == m).sum()))
+        for m, count in of.having.items()
     )
     return int(times.sum()) + glued
 
 
-def _contact_scale(problem: StructuredBodies) -> Vector:
+def _contact_scale(problem: ProblemInParts) -> Vector:
     """Return √(E/‖B_i‖²) of contact rows (m,), E of the softest body they touch."""
     rows, of = problem.contact.rows, problem.layout
     if not rows.shape[0]:
         return np.zeros(0)
-    at = of.places(rows.indices // problem.components)
-    norm2 = np.add.reduceat(rows.data**2 / of.times(at), rows.indptr[:-1])
-    softest = np.minimum.reduceat(problem.E[at.body], rows.indptr[:-1])
+    node = rows.indices // problem.components
+    E = problem.E[of.body[of.holder(node)]]
+    norm2 = np.add.reduceat(rows.data**2 / of.times(node), rows.indptr[:-1])
+    softest = np.minimum.reduceat(E, rows.indptr[:-1])
     return np.asarray(np.sqrt(softest / norm2))
 
 

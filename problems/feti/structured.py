@@ -20,18 +20,18 @@ it has on squares (`shape_factors`).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
-from problems.fem.mesh import Nodes, StructuredGrid
+from problems.fem.mesh import Nodes, StructuredGrid, cells_of_block
+from problems.feti.subdivision import Integers, Points, TornNodes
 from problems.feti.tearing import blocks
-
-Integers = NDArray[np.integer[Any]]
 
 
 class Places(NamedTuple):
@@ -42,18 +42,9 @@ class Places(NamedTuple):
     row: Integers  #: (k,) j
 
 
-class TornNodes(NamedTuple):
-    """The nodes of some blocks, block after block and row by row."""
-
-    block: Integers  #: (M,) place in the list of blocks
-    at: Places
-    copy: Integers  #: (M,) which of the copies of its node it is, from 0 on
-    start: NDArray[np.int64]  #: (blocks + 1,) first of each block, and M
-
-
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Structured grids, one after another, in blocks."""
+    """Structured grids, one after another, in blocks; a `Subdivision`."""
 
     grids: tuple[StructuredGrid, ...]
     #: of each grid: the lines of nodes where blocks begin and end, of columns and rows
@@ -83,6 +74,16 @@ class Layout:
     def node_start(self) -> NDArray[np.int64]:
         """First node of each grid, and how many there are."""
         return np.cumsum([0, *(grid.nodes for grid in self.grids)])
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes all grids have."""
+        return int(self.node_start[-1])
+
+    @property
+    def body(self) -> Integers:
+        """Grid of each block, (S,)."""
+        return self.block.body
 
     @cached_property
     def block_start(self) -> NDArray[np.int64]:
@@ -131,15 +132,15 @@ class Layout:
         )  # fmt: skip
         return first[0], first[1], last[0] - first[0] + 1, last[1] - first[1] + 1
 
-    def torn_nodes(self, block: Nodes) -> TornNodes:
-        """List the nodes of some blocks."""
-        left, low, columns, rows = self.corner(block)
+    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+        """List the nodes of some blocks, row by row."""
+        left, low, columns, rows = self.corner(subdomains)
         start = np.concatenate([[0], np.cumsum(columns * rows)])
-        of = np.repeat(np.arange(block.size), columns * rows)
+        of = np.repeat(np.arange(subdomains.size), columns * rows)
         row, column = np.divmod(np.arange(start[-1]) - start[of], columns[of])
-        at = Places(self.block.body[block][of], left[of] + column, low[of] + row)
+        at = Places(self.body[subdomains][of], left[of] + column, low[of] + row)
         second = [
-            (place[block][of] > lines.first[lines.start[at.body] + line]).astype(int)
+            place[subdomains][of] > lines.first[lines.start[at.body] + line]
             for lines, place, line in (
                 (self._columns, self.block.column, at.column),
                 (self._rows, self.block.row, at.row),
@@ -147,8 +148,26 @@ class Layout:
         ]
         across = self._columns.times[self._columns.start[at.body] + at.column]
         copy = (second[1] * across + second[0]).astype(np.int8)
-        small = [x.astype(np.int32) for x in (of, *at)]  # there are many of them
-        return TornNodes(small[0], Places(*small[1:]), copy, start)
+        times = self._times(at).astype(np.int8)  # there are many of them
+        return TornNodes(of.astype(np.int32), self._number(at), times, copy, start)
+
+    def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
+        """Return the columns and rows of nodes of some blocks."""
+        _, _, columns, rows = self.corner(subdomains)
+        return list(zip(columns.tolist(), rows.tolist(), strict=True))
+
+    def points(self, subdomains: Nodes) -> Sequence[Points]:
+        """Return the points (n, 2) of the nodes of some blocks."""
+        body = self.body[subdomains]
+        return [
+            self.grids[b].block(slice(i, i + k), slice(j, j + n))
+            for b, i, j, k, n in zip(body, *self.corner(subdomains), strict=True)
+        ]
+
+    def cells(self, subdomain: int) -> Nodes:
+        """List the cells (E, 4) of a block."""
+        _, _, columns, rows = self.corner(np.array([subdomain]))
+        return cells_of_block(int(columns[0]), int(rows[0]))
 
     def places(self, node: Nodes) -> Places:
         """Find nodes by their numbers (k,)."""
@@ -157,23 +176,35 @@ class Layout:
         row, column = np.divmod(node - self.node_start[body], wide[body])
         return Places(body, column, row)
 
-    def number(self, at: Places) -> Nodes:
+    def _number(self, at: Places) -> Nodes:
         """Return the numbers (k,) of nodes."""
         wide = np.array([grid.columns.size for grid in self.grids])
         return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
 
-    def times(self, at: Places) -> NDArray[np.int64]:
+    def position(self, node: Nodes) -> Points:
+        """Return the points of some nodes, (k, 2)."""
+        found, body = np.empty((node.size, 2)), self.places(node).body
+        for b in np.unique(body):
+            own = body == b
+            found[own] = self.grids[b].position(node[own] - self.node_start[b])
+        return found
+
+    def times(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,) of nodes."""
+        return self._times(self.places(node))
+
+    def _times(self, at: Places) -> NDArray[np.int64]:
         return np.asarray(
             self._columns.times[self._columns.start[at.body] + at.column]
             * self._rows.times[self._rows.start[at.body] + at.row]
         )
 
-    def holder(self, at: Places, copy: Integers) -> Nodes:
+    def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
         """Find the block (k,) of a copy of each node.
 
         copy : (k,) which one, from 0 on
         """
+        at = self.places(node)
         column = self._columns.start[at.body] + at.column
         row = self._rows.start[at.body] + at.row
         up, right = np.divmod(copy, self._columns.times[column])
@@ -212,6 +243,24 @@ class Layout:
             found.append(shape_factors(spacings(points), lines, share[b]))
         return np.concatenate(found)
 
+    def shaping(
+        self, share: Vector, block: Nodes
+    ) -> Callable[[Nodes, Nodes, bool], Vector]:
+        """Make what gives the `shape_factors` of torn nodes of some blocks.
+
+        It takes places in their list of torn nodes (k,), the numbers of these nodes,
+        and whether they are held by rows of supports.
+
+        share : (grids,) of the materials
+        """
+        sides = self.spacings(block)
+
+        def factors(torn: Nodes, node: Nodes, ends: bool) -> Vector:
+            at = self.places(node)
+            return shape_factors(sides[torn], self.lines(at, ends=ends), share[at.body])
+
+        return factors
+
     def spacings(self, block: Nodes) -> NDArray[np.float64]:
         """Return the `spacings` at the torn nodes (M, 2) of some blocks."""
         found = [np.empty((0, 2))]
@@ -226,9 +275,9 @@ class Layout:
             found.append(own.reshape(-1, 2))
         return np.concatenate(found)
 
-    def before(self, at: Places) -> NDArray[np.int64]:
+    def before(self, node: Nodes) -> NDArray[np.int64]:
         """Count, of each node (k,), those before it that have as many copies."""
-        columns, rows = self._columns, self._rows
+        columns, rows, at = self._columns, self._rows, self.places(node)
         column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
         m = columns.times[column] * rows.times[row]
         in_row = columns.before[columns.times[column] - 1, column]
@@ -238,9 +287,10 @@ class Layout:
             found[of] = in_rows[row[of]] + in_row[of]
         return found
 
-    def having(self, times: int) -> int:
-        """Count the nodes with so many copies."""
-        return self._counts[times][1]
+    @property
+    def having(self) -> Mapping[int, int]:
+        """How many nodes have several copies, by the number of these."""
+        return {m: count for m, (_, count) in self._counts.items() if m > 1 and count}
 
     @cached_property
     def _counts(self) -> dict[int, tuple[NDArray[np.int64], int]]:
@@ -262,7 +312,7 @@ class Layout:
             for m, count in in_row.items()
         }
 
-    def shared_sides(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
         """List pairs of blocks that share a side, and its number of nodes: all (k,)."""
         body, column, row = self.block
         all_ = np.arange(self.count)

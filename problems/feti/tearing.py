@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from harness import Vector
 from problems.fem.mesh import Nodes
 
 ALIKE = 1e-11  #: distance of the points of equal subdomains, of their diameter
@@ -96,44 +97,54 @@ def structured_bodies(
     return np.concatenate(labels)
 
 
-def compact_blocks(
-    points: NDArray[np.float64], cells: Nodes, divisions: tuple[int, int], most: int
-) -> NDArray[np.int64]:
-    """Label the cells of a graded structured mesh by blocks about as long as wide.
+Block = tuple[slice, slice]  #: rows and columns of cells
+#: sides of the cells of rows and columns, along columns and along rows: each as two
+#: factors, one of each row and one of each column
+Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
+
+
+def compact_blocks(sides: Sides, most: int) -> list[Block]:
+    """Cut a graded structured mesh into blocks of cells about as long as wide.
 
     A block of more than most² cells is cut across where it is longer, at half of its
-    length. Blocks as long as `blocks` are in cells would be as long and thin as these,
-    and bending of long subdomains is what conditions their dual worst.
+    length, and nearer to its beginning where two lines are as near to that but for
+    rounding. Blocks as long as `blocks` are in cells would be as long and thin as
+    these, and bending of long subdomains is what conditions their dual worst.
 
     Parameters
     ----------
-    points : (n, 2)
-    cells : (nx·ny, 4) anticlockwise, first along a row; a triangle repeats its last one
-    divisions : nx, ny
+    sides : of the cells, of ny rows and nx columns
     most : H/h of a square
 
-    Returns
-    -------
-    (nx·ny,) block of each cell
-
     """
-    corners = points[cells].reshape(*divisions[::-1], 4, -1)
-    a, b, c, d = (corners[:, :, k] for k in range(4))
-    sides = [np.linalg.norm(s, axis=-1) / 2 for s in (c + d - a - b, b + c - a - d)]
-    label = np.zeros(divisions[::-1], dtype=np.int64)
-    left, count = [(slice(0, divisions[1]), slice(0, divisions[0]))], 0
+    (deep, deep_of), (wide_of, wide) = sides
+    found, left = list[Block](), [(slice(0, deep.size), slice(0, wide.size))]
     while left:
-        block = left.pop()
-        lengths = [side[block].mean(axis=1 - k) for k, side in enumerate(sides)]
+        rows, columns = left.pop()
+        lengths = (
+            deep[rows] * deep_of[columns].mean(), wide[columns] * wide_of[rows].mean(),
+        )  # fmt: skip
         size = [0.0 if part.size == 1 else part.sum() for part in lengths]
-        if label[block].size <= most**2 or not any(size):
-            label[block], count = count, count + 1
+        if lengths[0].size * lengths[1].size <= most**2 or not any(size):
+            found.append((rows, columns))
             continue
-        k = int(np.argmax(size))
+        k = int(size[1] > size[0] * (1 + ALIKE))
         ends = np.cumsum(lengths[k])
-        at = block[k].start + int(np.argmin(np.abs(ends[:-1] - ends[-1] / 2))) + 1
-        for part in (slice(at, block[k].stop), slice(block[k].start, at)):
-            left.append((part, block[1]) if k == 0 else (block[0], part))
+        off = np.abs(ends[:-1] - ends[-1] / 2)
+        nearest = int(np.argmax(off <= off.min() + ALIKE * ends[-1]))
+        cut = (rows, columns)[k]
+        at = cut.start + nearest + 1
+        for part in (slice(at, cut.stop), slice(cut.start, at)):
+            left.append((part, columns) if k == 0 else (rows, part))
+    return found
+
+
+def labelled(found: Sequence[Block]) -> NDArray[np.int64]:
+    """Label cells, row by row, by the blocks that cover them."""
+    shape = [max(block[k].stop for block in found) for k in (0, 1)]
+    label = np.empty(shape, dtype=np.int64)
+    for b, block in enumerate(found):
+        label[block] = b
     return label.ravel()
 
 
@@ -204,7 +215,7 @@ def classify(
     rotation = np.empty((S, dim, dim))
     for group in alike.values():
         left = np.array(group)
-        spread = np.array([_spread(points[s]) for s in group])
+        spread = np.array([spread_of(points[s]) for s in group])
         # of images, ‖x − x̄‖ differs by no more than their points do
         off = 2 * ALIKE * np.sqrt(points[group[0]].size)
         while left.size:
@@ -218,8 +229,8 @@ def classify(
     return first, kind, rotation
 
 
-def _spread(points: NDArray[np.float64]) -> float:
-    """Return ‖x − x̄‖."""
+def spread_of(points: NDArray[np.float64]) -> float:
+    """Return ‖x − x̄‖, which is the same of images."""
     return float(np.linalg.norm(points - points.mean(axis=0)))
 
 

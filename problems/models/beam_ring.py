@@ -38,13 +38,20 @@ from problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
-from problems.feti.emission import StructuredBodies
+from problems.feti.elastic import (
+    SubdividedBodies,
+    at_rest,
+    in_parts,
+    posed_on,
+    subdivide,
+)
+from problems.feti.emission import ProblemInParts
 from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
+NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
 
@@ -92,23 +99,25 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     load = np.zeros(mesh.dofs)
     load[_tip(sides)[1]] = -LOAD
     return assemble(
-        mesh, body, names=("beam", "ring"), materials=(BEAM, RING), plane=plane,
+        mesh, body, names=NAMES, materials=(BEAM, RING), plane=plane,
         units=(LENGTH, LOAD), fixed=_clamps(sides), load=load,
-        pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
+        pairs=(_pair(sides),),
     )  # fmt: skip
 
 
-def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
-    """Describe the dual of a single linear load step, in subdomains."""
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the first linear load step, which is linearised at rest."""
     p: Any = params
-    grids = _grids(p["Nr"], p["Nh"], p["radial"])
+    grids, laws = _grids(p["Nr"], p["Nh"], p["radial"]), (law_of(params),)
     sides = joined_sides(grids)
-    return structured(
-        grids, p["feti"], materials=(BEAM, RING), plane=p["plane"],
-        units=(LENGTH, LOAD), fixed=_clamps(sides),
-        load=(_tip(sides)[1:], np.array([-LOAD])),
-        pairs=[((1, "outer"), (0, "bottom"))],
-        method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+    tip = _tip(sides)
+    return in_parts(
+        Layout.of(grids, p["feti"]), materials=(BEAM, RING), plane=p["plane"],
+        units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
+        load=(tip[1:], np.array([-LOAD / p["steps"]])),
+        pairs=(_pair(sides),),
+        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=lambda found, _: {"tip": (found.at(tip) * LENGTH).tolist()},
     )  # fmt: skip
 
 
@@ -122,6 +131,10 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
 def _clamps(sides: Mapping[str, Nodes]) -> Nodes:
     clamped = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
     return np.concatenate(clamped)
+
+
+def _pair(sides: Mapping[str, Nodes]) -> ContactPair:
+    return ContactPair(slave=sides["outer"], master=sides["bottom"])
 
 
 def _tip(sides: Mapping[str, Nodes]) -> Nodes:

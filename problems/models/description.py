@@ -58,7 +58,7 @@ from harness import InputError, checked
 from harness.checked import located
 from harness.errors import shown, unknown
 from harness.files.reading import read_toml
-from problems.contact.bodies import Bodies, ContactPair, assemble
+from problems.contact.bodies import ContactPair, UnassembledBodies, unassembled
 from problems.contact.friction import FrictionLaw, law_of
 from problems.fem.elasticity import Material
 from problems.fem.gmsh_mesh import NamedMesh, read_msh
@@ -125,8 +125,8 @@ def read_description(path: Path) -> dict[str, Any]:
     return table
 
 
-def described_bodies(path: Path, plane: Any) -> Bodies:
-    """Assemble what the TOML file describes.
+def described_bodies(path: Path, plane: Any) -> UnassembledBodies:
+    """Read what the TOML file describes.
 
     Raises
     ------
@@ -149,7 +149,7 @@ def described_bodies(path: Path, plane: Any) -> Bodies:
     body = np.repeat(
         np.arange(len(named.surfaces)), [len(c) for c in named.surfaces.values()]
     )
-    return assemble(
+    return unassembled(
         Mesh(named.points, named.cells, {}), body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
         units=units, fixed=np.unique(np.concatenate(fixed)), load=load.ravel(),

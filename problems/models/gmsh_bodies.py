@@ -17,7 +17,13 @@ from scipy.sparse import vstack
 from harness import QP, Case, Friction, InputError, Reference, Value
 from harness.checked import located
 from problems.contact.balance import check_balance
-from problems.contact.bodies import Bodies, clamped, floating, supported
+from problems.contact.bodies import (
+    Bodies,
+    assembled,
+    clamped,
+    floating,
+    supported,
+)
 from problems.contact.friction import FrictionLaw
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
@@ -26,8 +32,16 @@ from problems.duality.newton import NewtonPath
 from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, single_load
 from problems.fem.inverse import GeneralisedInverse
-from problems.feti.elastic import SubdividedBodies, subdivide, torn
+from problems.feti.elastic import (
+    SubdividedBodies,
+    at_rest,
+    in_parts,
+    subdivide,
+    torn,
+)
+from problems.feti.emission import ProblemInParts
 from problems.feti.partition import graph_partition
+from problems.feti.subdivision import mesh_in_parts
 from problems.models.description import (
     described_bodies,
     pair_laws,
@@ -67,7 +81,7 @@ def _finite(
     form: str, source: tuple[str, str, Any], p: Any, reference: Reference
 ) -> Case:
     """Emit the QP of one Newton iteration of one load step."""
-    laws = pair_laws(read_description(Path(source[0]))["contacts"], p)
+    laws = laws_of(p)
     with located(source[0]):
         if any(law.acts for law in laws):
             raise InputError(
@@ -86,7 +100,7 @@ def _posed(
     source: tuple[str, str, Any], p: Any, reference: Reference
 ) -> tuple[QP, Friction]:
     """Linearise the contact where the load path is; at first, that is u = 0."""
-    laws = pair_laws(read_description(Path(source[0]))["contacts"], p)
+    laws = laws_of(p)
     method = (p["contact"], p["basis"])
     if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
         bodies = model(*source)
@@ -105,11 +119,36 @@ def _posed(
     return problem.primal, problem.friction
 
 
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the first load step in parts; the mesh is read and cut as a whole."""
+    p: Any = params
+    bodies, laws = described_bodies(Path(p["path"]), p["plane"]), laws_of(params)
+    mesh, method = bodies.mesh, (p["contact"], p["basis"])
+    with located(p["path"]):
+        rows = linearisation(bodies, *method, laws)(np.zeros(mesh.dofs))
+        check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+        label = graph_partition(mesh.points, mesh.cells, bodies.body, p["parts"])
+    fixed, loaded = bodies.B_D.indices, np.flatnonzero(bodies.f)
+    named = np.concatenate([fixed, bodies.interface]) // 2
+    return in_parts(
+        mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
+        plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
+        fixed=fixed,
+        load=(loaded, bodies.f[loaded] * (bodies.force / p["steps"])),
+        pairs=bodies.pairs, linearise=at_rest(*method, laws), laws=laws, glue=p["glue"],
+    )  # fmt: skip
+
+
+def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
+    """Find the law of each pair, see `pair_laws`."""
+    return pair_laws(read_description(Path(str(params["path"])))["contacts"], params)
+
+
 @lru_cache(maxsize=4)
 def model(path: str, sha256: str, plane: Any) -> Bodies:
     """Assemble the bodies of a description; the digest tells contents apart."""
     del sha256
-    return described_bodies(Path(path), plane)
+    return assembled(described_bodies(Path(path), plane))
 
 
 @lru_cache(maxsize=4)

@@ -37,7 +37,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, eye_array
@@ -46,6 +46,7 @@ from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vect
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
+    ContactSides,
     assemble,
     clamped,
     floating,
@@ -62,12 +63,23 @@ from problems.duality.newton import NewtonPath
 from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
-from problems.fem.mesh import Mesh, Nodes, half_disc, join, nodal_lengths, prefixed
-from problems.feti.elastic import SubdividedBodies, posed_on, subdivide
-from problems.feti.tearing import compact_blocks
+from problems.fem.mesh import HalfDisc, Mesh, Nodes, join, joined_sides, nodal_lengths
+from problems.feti.elastic import (
+    AtSides,
+    SubdividedBodies,
+    at_rest,
+    in_parts,
+    posed_on,
+    subdivide,
+)
+from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import OwnSolution
+from problems.feti.subdivision import half_discs_in_blocks
+from problems.feti.tearing import Block, compact_blocks, labelled
 from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
+ALONE, NAMES = ("cylinder",), ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
@@ -82,7 +94,7 @@ def cylinder_on_plane(
     """Emit the QP in one form; at finite strain the gap to the plane is linear, too."""
     bodies, rows, exact = _on_plane(params)
     if params["kinematics"] == "linear":
-        return _case(bodies, rows, form, exact, params)
+        return _case(bodies, rows, form, params, half_on_plane(params))
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     case = newton_case(
         path, form, 1, int(params["newton"]),
@@ -99,23 +111,73 @@ def _newton_path(
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 
-def _on_plane(
-    params: Mapping[str, Value],
-) -> tuple[Bodies, ContactRows, LineContact]:
-    """Mesh and assemble the cylinder, n cells per a; with Hertz's solution."""
+class Halves(NamedTuple):
+    """Half cylinders that meet at (0, 0), and Hertz's solution."""
+
+    discs: tuple[HalfDisc, ...]
+    materials: tuple[Material, ...]
+    exact: LineContact
+
+    def blocks(self, most: int) -> list[list[Block]]:
+        """Cut each into blocks of rings and sectors, about as long as wide.
+
+        most : blocks have at most so many cells, squared; the triangles at a centre are
+            the last ring
+        """
+        return [compact_blocks(disc.lengths(), most) for disc in self.discs]
+
+    def results(self, found: OwnSolution, at: AtSides) -> dict[str, Any]:
+        """Compare what ranks have found with the exact pressure."""
+        del found
+        return pressure_quantities(at.bodies, at.primal, self.exact, at.solution)
+
+
+def half_on_plane(params: Mapping[str, Value]) -> Halves:
+    """Divide the cylinder on a rigid plane, n cells per a."""
     p: Any = params
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
     )
-    mesh = lower_half(exact.a / p["n"], exact.a, p["halvings"])
+    disc = _lower_half(exact.a / p["n"], exact.a, p["halvings"])
+    return Halves((disc,), (MATERIAL,), exact)
+
+
+def _on_plane(
+    params: Mapping[str, Value],
+) -> tuple[Bodies, ContactRows, LineContact]:
+    """Mesh and assemble the cylinder; with Hertz's solution."""
+    p: Any = params
+    (disc,), materials, exact = half_on_plane(params)
+    mesh = disc.mesh()
+    sides = mesh.boundaries
     bodies = assemble(
-        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("cylinder",),
-        materials=(MATERIAL,), plane=p["plane"], units=(RADIUS, exact.P),
-        fixed=2 * _on_axis(mesh),
-        load=pressed(mesh, mesh.boundaries["flat"], exact.P),
-        pairs=(ContactPair(mesh.boundaries["arc"], np.zeros(0, dtype=np.int64)),),
+        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=ALONE,
+        materials=materials, plane=p["plane"], units=(RADIUS, exact.P),
+        fixed=2 * _on_axis(sides),
+        load=_loaded(mesh, _pressed((disc,), "flat", exact.P)),
+        pairs=(_on_rigid(sides),),
     )  # fmt: skip
-    return bodies, above_plane(mesh, mesh.boundaries["arc"]), exact
+    return bodies, above_plane(mesh, sides["arc"]), exact
+
+
+def on_plane_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the linear problem of a cylinder on a plane in subdomains."""
+    p: Any = params
+    halves = half_on_plane(params)
+    sides = joined_sides(halves.discs)
+    return in_parts(
+        half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
+        materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
+        names=ALONE, fixed=2 * _on_axis(sides),
+        load=_pressed(halves.discs, "flat", halves.exact.P),
+        pairs=(_on_rigid(sides),),
+        linearise=lambda arc: above_plane(arc.mesh, arc.pairs[0].slave),
+        glue=p["glue"], results=halves.results,
+    )  # fmt: skip
+
+
+def _on_rigid(sides: Mapping[str, Nodes]) -> ContactPair:
+    return ContactPair(sides["arc"], np.zeros(0, dtype=np.int64))
 
 
 def cylinder_on_cylinder(
@@ -130,7 +192,7 @@ def cylinder_on_cylinder(
         bodies, exact = two_cylinders(params)
         linearise = linearisation(bodies, p["contact"], p["basis"])
         rows = linearise(np.zeros(bodies.mesh.dofs))
-        return _case(bodies, rows, form, exact, params)
+        return _case(bodies, rows, form, params, two_halves(params))
     same_path = {**params, "iterate": 0}
     path, exact = _friction_path(tuple(same_path.items()), reference)
     bodies, problem = path.bodies, path.problem(1, p["iterate"])
@@ -151,17 +213,19 @@ def cylinder_on_cylinder(
         bodies, primal, form,
         floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=results, friction=friction,
-        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal, friction),
+        torn=posed_on(
+            params, lambda: subdivided(bodies, two_halves(params), p["feti"]), primal,
+            friction,
+        ),
     )  # fmt: skip
     return _beside(case, exact, shear) if shear is not None else case
 
 
-def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
-    """Mesh and assemble the cylinders, n cells per a on the upper and m on the lower.
+def two_halves(params: Mapping[str, Value]) -> Halves:
+    """Divide the cylinders, n cells per a on the upper one and m on the lower.
 
     The upper one has R = 8 mm, E = 200 GPa, the lower one `radius` and `ratio` times
-    that. The load is P alone. Where there is a tangential force, the supports are those
-    that take no part in it.
+    that.
     """
     p: Any = params
     below = Material(p["ratio"] * MATERIAL.E, MATERIAL.nu)
@@ -170,49 +234,72 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     exact = LineContact(
         p["load"] * UNIT_LOAD, 1 / (1 / RADIUS + 1 / radius), 1 / compliance
     )
-    halves = (
-        lower_half(exact.a / p["n"], exact.a, p["halvings"]),
-        upper_half(exact.a / p["m"], exact.a, radius, p["halvings"]),
-    )
-    mesh, body = join((prefixed(halves[0], "upper_"), prefixed(halves[1], "lower_")))
-    sides = mesh.boundaries
-    upper, lower, flat = (
-        sides[side] for side in ("upper_arc", "lower_arc", "lower_flat")
-    )
-    load = pressed(mesh, sides["upper_flat"], exact.P)
+    a, halvings = exact.a, p["halvings"]
+    upper = _lower_half(a / p["n"], a, halvings).prefixed("upper_")
+    lower = _upper_half(a / p["m"], a, radius, halvings).prefixed("lower_")
+    return Halves((upper, lower), (MATERIAL, below), exact)
+
+
+def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
+    """Mesh and assemble the cylinders under P alone; with Hertz's solution.
+
+    Where there is a tangential force, the supports are those that take no part in it.
+    """
+    p: Any = params
+    discs, materials, exact = two_halves(params)
+    mesh, body = join(tuple(disc.mesh() for disc in discs))
+    sides, load = mesh.boundaries, _loaded(mesh, _pressed(discs, "upper_flat", exact.P))
     if p["peak"]:
-        load += pressed(mesh, flat, -exact.P)
-        axis = _on_axis(mesh, "lower_")  # supports that bend no symmetry
-        fixed = np.append(2 * axis, 2 * flat[flat.size // 2] + 1)
+        load += _loaded(mesh, _pressed(discs, "lower_flat", -exact.P))
+        axis, flat = _on_axis(sides, "lower_"), sides["lower_flat"]
+        fixed = np.append(2 * axis, 2 * flat[flat.size // 2] + 1)  # no symmetry is bent
     else:
-        fixed = np.concatenate([
-            2 * _on_axis(mesh, "upper_"), 2 * _on_axis(mesh, "lower_"), 2 * flat + 1
-        ])  # fmt: skip
+        fixed = _guided(sides)
     bodies = assemble(
-        mesh, body, names=("upper", "lower"), materials=(MATERIAL, below),
+        mesh, body, names=NAMES, materials=materials,
         plane=p["plane"], units=(RADIUS, exact.P), fixed=fixed, load=load,
-        pairs=(ContactPair(upper, lower) if p["slave"] == "upper"
-               else ContactPair(lower, upper),),
+        pairs=(_pair(params, sides),),
     )  # fmt: skip
     return bodies, exact
 
 
-def subdivided(bodies: Bodies, most: int) -> SubdividedBodies:
-    """Cut the half discs into blocks of rings and sectors, about as long as wide.
+def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe two cylinders under P alone, in subdomains."""
+    p: Any = params
+    halves, laws = two_halves(params), (law_of(params),)
+    sides = joined_sides(halves.discs)
+    return in_parts(
+        half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
+        materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
+        names=NAMES, fixed=_guided(sides),
+        load=_pressed(halves.discs, "upper_flat", halves.exact.P),
+        pairs=(_pair(params, sides),),
+        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=halves.results,
+    )  # fmt: skip
 
-    most : blocks have at most so many cells, squared; the triangles at a centre are the
-        last ring
-    """
-    sides, cells = bodies.mesh.boundaries, np.bincount(bodies.body)
-    arcs = [sides[name] for name in ("arc", "upper_arc", "lower_arc") if name in sides]
-    label, first = np.empty_like(bodies.body), 0
-    for b, (arc, count) in enumerate(zip(arcs, cells, strict=True)):
-        own, divisions = bodies.body == b, (arc.size - 1, int(count) // (arc.size - 1))
-        disc = compact_blocks(
-            bodies.mesh.points, bodies.mesh.cells[own], divisions, most
-        )
-        label[own], first = first + disc, first + int(disc.max()) + 1
-    return subdivide(bodies, label)
+
+def _guided(sides: Mapping[str, Nodes]) -> Nodes:
+    """Return the components that are held under P alone."""
+    return np.concatenate([
+        2 * _on_axis(sides, "upper_"), 2 * _on_axis(sides, "lower_"),
+        2 * sides["lower_flat"] + 1,
+    ])  # fmt: skip
+
+
+def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
+    upper, lower = sides["upper_arc"], sides["lower_arc"]
+    return ContactPair(
+        *((upper, lower) if params["slave"] == "upper" else (lower, upper))
+    )
+
+
+def subdivided(bodies: Bodies, halves: Halves, most: int) -> SubdividedBodies:
+    """Cut the half discs into blocks; most : as of `Halves.blocks`."""
+    label = [np.zeros(0, dtype=np.int64)]
+    for blocks in halves.blocks(most):
+        label.append(labelled(blocks) + label[-1].max(initial=-1) + 1)
+    return subdivide(bodies, np.concatenate(label))
 
 
 def kept_on_axis(bodies: Bodies) -> Bodies:
@@ -222,7 +309,7 @@ def kept_on_axis(bodies: Bodies) -> Bodies:
     polygons that their arcs are resists. The slip of the next step would begin there,
     and Q would do work on it.
     """
-    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh, "upper_"))
+    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh.boundaries, "upper_"))
     rows = eye_array(bodies.mesh.dofs, format="csr")[held]
     return replace(bodies, B_D=csr_array(rows))
 
@@ -276,14 +363,14 @@ def _friction_path(
     return path, exact
 
 
-def lower_half(h: float, a: float, halvings: int) -> Mesh:
-    """Mesh the lower half of the cylinder above (0, 0), with cells of size h there."""
-    return half_disc((0.0, RADIUS), *_polar(h, a, RADIUS, -np.pi / 2, halvings))
+def _lower_half(h: float, a: float, halvings: int) -> HalfDisc:
+    """Divide the lower half of the cylinder above (0, 0); cells there have size h."""
+    return HalfDisc((0.0, RADIUS), *_polar(h, a, RADIUS, -np.pi / 2, halvings))
 
 
-def upper_half(h: float, a: float, radius: float, halvings: int) -> Mesh:
-    """Mesh the upper half of a cylinder below (0, 0), with cells of size h there."""
-    return half_disc((0.0, -radius), *_polar(h, a, radius, np.pi / 2, halvings))
+def _upper_half(h: float, a: float, radius: float, halvings: int) -> HalfDisc:
+    """Divide the upper half of a cylinder below (0, 0); cells there have size h."""
+    return HalfDisc((0.0, -radius), *_polar(h, a, radius, np.pi / 2, halvings))
 
 
 def _polar(
@@ -310,16 +397,22 @@ def halved(x: Vector, times: int) -> Vector:
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
-def pressed(mesh: Mesh, flat: Nodes, P: float) -> Vector:
-    """Return the nodal forces (2N,) of P spread evenly over the flat side, N/m."""
-    share = nodal_lengths(mesh.points[flat])
-    load = np.zeros(mesh.dofs)
-    load[2 * flat + 1] = -P * share / share.sum()
-    return load
+def _pressed(discs: tuple[HalfDisc, ...], flat: str, P: float) -> tuple[Nodes, Vector]:
+    """Spread P evenly over a flat side: the components, and the forces there, N/m."""
+    (disc,) = (disc for disc in discs if flat in disc.sides)
+    share = nodal_lengths(disc.position(disc.sides[flat]))
+    return 2 * joined_sides(discs)[flat] + 1, -P * share / share.sum()
+
+
+def _loaded(mesh: Mesh, load: tuple[Nodes, Vector]) -> Vector:
+    """Return the nodal forces (2N,) of forces at some components."""
+    forces = np.zeros(mesh.dofs)
+    forces[load[0]] = load[1]
+    return forces
 
 
 def pressure_quantities(
-    bodies: Bodies, primal: QP, exact: LineContact, s: Solution
+    bodies: Bodies | ContactSides, primal: QP, exact: LineContact, s: Solution
 ) -> dict[str, Any]:
     """Compare the pressure on the slave side with Hertz's.
 
@@ -431,10 +524,11 @@ def _beside(
 
 
 def _case(
-    bodies: Bodies, rows: ContactRows, form: str, exact: LineContact,
-    params: Mapping[str, Value],
+    bodies: Bodies, rows: ContactRows, form: str, params: Mapping[str, Value],
+    halves: Halves,
 ) -> Case:  # fmt: skip
     p: Any = params
+    exact = halves.exact
     primal = primal_qp(bodies, rows)
     case = contact_case(
         bodies, primal, form,
@@ -442,15 +536,15 @@ def _case(
         supported=lambda: supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s)
         | pressure_quantities(bodies, primal, exact, s),
-        torn=posed_on(params, lambda: subdivided(bodies, p["feti"]), primal),
+        torn=posed_on(params, lambda: subdivided(bodies, halves, p["feti"]), primal),
     )  # fmt: skip
     return _beside(case, exact)
 
 
-def _on_axis(mesh: Mesh, prefix: str = "") -> Nodes:
+def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
     """Find the middle of the arc and the centre, which symmetry keeps at u_x = 0."""
-    sides = [mesh.boundaries[prefix + name] for name in ("arc", "flat")]
-    return np.array([side[side.size // 2] for side in sides])
+    chains = [sides[prefix + name] for name in ("arc", "flat")]
+    return np.array([chain[chain.size // 2] for chain in chains])
 
 
 def _compliance(material: Material, plane: Plane) -> float:

@@ -28,6 +28,7 @@ from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from problems.contact.sides import active
 from problems.duality.dualisation import posed
 from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
+from problems.fem.fixing import fixing_nodes
 from problems.fem.inverse import GeneralisedInverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
 from problems.fem.mesh import (
@@ -38,13 +39,13 @@ from problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from problems.feti.emission import Contact, StructuredBodies
+from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
-from problems.feti.membrane import membrane_kind
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
-from problems.feti.tearing import blocks, decompose
-from problems.feti.torn import Torn
+from problems.feti.tearing import Part, blocks, decompose
+from problems.feti.torn import Kind, Torn
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
@@ -141,16 +142,17 @@ class Membranes:
         along = shares(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def structured(self, rows: str) -> StructuredBodies:
+    def in_subdomains(self, rows: str) -> ProblemInParts:
         """Describe the dual, glued by `rows` of `problems.feti.gluing`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
-        G = _touching(sides, int(layout.node_start[-1]))
-        return StructuredBodies(
+        G = _touching(sides, layout.nodes)
+        return ProblemInParts(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
             kind=membrane_kind, E=np.ones(2), load=self.load, glue=rows,
             held=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
+            results=self.results,
         )  # fmt: skip
 
     @property
@@ -181,23 +183,53 @@ class Membranes:
 
         Of a solution of the primal problem; energy and force are per tension.
         """
+        return self._reported(s.z, self.qp.objective(s.x), float(s.x.min()))
+
+    def results(self, found: OwnSolution) -> dict[str, Any]:
+        """Report what ranks have found, as `quantities`; called by all of them."""
+        lowest = found.bodies.ranks.extreme(float(found.u.min()), np.min)
+        return self._reported(found.z, found.energy, lowest)
+
+    def _reported(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
+        nodes = 2 * (self.side + 1) ** 2
         return {
-            "nodes": len(self.mesh.points),
-            "elements": len(self.mesh.cells),
-            "dofs": self.qp.q.size,
-            "equality_rows": self.qp.b.size,
-            "contact_rows": self.qp.h.size,
-            "active": int(active(s.z).sum()),
-            "energy": self.qp.objective(s.x),
-            "contact_force": float(s.z.sum()),
-            "lowest": float(s.x.min()),
+            "nodes": nodes,
+            "elements": 2 * self.side**2,
+            "dofs": nodes,
+            "equality_rows": self.side + 1,
+            "contact_rows": z.size,
+            "active": int(active(z).sum()),
+            "energy": energy,
+            "contact_force": float(z.sum()),
+            "lowest": lowest,
         }
 
 
-def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     """Describe the dual, of which ranks can emit their shares."""
     p: Any = params
-    return Membranes(p["S"], p["n"]).structured(p["glue"])
+    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
+
+
+def membrane_kind(part: Part, h: float = 1.0) -> Kind:
+    """Assemble one floating block of a grid, under unit tension.
+
+    Its kernel are the constants. Its nodes are numbered as those of `grid_stiffness`.
+
+    h : length of a cell
+    """
+    places = [np.unique(x.round(9)) for x in (part.points / h).T]
+    cells = tuple(x.size - 1 for x in places)
+    nodes = len(part.points)
+    at = np.indices([x.size for x in places]).reshape(len(cells), -1)
+    last = np.array(cells)[:, None]
+    return Kind(
+        K=grid_stiffness(cells, h),
+        R=np.full((nodes, 1), nodes**-0.5),
+        fixing=fixing_nodes(part.points),
+        boundary=np.flatnonzero(((at == 0) | (at == last)).any(axis=0)),
+        stiffness=np.ones(nodes),
+    )
 
 
 def _touching(sides: Mapping[str, Nodes], nodes: int) -> csr_array:

@@ -54,11 +54,14 @@ from problems.duality.dualisation import Transformed, dual_bounds, dualise
 from problems.duality.torn_dual import torn_dual, torn_quantities
 from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_inverse
 from problems.fem.laplacian import grid_stiffness
+from problems.fem.mesh import Nodes, StructuredGrid
+from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
-from problems.feti.membrane import membrane_kind
+from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
 from problems.feti.torn import Torn
+from problems.models.membranes import membrane_kind
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
@@ -108,6 +111,66 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
             ),
         ),
     )  # fmt: skip
+
+
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the dual of a membrane (dim = 2) on a grid in blocks.
+
+    Every node within has a row of contact.
+    """
+    p: Any = params
+    n, shape, all_ = p["n"], p["shape"], slice(None)
+    grid = _grid(n, shape)
+    layout = Layout.of((grid,), p["feti"])
+    held = np.unique(np.concatenate([*grid.sides.values()]))
+    free = np.setdiff1d(np.arange(grid.nodes), held)
+    psi = obstacle_height(grid.block(all_, all_)[free], shape)
+    ends = np.arange(free.size + 1)
+    rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
+    return ProblemInParts(
+        layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
+        kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
+        load=partial(_load, grid, shape), held=held,
+        contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
+    )  # fmt: skip
+
+
+def _grid(n: int, shape: str) -> StructuredGrid:
+    """Divide Ω ⊂ ℝ²; its nodes are numbered as `nodes`, along y first."""
+    x = np.linspace(-HALF[shape], HALF[shape], n + 1)
+    return StructuredGrid(
+        columns=x, rows=x,
+        place=lambda y, x: np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1),
+        names=("left", "top", "right", "bottom"),
+    )  # fmt: skip
+
+
+def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
+    """Return −q − Kw of `Problem` at some nodes (k,).
+
+    K of a square is the sum of Kronecker products of the stiffness and the mass of
+    lines of linear elements; only next to the boundary, w is felt.
+    """
+    n, h = grid.columns.size - 1, 2 * HALF[shape] / (grid.columns.size - 1)
+    i, j = np.divmod(node, n + 1)
+
+    def ends(k: Nodes) -> Vector:
+        return np.where((k == 0) | (k == n), 1.0, 2.0)
+
+    def along(k: Nodes, step: int) -> tuple[Vector, Vector]:
+        one = np.ones(k.size)
+        stiff, mass = (-one, one) if step else (ends(k), 2 * ends(k))
+        return stiff / h, mass * (h / 6)
+
+    f = -LOAD[shape] * (h / 2) ** 2 * ends(i) * ends(j)
+    for a, b in np.ndindex(3, 3):
+        beside = np.stack([i + a - 1, j + b - 1])
+        at_boundary = ((beside == 0) | (beside == n)).any(axis=0)
+        of = np.flatnonzero(at_boundary & ((beside >= 0) & (beside <= n)).all(axis=0))
+        (K_i, M_i), (K_j, M_j) = along(i[of], a - 1), along(j[of], b - 1)
+        w = exact_height(grid.position(beside[0, of] * (n + 1) + beside[1, of]), shape)
+        f[of] -= (K_i * M_j + M_i * K_j) * w
+    return np.asarray(f)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,7 @@ from problems.contact.bodies import (
     ContactPair,
     assemble,
     clamped,
+    elasticity_matrices,
     floating,
     supported,
 )
@@ -51,6 +52,7 @@ from problems.fem.elasticity import Material
 from problems.fem.finite_strain import cauchy_stress, strain_energy
 from problems.fem.hyperelastic import Hyperelastic, hyperelastic
 from problems.fem.mesh import (
+    Mesh,
     Nodes,
     StructuredGrid,
     as_vectors,
@@ -60,13 +62,23 @@ from problems.fem.mesh import (
     rectangle_grid,
 )
 from problems.fem.stress import gauss_stress
-from problems.feti.elastic import SubdividedBodies, posed_on, structured, subdivide
-from problems.feti.emission import StructuredBodies
+from problems.feti.elastic import (
+    AtSides,
+    SubdividedBodies,
+    at_rest,
+    in_parts,
+    own_meshes,
+    posed_on,
+    subdivide,
+)
+from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 from problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
+NAMES = ("lower", "upper")
 PRESSURE = 1e6  #: p, Pa
 UNITS = (LENGTH, PRESSURE * LENGTH)  #: l and F₀, m and N/m
 E_UPPER, NU = 10e6, 0.3  #: Pa
@@ -246,26 +258,40 @@ def model(params: Mapping[str, Value]) -> Bodies:
     sides, (component, force) = mesh.boundaries, _pressure(grids)
     load = np.zeros(mesh.dofs)
     load[component] = force
-    lower, upper = sides["lower_top"], sides["upper_bottom"]
     return assemble(
-        mesh, body, names=("lower", "upper"), materials=_materials(params),
+        mesh, body, names=NAMES, materials=_materials(params),
         plane=p["plane"], units=UNITS, fixed=_rollers(sides), load=load,
-        pairs=(ContactPair(lower, upper) if p["slave"] == "lower"
-               else ContactPair(upper, lower),),
+        pairs=(_pair(params, sides),),
     )  # fmt: skip
 
 
-def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
-    """Describe the dual of the linear problem in subdomains."""
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the linear problem in subdomains."""
     p: Any = params
-    grids = _grids(params)
-    lower, upper = (0, "lower_top"), (1, "upper_bottom")
-    return structured(
-        grids, p["feti"], materials=_materials(params), plane=p["plane"], units=UNITS,
-        fixed=_rollers(joined_sides(grids)), load=_pressure(grids),
-        pairs=[(lower, upper) if p["slave"] == "lower" else (upper, lower)],
-        method=(p["contact"], p["basis"]), laws=(law_of(params),), glue=p["glue"],
+    grids, laws, materials = _grids(params), (law_of(params),), _materials(params)
+    sides, layout = joined_sides(grids), Layout.of(grids, p["feti"])
+    D = elasticity_matrices(materials, p["plane"])
+
+    def error(found: OwnSolution, _: AtSides) -> dict[str, Any]:
+        largest = max(
+            _stress_error(of.mesh, D[of.body], of.u)
+            for of in own_meshes(layout, found, LENGTH)
+        )
+        return {"stress_error": found.bodies.ranks.extreme(largest, np.max)}
+
+    return in_parts(
+        layout, materials=materials, plane=p["plane"], units=UNITS, names=NAMES,
+        fixed=_rollers(sides), load=_pressure(grids), pairs=(_pair(params, sides),),
+        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=error,
     )  # fmt: skip
+
+
+def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
+    lower, upper = sides["lower_top"], sides["upper_bottom"]
+    return ContactPair(
+        *((lower, upper) if params["slave"] == "lower" else (upper, lower))
+    )
 
 
 def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
@@ -298,5 +324,9 @@ def _divisions(n: int) -> tuple[int, int]:
 
 def stress_error(bodies: Bodies, s: Solution) -> float:
     """Return the largest |σ_y + p|/p over all Gauss points."""
-    stress = gauss_stress(bodies.mesh, bodies.D, s.x * bodies.length)
+    return _stress_error(bodies.mesh, bodies.D, s.x * bodies.length)
+
+
+def _stress_error(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> float:
+    stress = gauss_stress(mesh, D, u)
     return float(np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE)

@@ -40,7 +40,7 @@ from problems.fem.mesh import (
     rectangle_grid,
 )
 from problems.feti.elastic import elastic_kind, forces_at
-from problems.feti.emission import Contact, StructuredBodies
+from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue, without_supports
 from problems.feti.spectrum import Spectrum, spectra_of_equations
 from problems.feti.structured import Layout
@@ -177,14 +177,14 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     )  # fmt: skip
 
 
-def structured_problem(params: Mapping[str, Value]) -> StructuredBodies:
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     """Describe the dual of the plate, its supports being rows of B."""
     p: Any = params
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
     column, row = (x.astype(np.int64) for x in layout.block[1:])
     none = np.zeros(0)
-    return StructuredBodies(
+    return ProblemInParts(
         layout=layout, components=2, E=moduli[:1], glue=p["glue"],
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),

@@ -6,7 +6,6 @@ ranks emit are put together here, and compared with the QP that one process emit
 
 import json
 import sys
-from importlib import import_module
 
 import numpy as np
 from mpi4py import MPI
@@ -16,17 +15,12 @@ import mortarbench as mb
 from harness.distributed.vectors import Ranks
 from problems.feti.emission import OwnSubdomains, emitted, subdomains_of
 
-MODELS = {
-    "beam-ring": "beam_ring", "contact-patch": "patch", "membranes": "membranes",
-    "plate": "plate",
-}  # fmt: skip
-
 
 def compared(name, ranks):
     """Tell how far the shares are from the QP of one process, part by part."""
     case = mb.build(name)
-    model = import_module(f"problems.models.{MODELS[case.id.family.name]}")
-    problem = model.structured_problem(case.params)
+    assert case.id.family.is_emitted_by_ranks(case.params)
+    problem = case.id.family.in_subdomains(case.params)
     made = emitted(problem, ranks)
     share, qp = made.share().qp, case.qp
     whole, rows = qp.P.build(), share.P.halo.rows

@@ -12,46 +12,10 @@ from problems import PROBLEMS
 from problems.models import beam_ring
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
-from tests.support import ROOT
+from tests.support.press import described
 
 TOL = 1e-8
 GLUES = ("orthonormal", "chain", "redundant")
-DISC = """\
-mesh = "press.msh"
-length_unit = "mm"
-contact = "mortar"
-steps = 1
-[[bodies]]
-name = "disc"
-E = 210e9
-nu = 0.3
-[[bodies]]
-name = "lower"
-E = 210e9
-nu = 0.3
-[[bodies]]
-name = "upper"
-E = 210e9
-nu = 0.3
-[[supports]]
-boundary = "base"
-fix = ["x", "y"]
-[[supports]]
-boundary = "guides"
-fix = ["x"]
-[[supports]]
-point = "axis"
-fix = ["x"]
-[[loads]]
-boundary = "press"
-force = [0, -2e6]
-[[contacts]]
-slave = "disc below"
-master = "lower top"
-[[contacts]]
-slave = "disc above"
-master = "upper bottom"
-"""
 COULOMB = "friction=coulomb/mu=0.3"
 CASES = [
     ("beam-ring/Nr=2/Nh=2/steps=1", "feti=2"),
@@ -112,9 +76,7 @@ def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
 @pytest.fixture
 def press(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "press.toml").write_text(DISC)
-    mesh = (ROOT / "tests" / "data" / "press.msh").read_bytes()
-    (tmp_path / "press.msh").write_bytes(mesh)
+    described(tmp_path)
     return "bodies:press.toml"
 
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from harness.distributed import mpi
-from problems.ranges import emitted_on_ranks
-from tests.support import ROOT, SUPPORT
+from harness.names import parse
+from problems import PROBLEMS
+from tests.support import ROOT, SUPPORT, press
 
 pytestmark = pytest.mark.together
 
@@ -20,6 +21,10 @@ CASES = (
     "contact-patch/feti=3/slave=upper/ratio=5/glue=chain/dual",
     "membranes/S=2/n=3/dual",
     "plate/Sx=3/Sy=2/n=3/ny=2/pattern=checkerboard/jump=10/load=edge/dual",
+    "beam-ring/Nr=4/Nh=3/steps=5/step=1/contact=mortar/feti=4/dual",
+    "hertz-plane/n=2/feti=5/dual",
+    "obstacle/n=11/shape=hemisphere/feti=4/dual",
+    "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e5/slave=lower/dual",
 )
 ROUNDING = 1e-14
 
@@ -35,6 +40,36 @@ def emitted(ranks, cases):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def described(tmp_path_factory):
+    """Bodies of a description, in parts, the case by what it is about."""
+    path = press.described(tmp_path_factory.mktemp("press"))
+    name = f"bodies:{path}/parts=8"
+    return {
+        "first": f"{name}/step=1/dual",
+        "friction": f"{name}/steps=1/friction=tresca/bound=1e7/glue=redundant/dual",
+        "second": f"{name}/steps=2/step=2/dual",
+        "coulomb": f"{name}/steps=1/friction=coulomb/mu=0.2/dual",
+        "whole": f"bodies:{path}/steps=1/dual",
+    }
+
+
+def test_ranks_assemble_their_parts_of_a_mesh_that_all_read(described):
+    for case in emitted(2, [described["first"], described["friction"]]).values():
+        assert case["sizes"][0] == case["sizes"][1]
+        assert case["entries"][0] == case["entries"][1]
+        assert max(*case["errors"].values(), *case["bounds"]) < ROUNDING
+        assert set(case["owners"]) == {1}
+        assert case["torn"] == 0
+
+
+@pytest.mark.parametrize("what", ["second", "coulomb", "whole"])
+def test_of_a_description_one_process_emits_what_needs_more(described, what):
+    case = parse(described[what], PROBLEMS)
+
+    assert case.family.emission(case.form, case.params) is None
 
 
 @pytest.fixture(
@@ -97,13 +132,30 @@ def generated(rng, count=8):
             f"load={rng.choice(['point', 'edge', 'nodal'])}/glue={glue}/dual"
         )
         yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/glue={glue}/dual"
+        yield (
+            f"obstacle/n={n[4] + 6}/shape={rng.choice(['flat', 'hemisphere'])}/"
+            f"feti={n[5] % 3 + 2}/glue={glue}/dual"
+        )
+        yield f"hertz-plane/n={n[0] % 3 + 1}/feti={n[1] + 2}/glue={glue}/dual"
+        yield (
+            f"hertz-cylinder/n={n[2] % 3 + 1}/m={n[3] % 3 + 1}/feti={n[4] + 3}/"
+            f"ratio={n[5]}/slave={rng.choice(['upper', 'lower'])}/{method}"
+        )
 
 
 @pytest.mark.parametrize(
-    "changed", [{"steps": 2}, {"relin": 3}, {"friction": "coulomb"}, {"feti": 0}]
-)
-def test_what_needs_solutions_or_has_no_subdomains_is_emitted_by_one(changed):
-    plain = {"feti": 4, "steps": 1, "relin": 1, "friction": "none"}
+    "name",
+    [
+        "beam-ring/steps=2/feti=4/dual", "beam-ring/steps=1/relin=3/feti=4/dual",
+        "beam-ring/steps=1/dual", "beam-ring/steps=1/feti=4/primal",
+        "beam-ring/kinematics=finite/steps=1/dual",
+        "contact-patch/friction=coulomb/mu=0.3/feti=3/dual",
+        "plate/supports=eliminated/dual", "hertz-plane/dual",
+        "obstacle/dim=1/feti=5/dual",
+        "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/feti=5/dual",
+    ],
+)  # fmt: skip
+def test_what_needs_solutions_or_has_no_subdomains_is_emitted_by_one(name):
+    case = parse(name, PROBLEMS)
 
-    assert emitted_on_ranks(plain)
-    assert not emitted_on_ranks(plain | changed)
+    assert case.family.emission(case.form, case.params) is None

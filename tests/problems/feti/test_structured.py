@@ -27,55 +27,6 @@ def torn(request):
     return Layout.of(GRIDS, request.param), whole
 
 
-def test_torn_nodes_are_numbered_as_in_the_torn_mesh(torn):
-    layout, whole = torn
-    nodes = layout.torn_nodes(np.arange(layout.count))
-
-    assert np.array_equal(layout.number(nodes.at), whole.node)
-    assert np.array_equal(nodes.start, whole.start)
-    assert np.array_equal(nodes.block, whole.subdomain)
-
-
-def test_copies_of_a_node_are_counted_in_the_order_of_their_blocks(torn):
-    layout, whole = torn
-    nodes = layout.torn_nodes(np.arange(layout.count))
-    copies = [np.flatnonzero(whole.node == n) for n in range(whole.nodes)]
-
-    assert np.array_equal(layout.holder(nodes.at, nodes.copy), nodes.block)
-    assert layout.times(nodes.at).tolist() == [copies[n].size for n in whole.node]
-    for mine in copies:
-        assert nodes.copy[mine].tolist() == list(range(mine.size))
-
-
-def test_nodes_with_as_many_copies_are_counted_from_the_first(torn):
-    layout, whole = torn
-    times = np.bincount(whole.node)
-    counted = layout.before(layout.places(np.arange(whole.nodes)))
-
-    for m in (1, 2, 4):
-        having = np.flatnonzero(times == m)
-        assert layout.having(m) == having.size
-        assert counted[having].tolist() == list(range(having.size))
-
-
-def test_sides_between_blocks_are_those_with_common_nodes(torn):
-    layout, whole = torn
-    own = [set(part) for part in np.split(whole.node, whole.start[1:-1])]
-    common = {(s, t): len(own[s] & own[t]) for s in range(len(own)) for t in range(s)}
-    one, other, nodes = layout.shared_sides()
-
-    found = dict(zip(zip(other, one, strict=True), nodes, strict=True))
-    assert found == {pair: n for pair, n in common.items() if pair in found}
-    assert {pair for pair, n in common.items() if n > 2} <= set(found)
-    glued = [sum(n in neighbour for n in mine) for mine, neighbour in _around(own)]
-    assert layout.glued().tolist() == glued
-
-
-def _around(own):
-    for s, mine in enumerate(own):
-        yield mine, set().union(*own[:s], *own[s + 1 :])
-
-
 @pytest.mark.parametrize("grid", GRIDS)
 def test_a_block_has_the_points_of_the_whole_mesh(grid):
     mesh, (nx, ny) = grid.mesh(), grid.divisions
@@ -138,7 +89,7 @@ def test_spacings_are_those_of_the_cells_around(torn):
         spacings(grid.mesh().points.reshape(grid.rows.size, -1, 2)) for grid in GRIDS
     ]
 
-    assert np.array_equal(of_blocks, np.concatenate(whole)[layout.number(nodes.at)])
+    assert np.array_equal(of_blocks, np.concatenate(whole)[nodes.number])
     assert whole[0] == pytest.approx(np.tile([2 / 13, 0.05], (14 * 6, 1)))
 
 

@@ -1,20 +1,19 @@
 """Bodies torn into subdomains, and the rows that hold these together."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
 from problems.fem.elasticity import Material, elasticity_matrix
-from problems.fem.mesh import rectangle, rectangle_grid
+from problems.fem.mesh import rectangle
 from problems.feti.elastic import elastic_kind
 from problems.feti.gluing import glue, without_supports
 from problems.feti.tearing import (
     blocks,
     compact_blocks,
     decompose,
+    labelled,
     structured_bodies,
 )
 from tests.support.torn_bodies import torn_pair
@@ -43,8 +42,7 @@ def test_blocks_of_several_bodies_are_numbered_one_body_after_another() -> None:
 
 
 def test_compact_blocks_of_squares_are_squares() -> None:
-    mesh = rectangle((0.0, 0.0), (2.0, 1.0), (16, 8))
-    found = compact_blocks(mesh.points, mesh.cells, (16, 8), 4)
+    found = labelled(compact_blocks(sides(np.full(16, 2 / 16), np.full(8, 1 / 8)), 4))
     pairs = set(zip(found.tolist(), blocks((16, 8), 4).tolist(), strict=True))
 
     assert len(pairs) == found.max() + 1 == 8
@@ -52,9 +50,8 @@ def test_compact_blocks_of_squares_are_squares() -> None:
 
 def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> None:
     """Of cells that are 8 times as long as wide, 2 × 16 are a square."""
-    grid = rectangle_grid((0.0, 0.0), (8.0, 1.0), (16, 16))
-    mesh = grid.mesh()
-    label = compact_blocks(mesh.points, mesh.cells, (16, 16), 6)
+    mesh = rectangle((0.0, 0.0), (8.0, 1.0), (16, 16))
+    label = labelled(compact_blocks(sides(np.full(16, 1 / 2), np.full(16, 1 / 16)), 6))
 
     assert np.bincount(label).tolist() == [32] * 8
     for block in range(8):
@@ -64,11 +61,26 @@ def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> 
 
 
 def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() -> None:
-    grid = rectangle_grid((0.0, 0.0), (1.0, 1.0), (8, 2))
-    mesh = replace(grid, columns=np.array([0, 1, 2, 3, 4, 5, 6, 12, 13.0])).mesh()
-    label = compact_blocks(mesh.points, mesh.cells, (8, 2), 3)
+    wide = np.array([1, 1, 1, 1, 1, 1, 6, 1.0])
+    label = labelled(compact_blocks(sides(wide, np.full(2, 0.5)), 3))
 
     assert label.tolist() == 2 * [0, 0, 0, 1, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rounding_of_lengths_moves_no_cut_of_compact_blocks(seed: int) -> None:
+    """Of seven equal cells, two lines are as near to the middle."""
+    wide, deep = np.full(7, 1.0), np.full(2, 1.0)
+    rounding = 1 + 1e-15 * np.random.default_rng(seed).standard_normal((2, 7))
+    found = compact_blocks(sides(wide * rounding[0], deep * rounding[1, :2]), 3)
+
+    assert found == compact_blocks(sides(wide, deep), 3)
+    assert [columns.stop for _, columns in found] == [3, 7]
+
+
+def sides(wide, deep):
+    """Sides of rectangular cells, of columns and of rows."""
+    return (deep, np.ones(wide.size)), (np.ones(deep.size), wide)
 
 
 def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:

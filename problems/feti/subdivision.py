@@ -1,0 +1,291 @@
+"""Bodies in subdomains as somebody knows them who holds a few of these.
+
+What tearing and gluing number (`problems.feti.tearing`, `problems.feti.gluing`) can be
+counted once it is known which subdomains have a node. In blocks of structured grids
+that follows from tables as long as their sides (`problems.feti.structured.Layout`). For
+anything else, the nodes that several subdomains have are listed with these (`Listed`):
+a list as long as the interfaces are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, triu
+
+from harness.digest import hex_digest
+from problems.fem.mesh import HalfDisc, Mesh, Nodes
+from problems.feti.tearing import Block
+
+Integers = NDArray[np.integer[Any]]
+Points = NDArray[np.float64]
+
+
+class TornNodes(NamedTuple):
+    """The nodes of some subdomains, one after another, within each ascending."""
+
+    subdomain: Integers  #: (M,) place in the list of subdomains
+    number: Nodes  #: (M,) of the whole
+    times: Integers  #: (M,) copies of it in all subdomains
+    copy: Integers  #: (M,) which of these it is, from 0 on
+    start: NDArray[np.int64]  #: (subdomains + 1,) first of each, and M
+
+
+class Subdivision(Protocol):
+    """S subdomains of one or more bodies; nodes are given by their numbers (k,).
+
+    Copies of a node are numbered as the subdomains that have them.
+    """
+
+    @property
+    def count(self) -> int:
+        """How many subdomains there are, S."""
+
+    @property
+    def nodes(self) -> int:
+        """How many nodes all bodies have."""
+
+    @property
+    def body(self) -> Integers:
+        """Body of each subdomain, (S,)."""
+
+    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+        """List the nodes of some subdomains."""
+
+    def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
+        """Return what is the same of subdomains whose cells are numbered alike."""
+
+    def points(self, subdomains: Nodes) -> Sequence[Points]:
+        """Return the points (n, 2) of the nodes of some subdomains."""
+
+    def cells(self, subdomain: int) -> Nodes:
+        """List the cells (E, 4) of one; corners are places in its list of nodes."""
+
+    def times(self, node: Nodes) -> NDArray[np.int64]:
+        """Count the copies (k,)."""
+
+    def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
+        """Find the subdomain (k,) that has a copy of each node.
+
+        copy : (k,) which one, from 0 on
+        """
+
+    def position(self, node: Nodes) -> Points:
+        """Return the points of some nodes, (k, 2)."""
+
+    def before(self, node: Nodes) -> NDArray[np.int64]:
+        """Count, of each, those before it that have as many copies."""
+
+    @property
+    def having(self) -> Mapping[int, int]:
+        """How many nodes have several copies, by the number of these."""
+
+    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+        """List pairs of subdomains, and how many nodes these share: all (k,)."""
+
+    def glued(self) -> NDArray[np.int64]:
+        """Count the nodes of each subdomain that have several copies, (S,)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Listed:
+    """Subdomains whose common nodes are listed; see `Subdivision`.
+
+    Only of what is listed can copies, holders and points be asked for.
+    """
+
+    nodes: int
+    body: Integers  #: (S,)
+    node: Nodes  #: (k,) listed ones, ascending
+    start: NDArray[np.int64]  #: (k + 1,) first holder of each, and l
+    held_by: Nodes  #: (l,) subdomains that have it, ascending for each
+    #: nodes (n,) of a subdomain, ascending, and its cells (E, 4) as places in these
+    part: Callable[[int], tuple[Nodes, Nodes]]
+    position: Callable[[Nodes], Points]
+
+    @property
+    def count(self) -> int:
+        """How many subdomains there are, S."""
+        return self.body.size
+
+    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+        """List the nodes of some subdomains."""
+        parts = [self.part(int(s))[0] for s in subdomains]
+        sizes = np.array([part.size for part in parts])
+        number = np.concatenate(parts)
+        place = np.minimum(np.searchsorted(self.node, number), self.node.size - 1)
+        subdomain = np.repeat(np.arange(sizes.size, dtype=np.int32), sizes)
+        copy = np.zeros(number.size, dtype=np.int32)
+        listed = np.flatnonzero(self.node[place] == number)
+        # holders are ascending for each listed node, so pairs are in order
+        pairs = np.repeat(np.arange(self.node.size), np.diff(self.start))
+        found = np.searchsorted(
+            pairs * self.count + self.held_by,
+            place[listed] * self.count + subdomains[subdomain[listed]],
+        )
+        copy[listed] = found - self.start[place[listed]]
+        return TornNodes(
+            subdomain, number, self.times(number).astype(np.int32), copy,
+            np.concatenate([[0], np.cumsum(sizes)]),
+        )  # fmt: skip
+
+    def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
+        """Return a digest of the cells of each."""
+        cells = (np.ascontiguousarray(self.cells(int(s))) for s in subdomains)
+        return [hex_digest((c.tobytes(),), 32) for c in cells]
+
+    def points(self, subdomains: Nodes) -> Sequence[Points]:
+        """Return the points (n, 2) of the nodes of some subdomains."""
+        return [self.position(self.part(int(s))[0]) for s in subdomains]
+
+    def cells(self, subdomain: int) -> Nodes:
+        """List the cells (E, 4) of one; corners are places in its list of nodes."""
+        return self.part(subdomain)[1]
+
+    def _place(self, node: Nodes) -> Nodes:
+        """Find listed nodes."""
+        return np.searchsorted(self.node, node)
+
+    def times(self, node: Nodes) -> NDArray[np.int64]:
+        """Count the copies (k,); one of what is not listed."""
+        place = np.minimum(self._place(node), self.node.size - 1)
+        return np.where(self.node[place] == node, np.diff(self.start)[place], 1)
+
+    def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
+        """Find the subdomain (k,) that has a copy of each listed node."""
+        return np.asarray(self.held_by[self.start[self._place(node)] + copy])
+
+    def before(self, node: Nodes) -> NDArray[np.int64]:
+        """Count, of each listed node, those before it that have as many copies."""
+        return np.asarray(self._before[self._place(node)])
+
+    @cached_property
+    def _before(self) -> NDArray[np.int64]:
+        times = np.diff(self.start)
+        found = np.empty_like(times)
+        for m in np.unique(times):
+            of = np.flatnonzero(times == m)
+            found[of] = np.arange(of.size)
+        return found
+
+    @cached_property
+    def having(self) -> Mapping[int, int]:
+        """How many nodes have several copies, by the number of these."""
+        times, count = np.unique(np.diff(self.start), return_counts=True)
+        return {int(m): int(n) for m, n in zip(times, count, strict=True) if m > 1}
+
+    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+        """List pairs of subdomains, and how many nodes these share: all (k,)."""
+        shape = (self.node.size, self.count)
+        ones = np.ones(self.held_by.size, dtype=np.int64)
+        has = csr_array((ones, self.held_by, self.start), shape=shape)
+        pairs = coo_array(triu(has.T @ has, k=1))
+        return pairs.row, pairs.col, pairs.data
+
+    def glued(self) -> NDArray[np.int64]:
+        """Count the nodes of each subdomain that have several copies, (S,)."""
+        times = np.diff(self.start)
+        several = np.repeat(times > 1, times)
+        return np.bincount(self.held_by[several], minlength=self.count)
+
+
+def listed_by_holders(
+    number: Nodes, subdomain: Nodes, subdomains: int
+) -> tuple[Nodes, NDArray[np.int64], Nodes]:
+    """Sort pairs of a node and a subdomain that has it, each there once or more.
+
+    number, subdomain : (e,)
+
+    Returns
+    -------
+    `node`, `start` and `held_by` of `Listed`
+
+    """
+    node, held_by = np.divmod(np.unique(number * subdomains + subdomain), subdomains)
+    first = np.flatnonzero(np.diff(node, prepend=-1))
+    return node[first], np.append(first, node.size), held_by
+
+
+def half_discs_in_blocks(
+    discs: Sequence[HalfDisc], blocks: Sequence[Sequence[Block]]
+) -> Listed:
+    """Know half discs by the perimeters of the blocks that their cells form.
+
+    blocks : rings and angles of cells, of each disc, in the order of the subdomains
+    """
+    first = np.cumsum([0, *(disc.nodes for disc in discs)])
+    body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])
+    every = [
+        (discs[b], first[b], *block) for b, own in enumerate(blocks) for block in own
+    ]
+    around = [begin + _perimeter(disc, *block) for disc, begin, *block in every]
+
+    def part(s: int) -> tuple[Nodes, Nodes]:
+        disc, begin, rings, angles = every[s]
+        nodes, cells = disc.block(angles, rings)
+        return begin + nodes, cells
+
+    def position(node: Nodes) -> Points:
+        of = np.searchsorted(first, node, side="right") - 1
+        found = np.empty((node.size, 2))
+        for b in np.unique(of).tolist():
+            found[of == b] = discs[b].position(node[of == b] - first[b])
+        return found
+
+    subdomain = np.repeat(np.arange(len(every)), [nodes.size for nodes in around])
+    node, start, held_by = listed_by_holders(
+        np.concatenate(around), subdomain, len(every)
+    )
+    return Listed(
+        nodes=int(first[-1]), body=body, node=node, start=start, held_by=held_by,
+        part=part, position=position,
+    )  # fmt: skip
+
+
+def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
+    """List the nodes on the sides of a block of cells, some of them twice."""
+    a, r = disc.angles.size, disc.radii.size
+    has_centre = rings.stop == r
+    i = np.arange(angles.start, angles.stop + 1)
+    j = np.arange(rings.start, rings.stop + (not has_centre))
+    inner = [a * r] if has_centre else a * rings.stop + i
+    ends = (a * j + angles.start, a * j + angles.stop)
+    return np.concatenate([a * rings.start + i, inner, *ends])
+
+
+def mesh_in_parts(
+    mesh: Mesh, label: NDArray[np.int64], body: NDArray[np.int64], named: Nodes
+) -> Listed:
+    """Know a mesh of any kind by the labels of its cells; it is kept as a whole.
+
+    Parameters
+    ----------
+    label, body : (E,) subdomain and body of each cell
+    named : nodes that are listed though only one subdomain has them
+
+    """
+    points, cells, N = mesh.points, mesh.cells, len(mesh.points)
+    S = int(label.max()) + 1
+    by_label = np.argsort(label, kind="stable")
+    ends = np.searchsorted(label[by_label], np.arange(S + 1))
+    pairs = np.unique((label[by_label, None] * N + cells[by_label]).ravel())
+    subdomain, number = np.divmod(pairs, N)
+    kept = np.bincount(number, minlength=N) > 1
+    kept[named] = True
+    several = kept[number]
+    node, start, held_by = listed_by_holders(number[several], subdomain[several], S)
+
+    def part(s: int) -> tuple[Nodes, Nodes]:
+        own = cells[by_label[ends[s] : ends[s + 1]]]
+        nodes, corner = np.unique(own, return_inverse=True)
+        return nodes, corner.reshape(own.shape)
+
+    return Listed(
+        nodes=N, body=body[by_label[ends[:-1]]], node=node, start=start,
+        held_by=held_by, part=part, position=points.__getitem__,
+    )  # fmt: skip

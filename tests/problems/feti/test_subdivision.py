@@ -1,0 +1,159 @@
+"""What is known of subdomains without the whole is what tearing makes of it."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
+from problems.feti.structured import Layout
+from problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
+from problems.feti.tearing import (
+    compact_blocks,
+    decompose,
+    labelled,
+    structured_bodies,
+)
+
+pytestmark = pytest.mark.together
+
+GRIDS = (
+    rectangle_grid((0.0, 0.5), (2.0, 0.25), (13, 5)),
+    half_ring_grid((1.0, 0.0), (0.3, 0.49), (11, 7)),
+    rectangle_grid((0.0, 0.0), (1.0, 1.0), (2, 2)),
+)
+DISCS = (
+    HalfDisc((0.0, 8.0), np.linspace(-np.pi, 0, 15), 8 * 0.8 ** np.arange(9)),
+    HalfDisc((0.0, -2.0), np.pi * np.linspace(0, 1, 8) ** 2, np.array([2.0, 1.5])),
+    HalfDisc((0.0, 0.0), np.linspace(0, np.pi, 5), np.array([1.0])),
+)
+
+
+def torn(bodies, label):
+    mesh, body = join(tuple(one.mesh() for one in bodies))
+    return mesh, body, decompose(mesh.points, mesh.cells, label, body)
+
+
+def grids(most):
+    label = structured_bodies([grid.divisions for grid in GRIDS], most)
+    return Layout.of(GRIDS, most), *torn(GRIDS, label)
+
+
+def discs(most):
+    blocks = [compact_blocks(disc.lengths(), most) for disc in DISCS]
+    labels = [np.zeros(0, dtype=np.int64)]
+    for own in blocks:
+        labels.append(labelled(own) + labels[-1].max(initial=-1) + 1)
+    return half_discs_in_blocks(DISCS, blocks), *torn(DISCS, np.concatenate(labels))
+
+
+def mesh(most):
+    """The same grids as a mesh of which every node is asked for."""
+    _, whole, body, parts = grids(most)
+    label = structured_bodies([grid.divisions for grid in GRIDS], most)
+    return mesh_in_parts(whole, label, body, np.arange(parts.nodes)), whole, body, parts
+
+
+@pytest.fixture(
+    scope="module",
+    params=[(how, n) for how in (grids, discs, mesh) for n in (1, 3, 20)],
+)
+def known(request):
+    """A subdivision, and the torn mesh of the whole."""
+    how, most = request.param
+    return how(most)
+
+
+def test_torn_nodes_are_numbered_as_in_the_torn_mesh(known):
+    of, _, _, whole = known
+    nodes = of.torn_nodes(np.arange(of.count))
+
+    assert of.nodes == whole.nodes
+    assert_array_equal(nodes.number, whole.node)
+    assert_array_equal(nodes.start, whole.start)
+    assert_array_equal(nodes.subdomain, whole.subdomain)
+
+
+def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
+    of, _, _, whole = known
+    some = np.arange(of.count)[1::2]
+    nodes, all_ = of.torn_nodes(some), of.torn_nodes(np.arange(of.count))
+    kept = np.isin(whole.subdomain, some)
+
+    assert_array_equal(some[nodes.subdomain], whole.subdomain[kept])
+    for name in ("number", "times", "copy"):
+        assert_array_equal(getattr(nodes, name), getattr(all_, name)[kept])
+
+
+def test_copies_of_a_node_are_counted_in_the_order_of_their_subdomains(known):
+    of, _, _, whole = known
+    nodes = of.torn_nodes(np.arange(of.count))
+    times = np.bincount(whole.node)
+    shared = np.flatnonzero(nodes.times > 1)
+
+    assert_array_equal(nodes.times, times[whole.node])
+    assert_array_equal(
+        of.holder(nodes.number[shared], nodes.copy[shared]), nodes.subdomain[shared]
+    )
+    for n in np.flatnonzero(times > 1):
+        assert nodes.copy[whole.node == n].tolist() == list(range(times[n]))
+
+
+def test_nodes_with_as_many_copies_are_counted_from_the_first(known):
+    of, _, _, whole = known
+    times = np.bincount(whole.node)
+    several = {int(m): int((times == m).sum()) for m in np.unique(times) if m > 1}
+
+    assert dict(of.having) == several
+    for m in several:
+        having = np.flatnonzero(times == m)
+        assert of.before(having).tolist() == list(range(having.size))
+
+
+def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
+    of, mesh, body, whole = known
+    all_ = np.arange(of.count)
+    keys = [(key, b) for key, b in zip(of.keys(all_), of.body.tolist(), strict=True)]
+    nodes = np.split(whole.node, whole.start[1:-1])
+    found = [
+        own[of.cells(s)] for s, own in enumerate(nodes)
+    ]  # cells in the numbers of the whole
+
+    for points, own in zip(of.points(all_), nodes, strict=True):
+        assert_array_equal(points, mesh.points[own])
+    assert sum(map(len, found)) == len(mesh.cells)
+    rows = {row.tobytes(): b for row, b in zip(mesh.cells, body, strict=True)}
+    for cells, b in zip(found, of.body, strict=True):
+        assert {rows[row.tobytes()] for row in cells} == {b}
+    of_key = {}
+    for s, key in enumerate(keys):
+        first = of_key.setdefault(key, s)
+        assert_array_equal(of.cells(s), of.cells(first))
+
+
+def test_sides_of_bodies_and_interfaces_have_holders_and_points(known):
+    of, mesh, _, whole = known
+    times = np.bincount(whole.node)
+    for chain in (*mesh.boundaries.values(), np.flatnonzero(times > 1)):
+        assert_array_equal(of.position(chain), mesh.points[chain])
+        assert_array_equal(of.times(chain), times[chain])
+        first = np.searchsorted(np.sort(whole.node), chain)
+        by_node = whole.subdomain[np.argsort(whole.node, kind="stable")]
+        assert_array_equal(of.holder(chain), by_node[first])
+
+
+def test_neighbours_are_those_with_common_nodes(known):
+    of, _, _, whole = known
+    own = [set(part) for part in np.split(whole.node, whole.start[1:-1])]
+    common = {(t, s): len(own[s] & own[t]) for s in range(len(own)) for t in range(s)}
+    one, other, nodes = of.sharing()
+
+    found = dict(zip(zip(one, other, strict=True), nodes, strict=True))
+    assert found == {pair: n for pair, n in common.items() if pair in found}
+    assert {pair for pair, n in common.items() if n > 2} <= set(found)
+    glued = [sum(n in neighbour for n in mine) for mine, neighbour in _around(own)]
+    assert of.glued().tolist() == glued
+
+
+def _around(own):
+    for s, mine in enumerate(own):
+        yield mine, set().union(*own[:s], *own[s + 1 :])
