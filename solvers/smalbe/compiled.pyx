@@ -76,7 +76,7 @@ cdef extern from "vectors.h" nogil:
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
-    void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    void add_gram(const double *s, const double *V, double *S, Py_ssize_t k)
     int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
@@ -284,20 +284,24 @@ def orthonormal(G, e):
 cdef double RANK = 1e-13  # pivots of the normalised rows below this are rounding errors
 
 
-def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
-                const double[::1] size, const double[::1] a):
-    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
-    cdef Py_ssize_t i, j
+def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
+
+    triangle, rows_kept, sizes, told_a : R (r, r), the rows kept (r,), their sizes (m,), a
+    """
+    cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
     result = np.zeros(m)
-    if not m:
-        return result
-    cdef double[::1] y = result
-    for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
+    cdef double *y = numbers(result)
+    cdef const double *R = numbers(triangle)
+    cdef const double *size = numbers(sizes)
+    cdef const double *a = numbers(told_a)
+    cdef const int[::1] kept = rows_kept
+    for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
-        for j in range(i + 1, R.shape[0]):
-            s -= R[i, j] * y[kept[j]] * size[kept[j]]
-        y[kept[i]] = s / (R[i, i] * size[kept[i]])
+        for j in range(i + 1, r):
+            s -= R[i * r + j] * y[kept[j]] * size[kept[j]]
+        y[kept[i]] = s / (R[i * r + i] * size[kept[i]])
     return result
 
 
@@ -433,14 +437,17 @@ cdef struct Until:
 
 
 cdef class Gram:
-    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last.
+
+    Its upper triangle.
+    """
 
     cdef Py_ssize_t n, k, stride, flips
     cdef const double *U
     cdef Room holder, room  # of U, and of all others
     cdef int *where
     cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *column
+    cdef double *columns  # (4, stride)
     cdef double *held
 
     @staticmethod
@@ -448,10 +455,10 @@ cdef class Gram:
         cdef Gram made = Gram.__new__(Gram)
         made.U, made.holder, made.k, made.n = B.U, B.holder, B.k, B.n
         made.stride, made.flips = (B.k + 3) & ~3, B.n + 1
-        made.room = Room(made.stride * (made.stride + 1) + 2 * B.n)
+        made.room = Room(made.stride * (made.stride + 4) + 2 * B.n)
         made.values = made.room.at
-        made.column = made.values + made.stride * made.stride
-        made.held = made.column + made.stride
+        made.columns = made.values + made.stride * made.stride
+        made.held = made.columns + 4 * made.stride
         made.where = <int *> (made.held + B.n)
         return made
 
@@ -459,21 +466,33 @@ cdef class Gram:
         """Have it be that of the face where `piece` is zero.
 
         The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
         """
-        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        cdef Py_ssize_t i, j, c, q, count, k = self.k, stride = self.stride
+        cdef double sign[4]
+        cdef bint is_held
         if self.flips > self.n:
-            self.flips = 0
+            self.flips = count = 0
+            for i in range(self.n):
+                count += piece[i] != 0
+            is_held = 2 * count > self.n
             memset(self.values, 0, stride * stride * sizeof(double))
             for i in range(k):
-                self.values[i * stride + i] = 1.0
-            memset(self.held, 0, self.n * sizeof(double))
-        for c in range(changed(piece, self.held, self.n, self.where)):
-            i = self.where[c]
-            for j in range(k):
-                self.column[j] = self.U[j * self.n + i]
-            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
-            self.flips += 1
+                self.values[i * stride + i] = not is_held
+            for i in range(self.n):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.n, self.where)
+        self.flips += count
+        for c in range(0, count, 4):
+            for q in range(4):
+                sign[q] = 0.0
+                if c + q < count:
+                    i = self.where[c + q]
+                    sign[q] = 1 - 2 * self.held[i]
+                    for j in range(k):
+                        self.columns[q * stride + j] = self.U[j * self.n + i]
+            add_gram(sign, self.columns, self.values, stride)
 
 
 cdef class Model:

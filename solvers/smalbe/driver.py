@@ -67,8 +67,7 @@ class Carry(NamedTuple):
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Task:
+class _Task(NamedTuple):
     qp: QP
     inner: QP  #: without the variables that were eliminated
     eliminated: Eliminated | None
@@ -247,7 +246,7 @@ def _compiled_loop(
         options, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
-    outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
+    outer = at.outer + tuple(map(OuterIteration._make, done))
     return Iterate(nu, g, mu, M, rho, outer, Status(status))
 
 
@@ -271,7 +270,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
             return Solution.without_point(task.qp, at.status, message), _nothing
-        if not np.isfinite(at.nu).all():
+        if not at.nu @ at.nu < np.inf:
             message = "the iterates diverged"
             return Solution.without_point(task.qp, Status.FAILED, message), _nothing
         point, Fx = _point(task, at)
@@ -326,13 +325,12 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     if not (Fx + qp.q).any():  # a minimum of the cost without any constraint
         a, z_box = np.zeros_like(a), np.zeros_like(z_box)
     letters = at.steps
-    taken = ((name, letters.count(letter)) for letter, name in STEPS.items())
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
         z_box=z_box, iterations=len(letters),
         counts={
             "P_products": problem.F.count, **problem.counts, "outer": len(at.outer),
-            **{name: count for name, count in taken if count},
+            **{STEPS[x]: letters.count(x) for x in STEPS if x in letters},
         },
         message="converged", history=task.history.columns if task.history else {},
     )  # fmt: skip

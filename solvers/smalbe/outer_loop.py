@@ -100,7 +100,7 @@ class Iterate(NamedTuple):
     @property
     def steps(self) -> str:
         """All inner steps so far, one letter each."""
-        return "".join(o.trace for o in self.outer)
+        return "".join([o.trace for o in self.outer])
 
     @property
     def stalled(self) -> bool:
