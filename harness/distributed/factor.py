@@ -232,7 +232,7 @@ class SummedFactor:
         told = np.zeros(s + len(more))
         told[self.local.at.place] = r
         told[s:] = more
-        return self.local.at.ranks.total(told)
+        return self.local.at.ranks.total(told) if told.size else told
 
 
 def local_factor(

@@ -104,6 +104,7 @@ def factors(ranks):
             np.abs(whole.backward(a) - y[k]).max(),
             abs(a @ b - s @ y),
             abs(rows.additive(s[k]) @ whole.backward(a) - s @ y),
+            abs(whole.norm(rows.additive(t[k])) ** 2 - t @ y),
         ]
     bad = part.toarray()
     if ranks.rank == 0:
