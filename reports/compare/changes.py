@@ -13,7 +13,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtri, stdtrit
 
 from harness.running.pairs import Ratio, unpaired_ratio
 from reports.compare.conditions import hardware
@@ -248,7 +248,7 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     rng = np.random.default_rng(crc32("\n".join(names).encode()))
     draws = x[rng.integers(0, n, (DRAWS, n))].mean(axis=1)
     quantile = 0.5 + COVERAGE / 2
-    wider = np.sqrt(n / (n - 1)) * t.ppf(quantile, n - 1) / norm.ppf(quantile)
+    wider = np.sqrt(n / (n - 1)) * stdtrit(n - 1, quantile) / ndtri(quantile)
     low, high = np.quantile(draws, (1 - quantile, quantile)) - mean
     value, low, high = np.exp(mean + wider * np.array([0.0, low, high]))
     return Mean(float(value), float(low), float(high), n)

@@ -27,7 +27,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from harness.running.pairs import Block, Ratio, unpaired_ratio
 from reports.compare.changes import FEWEST, Comparison, Pair
@@ -187,7 +187,7 @@ def _student(logs: Sequence[float], miss: float) -> Ratio:
     miss : probability that the interval does not hold the mean, on either side
     """
     x = np.asarray(logs)
-    half = t.ppf(1 - miss / 2, x.size - 1) * x.std(ddof=1) / np.sqrt(x.size)
+    half = stdtrit(x.size - 1, 1 - miss / 2) * x.std(ddof=1) / np.sqrt(x.size)
     return _ratio(float(x.mean()), float(half), x.size)
 
 
@@ -198,7 +198,7 @@ def _of_cell(
     assert own is not None  # there are two repeats of each
     error = max(scatter, change.error)
     repeats = min(len(change.relative_after), len(change.relative_before))
-    half = float(t.ppf(1 - miss / 2, freedom)) * error
+    half = float(stdtrit(freedom, 1 - miss / 2)) * error
     relative = _ratio(change.relative, half, repeats)
     if min(own.low, relative.low) <= 1:
         return None

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import CensoredData, ecdf, t
+from scipy.special import stdtrit
 
 from reports.statistics.intervals import COVERAGE, Interval
 
@@ -52,19 +52,18 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     late = np.isinf(times) & ~np.isnan(stopped)
     ends = np.minimum(np.where(late, stopped, times), horizon)
     censored = times > horizon
-    survival = ecdf(CensoredData.right_censored(ends, censored)).sf
-    knots = np.append(survival.quantiles, max(horizon, survival.quantiles[-1]))
-    share = np.asarray(survival.probabilities)
-    areas = np.diff(np.append(0.0, knots)) * np.append(1.0, share)
+    at = np.unique(ends)
+    at_risk = n - np.searchsorted(np.sort(ends), at)
+    solved = np.searchsorted(np.sort(ends[~censored]), at, "right")
+    solved = np.diff(np.append(0, solved))
+    survival = np.cumprod(1 - solved / at_risk)
+    knots = np.append(at, max(horizon, at[-1]))
+    areas = np.diff(np.append(0.0, knots)) * np.append(1.0, survival)
     mean = float(areas.sum())
     left = np.cumsum(areas[:0:-1])[::-1]  # ∫ of S from each knot to the horizon
-    at_risk = n - np.searchsorted(np.sort(ends), survival.quantiles)
-    known = np.sort(ends[~censored])
-    solved = np.searchsorted(known, survival.quantiles, "right")
-    solved = np.diff(np.append(0, solved))
     rest = np.maximum(at_risk - solved, 1)  # left is 0 where nobody is at risk any more
     variance = float((left**2 * solved / (at_risk * rest)).sum()) * n / (n - 1)
-    half = float(t.ppf(0.5 + COVERAGE / 2, n - 1)) * variance**0.5
+    half = float(stdtrit(n - 1, 0.5 + COVERAGE / 2)) * variance**0.5
     low, high = max(mean - half, 0.0), min(mean + half, horizon)
     return Restricted(
         mean=Interval(mean, low, high, COVERAGE, n),

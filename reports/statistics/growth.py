@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import t
+from scipy.special import stdtr, stdtrit
 
 from reports.statistics.intervals import COVERAGE, Interval, power_law
 
@@ -58,7 +58,7 @@ class Growth:
         off = np.log(n) - x.mean()
         spread = float((x - x.mean()) @ (x - x.mean()))
         error = self.scatter * np.sqrt(1 + 1 / k + off**2 / spread)
-        half = float(t.ppf(0.5 + COVERAGE / 2, k - 2) * error)
+        half = float(stdtrit(k - 2, 0.5 + COVERAGE / 2) * error)
         value = self.factor * n**self.exponent
         ends = value * np.exp(-half), value * np.exp(half)
         return Interval(float(value), float(ends[0]), float(ends[1]), COVERAGE, k)
@@ -84,14 +84,14 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
         raise ValueError("a test of growth needs four different sizes, positive values")
     law = power_law(x, y)
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
-    error = (law.high - law.low) / 2 / float(t.ppf(0.5 + COVERAGE / 2, x.size - 2))
+    error = (law.high - law.low) / 2 / float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2))
     if error * spread <= _ROUNDING:  # as of counts that are all the same
         error = 0.0
     p = law.exponent if abs(law.exponent) * spread > _ROUNDING else 0.0
     return Growth(
         exponent=p,
-        most=p + float(t.ppf(1 - LEVEL, x.size - 2)) * error,
-        p_value=float(t.sf(p / error, x.size - 2)) if error else float(p <= 0),
+        most=p + float(stdtrit(x.size - 2, 1 - LEVEL)) * error,
+        p_value=float(stdtr(x.size - 2, -p / error)) if error else float(p <= 0),
         factor=law.factor,
         scatter=error * spread,
         sizes=tuple(map(float, x)),

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import binom, t
+from scipy.special import bdtr, stdtrit
 
 COVERAGE = 0.95  #: asked for; a median of fewer than six samples cannot have it
 
@@ -49,7 +49,7 @@ def median_interval(samples: Sequence[float]) -> Interval:
 def _order(n: int) -> tuple[int, float]:
     """Choose k for n samples, and say how often the interval covers."""
     k = np.arange(1, (n + 1) // 2 + 1)
-    coverages = 1 - 2 * binom.cdf(k - 1, n, 0.5)
+    coverages = 1 - 2 * bdtr(k - 1, n, 0.5)
     best = max(int((coverages >= COVERAGE).sum()), 1)
     return best, max(float(coverages[best - 1]), 0.0)
 
@@ -89,6 +89,6 @@ def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
     p = float(X @ Y / (X @ X))
     rest = Y - Y.mean() - p * X
     error = np.sqrt(rest @ rest / (x.size - 2) / (X @ X))
-    half = float(t.ppf(0.5 + COVERAGE / 2, x.size - 2) * error)
+    half = float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2) * error)
     factor = float(np.exp(Y.mean() - p * np.log(x).mean()))
     return PowerLaw(p, p - half, p + half, factor, x.size)

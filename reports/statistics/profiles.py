@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import beta
+from scipy.special import betainccinv, betaincinv
 
 from reports.statistics.intervals import COVERAGE
 
@@ -70,8 +70,10 @@ def share(counts: ArrayLike, cases: int) -> Share:
     tail = (1 - COVERAGE) / 2
     return Share(
         value=k / cases,
-        low=np.where(k > 0, beta.ppf(tail, np.maximum(k, 1), cases - k + 1), 0.0),
-        high=np.where(k < cases, beta.isf(tail, k + 1, np.maximum(cases - k, 1)), 1.0),
+        low=np.where(k > 0, betaincinv(np.maximum(k, 1), cases - k + 1, tail), 0.0),
+        high=np.where(
+            k < cases, betainccinv(k + 1, np.maximum(cases - k, 1), tail), 1.0
+        ),
     )
 
 

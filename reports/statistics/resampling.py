@@ -20,7 +20,7 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, rankdata, t
+from scipy.special import ndtr, stdtrit
 
 from reports.statistics.intervals import COVERAGE
 
@@ -49,7 +49,7 @@ def limits(draws: Array, cases: int) -> tuple[Array, Array]:
     −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. Order is kept: a transform of the
     statistic transforms the interval.
     """
-    tail = float(norm.cdf(-_student(cases)))
+    tail = float(ndtr(-_student(cases)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
     return low, high
 
@@ -79,7 +79,7 @@ def told_apart(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
     d = logs[:, i] - logs[:, j]
     d[np.abs(d) <= 1e-12 * np.abs(logs).max()] = 0
     signs = _signs(cases)
-    tests = [_flipped(d, signs), _flipped(np.sign(d) * rankdata(abs(d), axis=0), signs)]
+    tests = [_flipped(d, signs), _flipped(np.sign(d) * _ranks(abs(d)), signs)]
     slower = np.sign(d.mean(axis=0))
     agree = np.array([np.sign(observed) == slower for observed, _ in tests])
     levels = np.array([_beaten(largest, np.abs(seen)) for seen, largest in tests])
@@ -113,6 +113,16 @@ def _flipped(scores: Array, signs: Array) -> tuple[Array, Array]:
     return unit.sum(axis=0), np.abs(signs @ unit).max(axis=1, initial=0)
 
 
+def _ranks(values: Array) -> Array:
+    """Rank every column of (cases, pairs) values; equal ones share their mean rank."""
+    ranks = np.empty_like(values)
+    for column, rank in zip(values.T, ranks.T, strict=True):
+        order = np.sort(column)
+        below, within = (order.searchsorted(column, side) for side in ("left", "right"))
+        rank[:] = (below + within + 1) / 2
+    return ranks
+
+
 def _beaten(values: Array, by: Array) -> Array:
     """Share of the values that are at least as large, but for rounding."""
     below = np.searchsorted(np.sort(values), by - 1e-9)
@@ -138,4 +148,4 @@ def _rng(cases: Sequence[str]) -> np.random.Generator:
 
 def _student(n: int) -> float:
     """Half-width, in errors of the mean as resampled, of a 95 % interval from n."""
-    return float(np.sqrt(n / (n - 1)) * t.ppf(0.5 + COVERAGE / 2, n - 1))
+    return float(np.sqrt(n / (n - 1)) * stdtrit(n - 1, 0.5 + COVERAGE / 2))

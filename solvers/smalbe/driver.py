@@ -357,11 +357,14 @@ def recovered(
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
     """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
-    qp = task.qp
-    if task.solver is not None and task.eliminated is None:
+    qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
+    if task.eliminated is not None:
+        task.problem.F.count += 1
+        G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
+    if task.solver is not None:
         bound = compiled.residual_bound(
-            qp.q, task.problem.diagonal, point.x, point.y, point.z_box, Fx,
-            qp.lb, qp.ub, qp.b, task.problem.rows.G,
+            qp.q, diagonal, point.x, point.y, point.z_box, Fx,
+            qp.lb, qp.ub, qp.b, G,
         )  # fmt: skip
         if bound <= enough:
             return bound

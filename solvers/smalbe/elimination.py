@@ -6,23 +6,28 @@ Where no bound holds x_E, stationarity in E and the equality rows that involve E
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
 
 give x_E and y as affine functions of the bounded x_I. What is left is a QP in x_I with
-the bounds and those equality rows that E does not meet. On the duals of contact
-problems E are the supports: P_EE = F_EE is the same in every load step.
+the bounds, those equality rows that E does not meet, and the Schur complement
+
+    P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I,
+
+which costs about as much to form as P_EE to factorise. On the duals of contact problems
+E are the supports: P_EE = F_EE is the same in every load step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.sparse import csr_array
 
 from harness import QP, Matrix, Solution, Vector, no_rows
-from solvers.smalbe.rows import orthonormal_rows
+from solvers.smalbe.rows import prepared_rows
 
 #: singular values of orthonormal rows, cut to E, are zero below and good above these;
 #: rows that hardly meet E would make the reduced matrix as large as they are small
@@ -35,14 +40,15 @@ class FreeBlock(NamedTuple):
     """P_EE with its Cholesky factor."""
 
     matrix: Array  #: (k, k)
-    factor: Any
+    factor: Array  #: R of P_EE = RᵀR, in the upper triangle
 
 
 class Eliminated(NamedTuple):
     """A QP in the bounded variables, and its way back."""
 
-    qp: QP  #: P is an operator; one product costs what one with the whole P does
+    qp: QP  #: P is dense
     recover: Callable[[Solution], Solution]
+    G: Array  #: (m, n) the equality rows as given
     block: FreeBlock  #: to use again where P_EE is the same
     columns: int  #: of P_EE that were factorised, 0 where the factor was known
 
@@ -51,35 +57,26 @@ class Eliminated(NamedTuple):
 class _Saddle:
     """Solves for x_E and y."""
 
-    factor: Any
+    factor: Array  #: (k, k) of P_EE, in the upper triangle
     G_E: Array  #: (r, k) of full rank
     PG: Array  #: P_EE⁻¹G_Eᵀ (k, r)
-    schur: Any  #: Cholesky factor of G_E P_EE⁻¹ G_Eᵀ
+    schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, likewise
 
     def __call__(self, top: Vector, bottom: Vector) -> tuple[Vector, Vector]:
-        w = cho_solve(self.factor, top, check_finite=False)
+        w = dpotrs(self.factor, top)[0]
         if not len(bottom):
             return w, bottom
-        y = cho_solve(self.schur, self.G_E @ w - bottom, check_finite=False)
+        y = dpotrs(self.schur, self.G_E @ w - bottom)[0]
         return w - self.PG @ y, y
 
-
-@dataclass(frozen=True, eq=False)
-class _Reduced:
-    """The matrix of the reduced problem, as an operator."""
-
-    solve: _Saddle
-    P_EI: Array
-    P_II: Array
-    G_I: Array
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        return self.P_II.shape[0], self.P_II.shape[0]
-
-    def __matmul__(self, v: Vector) -> Vector:
-        x_E, y = self.solve(-(self.P_EI @ v), -(self.G_I @ v))
-        return np.asarray(self.P_II @ v + self.P_EI.T @ x_E + self.G_I.T @ y)
+    def complement(self, P_EI: Array, P_II: Array, G_I: Array) -> Array:
+        """Return the Schur complement (n − k, n − k) of the saddle point matrix."""
+        W = dtrtrs(self.factor, P_EI, trans=1)[0]
+        S: Array = P_II - W.T @ W
+        if len(G_I):
+            Z = dtrtrs(self.schur, self.PG.T @ P_EI - G_I, trans=1)[0]
+            S += Z.T @ Z
+        return S
 
 
 def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
@@ -93,11 +90,11 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     free = np.isinf(qp.lb) & np.isinf(qp.ub)
     if free.all() or not free.any() or not qp.is_explicit or qp.h.size:
         return None
-    rows = orthonormal_rows(qp.A, qp.b)
+    rows = prepared_rows(qp.A, qp.b)
     block = _factorised(_block(qp.P, free, free), known)
     if block is None or not rows.consistent:
         return None
-    left, size, _ = np.linalg.svd(rows.C[:, free])
+    left, size, _ = np.linalg.svd(rows.C[:, free], full_matrices=False)
     if ((size > ZERO) & (size < GOOD)).any():
         return None
     rank = int((size >= GOOD).sum())
@@ -110,7 +107,7 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     G_I, P_EI = G[:, ~free], _block(qp.P, free, ~free)
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
     reduced = QP(
-        P=_Reduced(solve, P_EI, _block(qp.P, ~free, ~free), G_I),
+        P=solve.complement(P_EI, _block(qp.P, ~free, ~free), G_I),
         q=qp.q[~free] + P_EI.T @ x_0 + G_I.T @ y_0,
         A=N[:, ~free], b=others.T @ Cx, G=no_rows(int((~free).sum())), h=np.zeros(0),
         lb=qp.lb[~free], ub=qp.ub[~free],
@@ -125,24 +122,45 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
         return replace(s, x=x, y=y, z_box=z_box)
 
     columns = 0 if known is block else int(free.sum())
-    return Eliminated(reduced, recover, block, columns)
+    return Eliminated(reduced, recover, rows.G, block, columns)
 
 
 def _factorised(P_EE: Array, known: FreeBlock | None) -> FreeBlock | None:
     if known is not None and np.array_equal(known.matrix, P_EE):
         return known
     try:
-        return FreeBlock(P_EE, cho_factor(P_EE))
+        return FreeBlock(P_EE, _cholesky(P_EE))
     except LinAlgError:  # singular: stationarity does not determine x_E
         return None
 
 
+def _cholesky(M: Array) -> Array:
+    """Return R of M = RᵀR (k, k) in the upper triangle; below is what was there."""
+    factor, info = dpotrf(M.T, clean=False)
+    if info:
+        raise LinAlgError("not positive definite")
+    return np.asarray(factor)
+
+
 def _saddle(block: FreeBlock, G_E: Array) -> _Saddle:
-    PG = cho_solve(block.factor, G_E.T)
-    return _Saddle(block.factor, G_E, PG, cho_factor(G_E @ PG) if len(G_E) else None)
+    if not len(G_E):
+        return _Saddle(block.factor, G_E, G_E.T, np.zeros((0, 0)))
+    PG = dpotrs(block.factor, G_E.T)[0]
+    return _Saddle(block.factor, G_E, PG, _cholesky(G_E @ PG))
 
 
 def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
-    if isinstance(P, np.ndarray):
-        return P[np.ix_(rows, columns)].astype(float)
-    return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
+    """Return that block of a symmetric P, which looks at P where that is dense."""
+    if not isinstance(P, np.ndarray):
+        return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
+    at, of = _as_slice(columns), _as_slice(rows)
+    if isinstance(at, slice) and isinstance(of, slice):
+        return P[at, of].astype(float, copy=False).T  # as LAPACK stores it
+    return P[np.ix_(columns, rows)].astype(float, copy=False).T
+
+
+def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
+    """Give components without a gap as a slice."""
+    at = np.flatnonzero(chosen)
+    whole = at.size and at[-1] - at[0] == at.size - 1
+    return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen

@@ -135,7 +135,7 @@ def smalbe(
 
     def precise(here: Point, face: Face) -> bool:
         size, coarse = face.projected_norm, constants.eta * b_size
-        if len(C) and size < coarse and size < at.M * _norm(C @ here.x):
+        if len(C) and size < coarse and size < at.M * problem.rows.violation(here.x):
             return True
         return small(here, face)
 

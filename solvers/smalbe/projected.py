@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from harness import QP, Matrix, Vector
 from harness.distributed.vectors import DistributedVector
 from solvers.common.conversion import boxed
-from solvers.smalbe import compiled
+from solvers.smalbe import compiled, kernels
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
 from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
@@ -87,9 +87,9 @@ class Projected:
         C = self.rows.C
         Cv = C @ v
         Fv = self.F(v - C.T @ Cv)
-        shift = rho * Cv - (C @ Fv) / self.spectrum.norm
-        Hv: Vector = Fv / self.spectrum.norm + C.T @ shift
-        return Hv
+        scale = 1 / self.spectrum.norm
+        shift = kernels.combined(rho, Cv, -scale, C @ Fv)
+        return kernels.combined(scale, Fv, 1.0, C.T @ shift)
 
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.

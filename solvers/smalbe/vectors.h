@@ -4,6 +4,7 @@
    decided when the module is loaded. Selections are written as expressions, so that the
    compiler can do four components at once. */
 
+#include <limits.h>
 #include <math.h>
 #include <string.h>
 
@@ -13,22 +14,11 @@
 #define TWICE
 #endif
 
+#define INLINE static inline __attribute__((always_inline))
 #define ROUNDING (4 * 2.220446049250313e-16) /* relative error of a few operations */
 
 typedef const double *restrict in;
 typedef double *restrict out;
-
-/* y = s F v by the rows of F (n, n). */
-TWICE static void sparse_product(const int *restrict indptr, const int *restrict indices,
-                                 in data, double s, in v, out y, Py_ssize_t n)
-{
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double total = 0;
-        for (int k = indptr[i]; k < indptr[i + 1]; k++)
-            total += data[k] * v[indices[k]];
-        y[i] = s * total;
-    }
-}
 
 /* Four components at once; what the compiler makes of the loops below on its own is not
    as fast where several sums are taken in one pass. */
@@ -36,9 +26,160 @@ typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 #define FOUR(a) (*(const four *) (a))
 #define EACH(s) ((four){(s), (s), (s), (s)})
 
-static inline __attribute__((always_inline)) double total(four t)
+INLINE double total(four t)
 {
     return (t[0] + t[1]) + (t[2] + t[3]);
+}
+
+#define BLOCK 256 /* components that stay in the cache from one loop to the next */
+
+/* A sparse symmetric matrix F (n, n): by its rows, or, where `count` is not zero, by its
+   diagonals 0, o₁, o₂, … above: `diagonals` (count, n) has F[i, i + o] at i. */
+typedef struct {
+    Py_ssize_t n, count;
+    const int *indptr, *indices;
+    const Py_ssize_t *offset;
+    const double *data, *diagonals;
+} sparse;
+
+enum { MOST_DIAGONALS = 16 };
+
+/* y = s (f₁w₁ + f₂w₂ + …), componentwise. */
+INLINE void
+sum_of_terms(const double *const *f, const double *const *w, Py_ssize_t terms, double s,
+             out y, Py_ssize_t n)
+{
+    Py_ssize_t i = 0;
+    for (; i + 16 <= n; i += 16) {
+        four a = EACH(0), b = a, c = a, d = a;
+        for (Py_ssize_t t = 0; t < terms; t++) {
+            in g = f[t] + i, u = w[t] + i;
+            a += FOUR(g) * FOUR(u);
+            b += FOUR(g + 4) * FOUR(u + 4);
+            c += FOUR(g + 8) * FOUR(u + 8);
+            d += FOUR(g + 12) * FOUR(u + 12);
+        }
+        *(four *) (y + i) = EACH(s) * a;
+        *(four *) (y + i + 4) = EACH(s) * b;
+        *(four *) (y + i + 8) = EACH(s) * c;
+        *(four *) (y + i + 12) = EACH(s) * d;
+    }
+    for (; i < n; i++) {
+        double sum = 0;
+        for (Py_ssize_t t = 0; t < terms; t++)
+            sum += f[t][i] * w[t][i];
+        y[i] = s * sum;
+    }
+}
+
+/* y = s F v of the rows from first to last by diagonals; y begins at row first. */
+INLINE void
+rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v,
+                  out y)
+{
+    const double *f[2 * MOST_DIAGONALS], *w[2 * MOST_DIAGONALS];
+    Py_ssize_t from[2 * MOST_DIAGONALS], to[2 * MOST_DIAGONALS];
+    Py_ssize_t terms = 0, size = last - first, missing = 0;
+    for (Py_ssize_t d = 1 - F->count; d < F->count; d++) {
+        Py_ssize_t o = F->offset[d < 0 ? -d : d], shift = d < 0 ? -o : o;
+        const double *whole = F->diagonals + (d < 0 ? -d : d) * F->n;
+        Py_ssize_t least = shift < 0 ? o : 0, most = shift < 0 ? F->n : F->n - o;
+        from[terms] = least > first ? least - first : 0;
+        to[terms] = most < last ? most - first : size;
+        if (from[terms] >= to[terms])
+            continue;
+        missing |= from[terms] | (size - to[terms]);
+        f[terms] = whole + first + (shift < 0 ? shift : 0);
+        w[terms++] = v + first + shift;
+    }
+    if (missing) { /* near the first row and the last */
+        memset(y, 0, size * sizeof(double));
+        for (Py_ssize_t t = 0; t < terms; t++)
+            for (Py_ssize_t j = from[t]; j < to[t]; j++)
+                y[j] += s * f[t][j] * w[t][j];
+        return;
+    }
+    switch (terms) { /* the number of terms known, the loop over them is none */
+    case 3: sum_of_terms(f, w, 3, s, y, size); break;
+    case 5: sum_of_terms(f, w, 5, s, y, size); break;
+    case 9: sum_of_terms(f, w, 9, s, y, size); break;
+    default: sum_of_terms(f, w, terms, s, y, size);
+    }
+}
+
+/* y = s F v of the rows from first to last; y begins at row first. */
+INLINE void
+some_rows(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v, out y)
+{
+    if (F->count) {
+        rows_by_diagonals(F, first, last, s, v, y);
+        return;
+    }
+    const int *restrict indptr = F->indptr, *restrict indices = F->indices;
+    in data = F->data;
+    for (Py_ssize_t i = first; i < last; i++) {
+        double sum = 0;
+        for (int k = indptr[i]; k < indptr[i + 1]; k++)
+            sum += data[k] * v[indices[k]];
+        y[i - first] = s * sum;
+    }
+}
+
+/* y = s F v. */
+TWICE static void sparse_product(const sparse *F, double s, in v, out y)
+{
+    for (Py_ssize_t i = 0; i < F->n; i += BLOCK)
+        some_rows(F, i, i + BLOCK < F->n ? i + BLOCK : F->n, s, v, y + i);
+}
+
+/* Hp = s F p; returns pᵀHp. */
+TWICE static double sparse_curvature(const sparse *F, double s, in p, out Hp)
+{
+    double curvature = 0;
+    for (Py_ssize_t i = 0; i < F->n; i += BLOCK) {
+        Py_ssize_t last = i + BLOCK < F->n ? i + BLOCK : F->n;
+        some_rows(F, i, last, s, p, Hp + i);
+        for (Py_ssize_t j = i; j < last; j++)
+            curvature += p[j] * Hp[j];
+    }
+    return curvature;
+}
+
+/* Find the diagonals of F by its rows: their offsets, as many as there are, 0 where more
+   than `most`. slot (n,) is room. */
+static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
+                                 signed char *slot)
+{
+    Py_ssize_t count = 1;
+    memset(slot, 0, F->n);
+    offset[0] = 0, slot[0] = 1;
+    for (Py_ssize_t i = 0; i < F->n; i++)
+        for (int k = F->indptr[i]; k < F->indptr[i + 1]; k++) {
+            Py_ssize_t o = F->indices[k] - i;
+            if (o <= 0 || slot[o])
+                continue;
+            if (count >= most)
+                return 0;
+            slot[o] = 1;
+            offset[count++] = o;
+        }
+    for (Py_ssize_t c = 1; c < count; c++) /* in ascending order */
+        for (Py_ssize_t d = c; d > 1 && offset[d] < offset[d - 1]; d--) {
+            Py_ssize_t o = offset[d];
+            offset[d] = offset[d - 1], offset[d - 1] = o;
+        }
+    for (Py_ssize_t c = 0; c < count; c++)
+        slot[offset[c]] = (signed char) c;
+    return count;
+}
+
+/* diagonals (count, n), zeros at first, with the slots that `find_diagonals` left. */
+static void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
+{
+    for (Py_ssize_t i = 0; i < F->n; i++)
+        for (int k = F->indptr[i]; k < F->indptr[i + 1]; k++)
+            if (F->indices[k] >= i)
+                diagonals[slot[F->indices[k] - i] * F->n + i] += F->data[k];
 }
 
 /* y = s F v for symmetric F (n, n), of which the lower triangle is read, four rows in
@@ -172,39 +313,98 @@ TWICE static void add_combination(double s, in U, in c, out y, Py_ssize_t k,
     }
 }
 
-#define BLOCK 256 /* components that stay in the cache from one loop to the next */
 typedef long long __attribute__((may_alias)) ordered; /* as doubles ≥ 0 are */
+typedef long long __attribute__((vector_size(32))) mask;
 
-/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. */
-TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
-                          out told)
+#define CHOSEN(m, a, b) ((four) (((m) & (mask) (a)) | (~(m) & (mask) (b))))
+#define ABSOLUTE(a) \
+    ((four) ((mask) (a) & (mask){LLONG_MAX, LLONG_MAX, LLONG_MAX, LLONG_MAX}))
+
+/* What a step x - αp meets in a block: the α at which it is on the first bound, where
+   that is below `least`, pᵀHp and gᵀp, which are added to told[3] and told[2].
+
+   Few blocks have a component that is on its bound before the first of those before:
+   whether one is needs no division. */
+INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
+                            double least, out told)
 {
-    double curvature = 0, slope = 0, room[BLOCK], feasible = INFINITY;
-    ordered least = *(ordered *) &feasible;
-    for (Py_ssize_t first = 0; first < n; first += BLOCK) {
-        Py_ssize_t size = n - first < BLOCK ? n - first : BLOCK;
-        for (Py_ssize_t j = 0; j < size; j++) {
-            Py_ssize_t i = first + j;
-            double bound = p[i] > 0 ? lower[i] : upper[i];
-            double to = (x[i] - bound) / p[i];
-            to = to > 0 ? to : 0;
-            room[j] = p[i] != 0 ? to : INFINITY;
-            curvature += p[i] * Hp[i];
-            slope += g[i] * p[i];
+    four zero = EACH(0), curvature = zero, slope = zero, most = EACH(least);
+    mask nearer = (mask) zero;
+    Py_ssize_t whole = n & ~(Py_ssize_t) 3;
+    for (Py_ssize_t j = 0; j < whole; j += 4) {
+        four q = FOUR(p + j), to = FOUR(x + j);
+        four room = to - FOUR(lower + j);
+        if (upper) {
+            room = CHOSEN(q > zero, room, FOUR(upper + j) - to);
+            nearer |= (room <= most * ABSOLUTE(q)) & (q != zero);
+        } else {
+            nearer |= (room <= most * q) & (q > zero);
         }
-        for (Py_ssize_t j = 0; j < size; j++) {
-            ordered to = *(ordered *) (room + j);
-            least = to < least ? to : least;
-        }
+        curvature += q * FOUR(Hp + j);
+        slope += q * FOUR(g + j);
     }
-    memcpy(&feasible, &least, sizeof feasible);
-    told[0] = curvature > 0 ? slope / curvature : INFINITY;
-    told[1] = feasible;
-    told[2] = slope;
-    told[3] = curvature;
+    told[3] += total(curvature);
+    told[2] += total(slope);
+    for (Py_ssize_t j = whole; j < n; j++) {
+        told[3] += p[j] * Hp[j];
+        told[2] += g[j] * p[j];
+    }
+    if (!(nearer[0] | nearer[1] | nearer[2] | nearer[3]) && whole == n)
+        return least;
+    double room[BLOCK];
+    ordered first = *(ordered *) &least;
+    for (Py_ssize_t j = 0; j < n; j++) {
+        double bound = p[j] > 0 ? lower[j] : upper ? upper[j] : INFINITY;
+        double to = (x[j] - bound) / p[j];
+        to = to > 0 ? to : 0;
+        room[j] = p[j] != 0 ? to : INFINITY;
+    }
+    for (Py_ssize_t j = 0; j < n; j++) {
+        ordered to = *(ordered *) (room + j);
+        first = to < first ? to : first;
+    }
+    memcpy(&least, &first, sizeof least);
+    return least;
 }
 
-static inline __attribute__((always_inline)) void
+/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. With F, Hp = s F p
+   is found first, in the same go through memory. */
+INLINE void find_lengths(const sparse *F, double s, in x, in g, in p, out Hp, in lower,
+                         in upper, Py_ssize_t n, out told)
+{
+    double feasible = INFINITY;
+    told[2] = told[3] = 0;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        if (F)
+            some_rows(F, i, i + size, s, p, Hp + i);
+        feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
+                                 upper ? upper + i : NULL, size, feasible, told);
+    }
+    told[0] = told[3] > 0 ? told[2] / told[3] : INFINITY;
+    told[1] = feasible;
+}
+
+/* upper : NULL where no component has a bound above */
+TWICE static void lengths(in x, in g, in p, out Hp, in lower, in upper, Py_ssize_t n,
+                          out told)
+{
+    if (upper)
+        find_lengths(NULL, 1, x, g, p, Hp, lower, upper, n, told);
+    else
+        find_lengths(NULL, 1, x, g, p, Hp, lower, NULL, n, told);
+}
+
+TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, in p, out Hp,
+                                 in lower, in upper, out told)
+{
+    if (upper)
+        find_lengths(F, s, x, g, p, Hp, lower, upper, F->n, told);
+    else
+        find_lengths(F, s, x, g, p, Hp, lower, NULL, F->n, told);
+}
+
+INLINE void
 move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -219,7 +419,7 @@ move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize
 }
 
 /* Adds to told, which begins as zeros. */
-static inline __attribute__((always_inline)) void
+INLINE void
 split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ssize_t n,
             out told)
 {
@@ -259,21 +459,67 @@ TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out
     split_block(x, g, lower, upper, tau, phi, free, n, told);
 }
 
-/* What `move` and `split` do, in one go through memory; told[3] = φᵀHp. */
+INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upper,
+                       double tau, out phi, out free, Py_ssize_t n, out told)
+{
+    four zero = EACH(0), phi_square = zero, beta_square = zero, reduced = zero;
+    four phi_Hp = zero, length = EACH(alpha), rounding = EACH(ROUNDING), t = EACH(tau);
+    Py_ssize_t whole = n & ~(Py_ssize_t) 3;
+    for (Py_ssize_t i = 0; i < whole; i += 4) {
+        four at = FOUR(x + i), low = FOUR(lower + i), step = length * FOUR(p + i);
+        four noise = rounding * (ABSOLUTE(at) + ABSOLUTE(step));
+        four to = at - step, push = FOUR(g + i) - length * FOUR(Hp + i);
+        mask at_lower = (to - low <= noise) & (step >= zero), inside, leads;
+        if (upper)
+            to = CHOSEN((FOUR(upper + i) - to <= noise) & (step <= zero),
+                        FOUR(upper + i), to);
+        to = CHOSEN(at_lower, low, to);
+        inside = to > low;
+        leads = (push < zero) | inside;
+        if (upper) {
+            mask below = to < FOUR(upper + i);
+            leads = ((push < zero) & below) | ((push > zero) & inside);
+            inside &= below;
+        }
+        four f = (four) ((mask) push & inside);
+        four b = (four) ((mask) push & leads & ~inside);
+        four cut = f, most = t * (to - low);
+        if (upper) {
+            four least = t * (to - FOUR(upper + i));
+            cut = CHOSEN(f > least, f, least);
+        }
+        cut = CHOSEN(cut < most, cut, most);
+        *(four *) (x + i) = to;
+        *(four *) (g + i) = push;
+        *(four *) (phi + i) = f;
+        *(four *) (free + i) = (four) ((mask) EACH(1) & inside);
+        phi_square += f * f;
+        beta_square += b * b;
+        reduced += cut * f;
+        phi_Hp += f * FOUR(Hp + i);
+    }
+    told[0] = total(phi_square);
+    told[1] = total(beta_square);
+    told[2] = total(reduced);
+    told[3] = total(phi_Hp);
+    for (Py_ssize_t i = whole; i < n; i++) {
+        double above = upper ? upper[i] : INFINITY;
+        move_block(alpha, x + i, g + i, p + i, Hp + i, lower + i, &above, 1);
+        split_block(x + i, g + i, lower + i, &above, tau, phi + i, free + i, 1, told);
+        told[3] += phi[i] * Hp[i];
+    }
+}
+
+/* What `move` and `split` do, in one go through memory; told[3] = φᵀHp.
+
+   upper : NULL where no component has a bound above */
 TWICE static void advance(double alpha, out x, out g, in p, in Hp, in lower, in upper,
                           double tau, out phi, out free, Py_ssize_t n, out told)
 {
-    told[0] = told[1] = told[2] = told[3] = 0;
-    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
-        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
-        double phi_Hp = 0;
-        move_block(alpha, x + i, g + i, p + i, Hp + i, lower + i, upper + i, size);
-        split_block(x + i, g + i, lower + i, upper + i, tau, phi + i, free + i, size,
-                    told);
-        for (Py_ssize_t j = i; j < i + size; j++)
-            phi_Hp += phi[j] * Hp[j];
-        told[3] += phi_Hp;
-    }
+    if (upper)
+        advance_by(alpha, x, g, p, Hp, lower, upper, tau, phi, free, n, told);
+    else
+        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, phi, free, n, told);
 }
 
 /* s = x + s - from, where x + s is in the box up to rounding, and on bounds that it
@@ -288,11 +534,31 @@ TWICE static void within(in x, in from, in lower, in upper, out s, Py_ssize_t n)
     }
 }
 
-/* p = z - γp. */
-TWICE static void turn(in z, double gamma, out p, Py_ssize_t n)
+/* p = z - γp; returns zᵀp. */
+TWICE static double turn(in z, double gamma, out p, Py_ssize_t n)
 {
-    for (Py_ssize_t i = 0; i < n; i++)
+    double slope = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
         p[i] = z[i] - gamma * p[i];
+        slope += z[i] * p[i];
+    }
+    return slope;
+}
+
+/* x = x - αp and g = g - αHp on a face without bounds, and φ there; told = ‖φ‖², φᵀHp. */
+TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in free,
+                                 out phi, Py_ssize_t n, out told)
+{
+    double phi_square = 0, phi_Hp = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        x[i] -= alpha * p[i];
+        g[i] -= alpha * Hp[i];
+        phi[i] = free[i] * g[i];
+        phi_square += phi[i] * phi[i];
+        phi_Hp += phi[i] * Hp[i];
+    }
+    told[0] = phi_square;
+    told[1] = phi_Hp;
 }
 
 /* S = S + s vvᵀ (k, k), k a multiple of four. */

@@ -4,9 +4,10 @@ An interpreter of its own takes each worker half a second of CPU time for import
 than most tests have it do. What `Server.popen` gives in its place is a process like any
 other: it has its own memory, signals and exit code, its files, environment and limits
 are those that it is started with, the sub-reaper above it is the one of
-`harness.processes.reaper`, and that one's parent is the process that asked. Only what
-an interpreter does before it runs a program is left out. Where that is tested, or
-`/proc/PID/environ` is, processes are started as users start them.
+`harness.processes.reaper`, and that one's parent is the process that asked. Its command
+line and environment are to be read in /proc, see proc(5). Only what an interpreter does
+before it runs a program is left out. Where that is tested, processes are started as
+users start them.
 
 Run as a program with a socket and modules to import, it is the server.
 """
@@ -22,7 +23,7 @@ import subprocess
 import sys
 import time
 import traceback
-from ctypes import CDLL
+from ctypes import CDLL, memmove, memset
 from importlib import import_module
 from pathlib import Path
 from threading import Lock
@@ -33,6 +34,8 @@ from harness.processes import reaper
 LONGEST = 2**20  #: bytes of a request
 LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIMIT_"]
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+ARGUMENTS, ENVIRONMENT = 48, 50  #: fields of /proc/PID/stat: where they lie in memory
+ROOM = 2**16 * " "  #: for longer ones than the server was started with
 
 #: what is loaded for plug-ins, which start as ``python -P FILE``
 PLUGINS = ("mortarbench.cli.main", "mortarbench.processes")
@@ -56,6 +59,7 @@ class Forks:
     TimeoutExpired = subprocess.TimeoutExpired
 
     def __init__(self):
+        self._env = os.environ | ONE_THREAD | {"ROOM": ROOM}
         self._servers = {}
         self._lock = Lock()
 
@@ -67,7 +71,7 @@ class Forks:
         modules = OURS if args[9] == "-m" else PLUGINS
         with self._lock:
             if modules not in self._servers:
-                self._servers[modules] = Server(modules)
+                self._servers[modules] = Server(modules, self._env)
             return Forked(self._servers[modules], args[4:], **how)
 
     def close(self):
@@ -78,14 +82,14 @@ class Forks:
 class Server:
     """The parent's side of an interpreter that has loaded some modules."""
 
-    def __init__(self, modules):
+    def __init__(self, modules, env):
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             fd = theirs.fileno()
             self._process = subprocess.Popen(
-                [sys.executable, "-P", __file__, str(fd), *modules],
+                [sys.executable, "-P", __file__, str(fd), ROOM, *modules],
                 pass_fds=[fd],
-                env=os.environ | ONE_THREAD,
+                env=env,
             )
 
     def close(self):
@@ -167,6 +171,7 @@ def become(request, fds):
     os.chdir(request["cwd"])
     os.environ.clear()
     os.environ.update(request["env"])
+    show(ENVIRONMENT, [f"{name}={value}" for name, value in request["env"].items()])
     os.sched_setaffinity(0, request["cpus"])
     for limit, values in zip(LIMITS, request["limits"], strict=True):
         resource.setrlimit(limit, values)
@@ -174,12 +179,25 @@ def become(request, fds):
         os.dup2(fd, at)
         os.close(fd)
     cpu, _, _, *command = request["arguments"]
+    arguments = [cpu, *map(str, fds[3:]), *command]
+    show(ARGUMENTS, [sys.executable, "-I", "-S", reaper.__file__, *arguments])
     os.execvp = run
-    reaper.main([cpu, *map(str, fds[3:]), *command])
+    reaper.main(arguments)
+
+
+def show(field, texts):
+    """Have /proc tell of this process what it would after execve(2)."""
+    stat = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    start, end = map(int, stat[field - 3 : field - 1])
+    block = b"".join(os.fsencode(text) + b"\0" for text in texts)
+    assert len(block) <= end - start, "more than the server has room for"
+    memset(start, 0, end - start)
+    memmove(start, block, len(block))
 
 
 def run(_, command):
     """Do what python does with ``-P FILE ARGUMENT…`` or ``-P -m MODULE ARGUMENT…``."""
+    show(ARGUMENTS, command)
     sys.argv = command[2:]
     try:
         if sys.argv[0] == "-m":
@@ -205,7 +223,7 @@ def end_well():
 
 
 if __name__ == "__main__":
-    _, own, *loaded = sys.argv
+    _, own, _room, *loaded = sys.argv
     for module in loaded:
         import_module(module)
     gc.freeze()  # pages that no collection writes to stay shared

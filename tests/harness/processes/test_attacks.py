@@ -123,6 +123,7 @@ def beside_a_witness(tmp_path_factory):
         bench = Bench(tmp_path_factory.mktemp("attacks"))
         assert bench("witness").verdict is Verdict.VERIFIED
         alone = left(name)
+        assert len(alone) == 2  # worker, sub-reaper
 
         def measured_beside(attacker, time_limit):
             patch.setenv("ATTACKED", name)

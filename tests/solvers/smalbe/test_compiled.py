@@ -67,6 +67,33 @@ def test_a_product_is_the_product_and_is_counted(seed, kind):
     assert P.count == 2
 
 
+@pytest.mark.parametrize("offsets", [(), (1,), (1, 2), (1, 40), (3, 299), (1, 7, 8, 9)])
+@pytest.mark.parametrize("n", [1, 5, 16, 300, 777])
+def test_a_product_by_diagonals_is_the_product(offsets, n):
+    """With all rows short of some diagonal, unsorted entries, and entries in parts."""
+    rng = np.random.default_rng([n, *offsets])
+    P = np.diag(rng.standard_normal(n))
+    for o in (o for o in offsets if o < n):
+        part = np.diag(rng.standard_normal(n - o), o)
+        P += part + part.T
+    i, j = np.nonzero(P)
+    twice = rng.permutation(np.r_[: i.size, : i.size])
+    halves = csr_array((P[i, j][twice] / 2, (i[twice], j[twice])), shape=(n, n))
+    told = csr_array((n, n))
+    told.data = np.repeat(halves.data / 2, 2)
+    told.indices, told.indptr = np.repeat(halves.indices, 2), 2 * halves.indptr
+    v = rng.standard_normal(n)
+
+    for M in (halves, told):
+        assert compiled.Product(M, n)(v) == pytest.approx(P @ v, rel=1e-12, abs=1e-12)
+
+
+def test_a_product_with_fewer_entries_than_rows():
+    P = csr_array(([2.0, 2.0], ([0, 4], [4, 0])), shape=(5, 5))
+
+    assert compiled.Product(P, 5)(np.arange(1.0, 6)).tolist() == [10, 0, 0, 0, 2]
+
+
 def test_a_product_of_another_length_is_refused():
     class Short(Operator):
         def __matmul__(self, v):

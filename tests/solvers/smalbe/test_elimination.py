@@ -66,6 +66,21 @@ def test_the_reduced_matrix_is_the_hessian_along_optimal_free_variables(dual):
     assert dense == pytest.approx(dense.T)
 
 
+def test_the_order_of_the_variables_does_not_matter(dual):
+    """Free ones one after another, of which P is looked at, and scattered ones."""
+    qp = dual(314159, apart=1)
+    order = np.random.default_rng(577215).permutation(24)
+    mixed = replace(
+        qp, P=qp.P[np.ix_(order, order)], q=qp.q[order], A=qp.A[:, order],
+        lb=qp.lb[order],
+    )  # fmt: skip
+    one, other = eliminate_free(qp).qp, eliminate_free(mixed).qp
+    bounded = order[order >= 12] - 12
+
+    assert other.P == pytest.approx(one.P[np.ix_(bounded, bounded)])
+    assert other.q == pytest.approx(one.q[bounded])
+
+
 def test_the_factor_is_used_again_only_for_the_same_block(dual):
     qp = dual(271828)
     first = eliminate_free(qp)
