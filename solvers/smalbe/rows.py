@@ -643,12 +643,21 @@ def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
 
 def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
     """Do what `orthonormal_rows` does, compiled."""
+    if not e.size:
+        none, n = np.zeros((0, G.shape[1])), G.shape[1]
+        return DenseRows(
+            none, none, 0.0, 1.0, np.zeros(n), True, _themselves, np.zeros((0, 0))
+        )
     found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e))
     dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
     multipliers = partial(compiled.multipliers, e.size, *triangle)
     return DenseRows(
         dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
     )
+
+
+def _themselves(a: Vector) -> Vector:
+    return a
 
 
 def as_dense(G: Matrix) -> NDArray[np.float64]:
