@@ -58,9 +58,10 @@ def emitted(name: str = CASE) -> None:
 
     ranks.comm.Barrier()
     start = time.perf_counter()
-    made = case.family.emitted(case.form, case.params, ranks)
-    if made is None:
+    emit = case.family.emission(case.form, case.params)
+    if emit is None:
         raise SystemExit(f"{name}: ranks cannot emit it")
+    made = emit(ranks)
     if ranks.rank == 0:
         print(f"{name}: {made.variables} multipliers, {ranks.size} ranks")
     told("emit", start)

@@ -179,6 +179,17 @@ def unbuilt(name: object, e: BaseException) -> str:
     return " ".join(f"{name} could not be built: {why}".split())
 
 
+def emitted_by_ranks(name: CaseId) -> bool:
+    """Whether ranks can emit the QP of a case, each its share; see `Family.emission`.
+
+    A family that fails to say so does it when it builds, too.
+    """
+    try:
+        return name.family.emission(name.form, name.params) is not None
+    except Exception:  # the family's code
+        return False
+
+
 def match(pattern: str, names: Iterable[str]) -> list[str]:
     """Keep the canonical names that the shell glob `pattern` matches."""
     return [name for name in names if fnmatchcase(name, pattern)]

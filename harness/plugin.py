@@ -186,13 +186,13 @@ class Family(ABC):
         """
         return None
 
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of what `build` would emit, for a solve on all.
+    def emission(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Ranks], Emitted] | None:
+        """Say how ranks make their shares of what `build` would emit, complete params.
 
-        Called by all ranks, with complete params. None, on all of them, where that is
-        not built: one process emits the whole then.
+        All ranks call what is returned. None where that is not built: one process emits
+        the whole then. Neither needs MPI to be there, nor builds anything yet.
         """
         return None
 
@@ -237,6 +237,12 @@ class _Offered(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         finer: Mapping[str, Value] | None = self._own("refined")(params)
         return finer
+
+    def emission(
+        self, form: str, params: Mapping[str, Value]
+    ) -> Callable[[Ranks], Emitted] | None:
+        emit: Callable[[Ranks], Emitted] | None = self._own("emission")(form, params)
+        return emit
 
     def _own(self, method: str) -> Any:
         return getattr(self._offered, method, getattr(super(), method))

@@ -16,7 +16,7 @@ from harness import Fields, Record, Residuals, Solution, Verdict
 from harness.distributed.mpi import ranks_asked
 from harness.environment.environment import digest
 from harness.errors import InputError
-from harness.names import assemble
+from harness.names import assemble, emitted_by_ranks, parse
 from harness.processes.measurement import measured_once, single_worker
 from harness.record import finite
 from harness.registry import PluginFile, SolverSpec, options_of, resolve
@@ -29,8 +29,8 @@ from mortarbench.arguments import (
     tolerance,
     writable,
 )
-from mortarbench.case import Case, build, built_case
-from mortarbench.registries import Plugins, Registries, one_thread
+from mortarbench.case import Case, built_case
+from mortarbench.registries import Plugins, Registries, known, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
@@ -205,8 +205,8 @@ def solve(
     """
     tolerance(tol)
     if isinstance(case, str):
-        case = build(case, plugins=plugins)
-        registries = case.registries
+        registries = known(plugins)
+        case = Case(id=parse(case, registries.families), registries=registries)
     else:
         registries = case.registries
         held = {file.resolved() for file in registries.files}
@@ -262,10 +262,11 @@ def answers_of(
             repeat=0,
             environment=environment,
         )
+        emits = ranks > 1 and emitted_by_ranks(case.id)
         with one_thread(), redirect_stdout(stderr):  # whatever the family prints
             record, solution = measured_once(
-                worker, case.made, record, registries.reference,
-                evaluates=registries.hold_own_code_only(),
+                worker, lambda: case.made, record, registries.reference,
+                emits=emits, evaluates=emits and registries.hold_own_code_only(),
             )  # fmt: skip
         return Answer(
             case=case, record=record, solution=solution, spec=spec, defaults=defaults

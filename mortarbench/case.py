@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,29 @@ class Case:
     """One QP of one problem, under its canonical name."""
 
     id: CaseId  #: its name, in parts
-    made: plugin.Case  #: what the family made
-    registries: Registries  #: those that it was built with
+    registries: Registries  #: those that it is built with
+
+    @cached_property
+    def made(self) -> plugin.Case:
+        """What the family makes, once it is asked for.
+
+        Raises
+        ------
+        InputError
+            As `build`.
+
+        """
+        origin = self.registries.origins.get(self.id.family.name)
+        try:
+            with one_thread():
+                return self.id.build(self.registries.reference)
+        except InputError:
+            raise
+        except (Exception, SystemExit) as e:
+            if origin is None and not isinstance(e, MemoryError):
+                raise
+            text = unbuilt(self.id, e)
+            raise InputError(f"{origin}: {text}" if origin else text) from e
 
     @property
     def name(self) -> str:
@@ -107,6 +129,8 @@ class Case:
         return path
 
     def __repr__(self) -> str:
+        if "made" not in vars(self):
+            return f"<Case {self.name}, not built>"
         sizes = ", ".join(f"{n} {what}" for what, n in self.qp.sizes.items())
         return f"<Case {self.name}: {sizes}>"
 
@@ -135,15 +159,6 @@ def built_case(case: CaseId, registries: Registries) -> Case:
         For both, and what the family itself refuses.
 
     """
-    origin = registries.origins.get(case.family.name)
-    try:
-        with one_thread():
-            made = case.build(registries.reference)
-    except InputError:
-        raise
-    except (Exception, SystemExit) as e:
-        if origin is None and not isinstance(e, MemoryError):
-            raise
-        text = unbuilt(case, e)
-        raise InputError(f"{origin}: {text}" if origin else text) from e
-    return Case(id=case, made=made, registries=registries)
+    found = Case(id=case, registries=registries)
+    _ = found.made
+    return found

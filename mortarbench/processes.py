@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from harness.distributed.vectors import Emitted, Ranks
+from harness.errors import InputError
 from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
 from harness.processes.ranks import launch, this_rank
@@ -26,9 +27,12 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     solver = resolve(spec, registries.solvers)
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
-    def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted | None:
+    def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted:
         family = registries.families[case["family"]]
-        return family.emitted(case["form"], case["params"], ranks)
+        made = family.emission(case["form"], case["params"])
+        if made is None:
+            raise InputError(f"{family.name}: ranks cannot emit this case")
+        return made(ranks)
 
     serve(
         solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,

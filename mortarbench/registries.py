@@ -194,6 +194,7 @@ class Registries:
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "generator", json.dumps(request)],
+            own_code_only=self.hold_own_code_only(),
         )
 
     def environment(self) -> dict[str, Any]:

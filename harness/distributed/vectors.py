@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import wraps
+from functools import cached_property, wraps
 from time import perf_counter
 from typing import (
     TYPE_CHECKING,
@@ -65,6 +65,11 @@ class Ranks:
     #: s: how fast they talk to one another, as `harness.distributed.network.network`
     #: measured it; empty where it did not
     network: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def apart(self) -> Comm:
+        """A communicator of the same processes; called first by all ranks together."""
+        return self.comm.Dup()
 
     @property
     def size(self) -> int:
@@ -307,20 +312,45 @@ class Share(NamedTuple):
     whole: Callable[[Solution], Solution | None]
 
 
+#: begins the digest of a QP that no process has whole: `Emitted.digest`
+EMITTED = "emitted-"
+
+
+class Answered(NamedTuple):
+    """What ranks make of a solution together; all of them call what they call."""
+
+    #: what `harness.verify.over_ranks` takes to certify it; None: that needs the whole
+    certifiable: Any | None
+    #: physical results, SI, the same on all ranks; None: these need the whole
+    quantities: Callable[[], Mapping[str, Any]] | None
+
+
 class Emitted(NamedTuple):
     """A QP that ranks have made together, each its share; no process has it whole."""
 
     variables: int  #: of the whole
     equality_rows: int  #: of the whole
+    bounds: int  #: finite ones, of the whole
     #: puts this rank's operator together, anew each time: called by all ranks
     share: Callable[[], Share]
-    #: of this rank's slice of a solution, what `harness.verify.over_ranks` takes to
-    #: certify it; None where that needs the whole
-    answer: Callable[[Solution], Any] | None = None
+    #: names the numbers of the QP; called by all ranks. Not as
+    #: `harness.files.qpfile.qp_digest`, which takes the whole, and therefore marked by
+    #: `EMITTED`
+    digest: Callable[[], str]
+    #: of this rank's slice of a solution, what it means; called by all ranks
+    answer: Callable[[Solution], Answered]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Say of the whole what `harness.qp.QP.sizes` does."""
+        return {
+            "variables": self.variables, "equalities": self.equality_rows,
+            "inequalities": 0, "bounds": self.bounds,
+        }  # fmt: skip
 
 
-#: has all ranks emit a case, family, params and form; None where that is not built
-Emit = Callable[[Mapping[str, Any], Ranks], Emitted | None]
+#: has all ranks emit a case, family, params and form, where its family can
+Emit = Callable[[Mapping[str, Any], Ranks], Emitted]
 
 
 @runtime_checkable

@@ -6,16 +6,16 @@ import fcntl
 import os
 import shutil
 import stat
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from io import BytesIO
-from math import inf, isinf
+from math import inf, isinf, nan
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from typing import Any
+from typing import Any, NamedTuple
 from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
@@ -28,10 +28,12 @@ from harness.plugin import Case, Reference
 from harness.processes.case_folder import content_digest
 from harness.processes.forking import Serve
 from harness.processes.protocol import MOST_ECHOED
+from harness.processes.ranks import without_content
 from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from harness.qp import QP
 from harness.record import MEASURED, Measurement, Record, Verdict, journal_name
 from harness.solution import Solution, Status, checked_history
+from harness.verify.kkt import Residuals
 from harness.verify.measure import one_line
 from harness.verify.optimum import Proves, proves
 from harness.verify.verdicts import certified, has_point, judged, noted, quantities_of
@@ -45,24 +47,37 @@ FAR_LESS = 20.0  #: a repeat that is so many times faster …
 LEAST_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
 LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
 
+_NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 _POINT = ("x", "y", "z", "z_box")
 _HISTORY = "history_"
 _KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "FIFO", stat.S_IFLNK: "symbolic link"}
 
 
+class Measured(NamedTuple):
+    """One measurement, judged."""
+
+    record: Record
+    solution: Solution | None  #: None where the worker ended
+    #: whether quantities or bounds are lacking, though there is a point: ranks that
+    #: evaluate an answer fill in what they can
+    is_undescribed: bool = True
+
+
 def measured(
     worker: WorkerProcess,
-    qp: QP,
+    whole: Callable[[], QP],
     record: Record,
     request: Mapping[str, Any],
     *,
     time_limit: float,
     memory_limit: float,
     prove: Proves,
-) -> tuple[Record, Solution | None]:
-    """Fill in `record` by one measurement; no solution where the worker ended.
+) -> Measured:
+    """Fill in `record` by one measurement.
 
+    whole : gives the QP. Where ranks emit it themselves and evaluate the answer, it is
+        asked for only if they cannot
     request : to the worker, see `harness.processes.worker`; less what stands in the
         record. The point is in the file ``out`` afterwards, as we have read it
     time_limit, memory_limit : s and MiB
@@ -77,10 +92,6 @@ def measured(
 
     """
     request = {**request, "tol": record.asked_tol}
-    if record.ranks > 1:  # these may emit the QP themselves
-        request["case"] = {
-            "family": record.family, "params": dict(record.params), "form": record.form
-        }  # fmt: skip
     if not isinf(memory_limit):
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
@@ -96,15 +107,19 @@ def measured(
         if reply.fault:
             raise FaultError(f"{record.solver} on {record.case}: {reply.message}")
         record = record.but(
-            sizes=qp.sizes,
             started=started,
             message=reply.message,
             peak_mib=reply.peak_mib,
             threads=reply.threads,
             cpu=reply.cpu,
         )
+        if request.get("evaluates"):
+            qp, record = _as_told(reply.emitted, record)
+        else:
+            qp = whole()
+            record = record.but(sizes=qp.sizes)
         if reply.answer is None:
-            return record.but(verdict=reply.verdict), None
+            return Measured(record.but(verdict=reply.verdict), None)
         solution = _solution(returned, qp, reply.answer)
         _clear(out, returned)
         if has_point(solution):
@@ -112,27 +127,68 @@ def measured(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    cost, *notes = _believed(reply)
-    if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
-        cost = replace(cost, peak_mib=reply.peak_mib)
-    if not notes:
-        first = reply.answer["first_seconds"]
-        notes = _cached(
-            cost, first, worker.first_seconds, (record.qp, record.asked_tol)
-        )
-    found = reply.answer["evaluated"] if request.get("evaluates") else None
-    values = None if found is None else found["values"]
-    record = judged(record.but(**asdict(cost)), qp, solution, prove, values)
-    record = noted(record, reply.message, *notes)
-    if found is not None and record.verdict is not Verdict.DECLINED:
-        record = noted(record, found["note"]).but(**found["bounds"])
-    return _within(memory_limit, record).but(
+    record, *notes = _timed(reply, record, worker.first_seconds)
+    sizes, by_ranks = record.sizes, request.get("evaluates")
+    is_pointless = by_ranks and not has_point(solution)
+    found = reply.answer["evaluated"] if by_ranks else None
+    notes += found["notes"] if found is not None else []
+    if found is not None and found["values"] is not None:
+        record = _evaluated(judged(record, qp, solution, found=found["values"]), found)
+    elif is_pointless:
+        record = judged(record, qp, solution, found=_NO_POINT)
+    else:
+        record = judged(record, whole() if by_ranks else qp, solution, prove)
+    record = _within(memory_limit, noted(record, reply.message, *notes)).but(
+        sizes=sizes,
         canary_seconds=reply.answer["canary_seconds"],
         **{
             table: {part: tuple(pair) for part, pair in reply.answer[table].items()}
             for table in ("rank_seconds", "rank_counts", "rank_network")
         },
-    ), solution
+    )
+    lacks = found is None or None in (found["quantities"], found["bounds"])
+    return Measured(record, solution, lacks and not is_pointless)
+
+
+def _timed(
+    reply: Reply, record: Record, first_seconds: dict[Hashable, float]
+) -> tuple[Record, *tuple[str, ...]]:
+    """Fill in what the measurement cost; with notes on what cannot be believed."""
+    assert reply.answer is not None
+    cost, *notes = _believed(reply)
+    if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
+        cost = replace(cost, peak_mib=reply.peak_mib)
+    if not notes:
+        first, what = reply.answer["first_seconds"], (record.qp, record.asked_tol)
+        notes = _cached(cost, first, first_seconds, what)
+    return record.but(**asdict(cost)), *notes
+
+
+def _evaluated(record: Record, found: Mapping[str, Any]) -> Record:
+    """Fill in what ranks tell of the answer, besides the residuals."""
+    return record.but(
+        quantities=found["quantities"] or {},
+        recover_seconds=found["recover_seconds"],
+        **(found["bounds"] or {}),
+    )
+
+
+def emission_request(record: Record) -> dict[str, Any]:
+    """Ask ranks to emit the QP of a record's case."""
+    case = {
+        "family": record.family, "params": dict(record.params), "form": record.form
+    }  # fmt: skip
+    return {"case": case}
+
+
+def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Record]:
+    """Take what ranks tell of a QP that they have emitted; nothing, if they did not."""
+    if emitted is None or not emitted["sizes"]:
+        return without_content(0, 0), record
+    sizes = emitted["sizes"]
+    return without_content(sizes["variables"], sizes["equalities"]), record.but(
+        sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
+    )
 
 
 def _clear(*paths: Path) -> None:
@@ -321,17 +377,20 @@ def single_worker(
 
 def measured_once(
     worker: WorkerProcess,
-    case: Case,
+    case: Callable[[], Case],
     record: Record,
     reference: Reference,
     *,
+    emits: bool = False,
     evaluates: bool = False,
 ) -> tuple[Record, Solution | None]:
-    """Do as `measured`, without limits.
+    """Do as `measured`, without limits, and say what the point means.
 
+    case : gives the case, built when it is first asked for
     reference : solves the QP where residuals cannot decide
-    evaluates : whether ranks, where there are several, evaluate residuals and the
-        certificate themselves; only where no code but ours runs in them
+    emits : whether the worker is ranks that emit the QP themselves
+    evaluates : whether these evaluate the answer, too; only where no code but ours runs
+        in them. What else is asked of the case is then what they cannot tell
 
     Raises
     ------
@@ -340,30 +399,33 @@ def measured_once(
 
     """
     with scratch_folder() as scratch:
-        qp_file = scratch / "qp.npz"
-        digest = save_qp(qp_file, case.qp, {"name": record.case}, serialised=True)
-        record = record.but(qp=digest)
-        request = {
-            "qp": str(qp_file),
-            "digest": content_digest(qp_file),
-            "out": str(scratch / "point.npz"),
-            "evaluates": evaluates,
-        }
+        request: dict[str, Any] = {"out": str(scratch / "point.npz")}
+        if emits:
+            request |= {**emission_request(record), "evaluates": evaluates}
+        if not evaluates:
+            qp_file = scratch / "qp.npz"
+            meta = {"name": record.case}
+            digest = save_qp(qp_file, case().qp, meta, serialised=True)
+            record = record.but(qp=digest)
+            if not emits:
+                request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
-            measured, worker, case.qp, record, request,
+            measured, worker, lambda: case().qp, record, request,
             time_limit=inf, memory_limit=inf, prove=proves(reference),
         )  # fmt: skip
         try:
-            record, solution = once()
+            record, solution, is_undescribed = once()
         except FaultError:
-            record, solution = once()
-    if solution is None or record.verdict is Verdict.DECLINED:
+            record, solution, is_undescribed = once()
+    declined = record.verdict is Verdict.DECLINED
+    if solution is None or declined or not is_undescribed:
         return record, solution
-    quantities, note = quantities_of(case, solution)
-    bounds, objection = dict[str, Any](), ""
+    if not record.quantities:
+        quantities, note = quantities_of(case(), solution)
+        record = noted(record, note).but(quantities=quantities)
     if record.certify_seconds is None:
-        bounds, objection = certified(case, solution)
-    record = noted(record, note, objection).but(quantities=quantities, **bounds)
+        bounds, objection = certified(case(), solution)
+        record = noted(record, objection).but(**bounds)
     return record, solution
 
 

@@ -5,7 +5,9 @@
 * any other request: it says ``{"event": "start"}`` when it begins what is to be timed
   from outside, and ``{"event": "done", …}`` with its answer. One that measures says
   ``{"event": "timed"}`` when its clock has stopped, and waits for a line before it goes
-  on: until then the parent looks at the CPU time of the process
+  on: until then the parent looks at the CPU time of the process. One on ranks that emit
+  a case says ``{"event": "emitted", …}`` before "start", and ``{"event": "measured"}``
+  after "timed", before it evaluates the answer
 * ``{"event": "fault", "what": …}`` in place of each: our own code failed
 
 and ends when its requests do. Each request holds a ``nonce``, which all events of its
@@ -42,6 +44,8 @@ class Events:
 
     start: Callable[[], None]  #: the clock starts
     timed: Callable[[], None]  #: it has stopped; returns when the parent has looked
+    #: a stage beside the clock is done, by its name, with what is to be told of it
+    reached: Callable[[str, Mapping[str, Any]], None]
 
 
 Handle = Callable[[dict[str, Any], Events], dict[str, Any]]
@@ -86,7 +90,10 @@ def _events(requests: TextIO, replies: TextIO, nonce: str) -> Events:
         _send(replies, event="timed", nonce=nonce)
         requests.readline()
 
-    return Events(lambda: _send(replies, event="start", nonce=nonce), timed)
+    def reached(event: str, told: Mapping[str, Any]) -> None:
+        _send(replies, event=event, nonce=nonce, **told)
+
+    return Events(lambda: _send(replies, event="start", nonce=nonce), timed, reached)
 
 
 def _send(replies: TextIO, **event: Any) -> None:
@@ -187,11 +194,9 @@ def _is_evaluation(value: Any) -> bool:
     """As of `harness.verify.verdicts.evaluated_by_ranks`."""
     return (
         isinstance(value, dict)
-        and value.keys() == {"values", "bounds", "note"}
-        and _named(_is_number)(value["values"])
-        and value["values"].keys() == {"objective", *Residuals._fields}
-        and _is_bounds(value["bounds"])
-        and _is_text(value["note"])
+        and value.keys() == _EVALUATED.keys()
+        and all(accepts(value[name]) for name, accepts in _EVALUATED.items())
+        and (value["values"] or _VALUES).keys() == _VALUES.keys()
     )
 
 
@@ -205,6 +210,14 @@ def _cost(field: Field[Any]) -> Accepts:
     return _is_time if field.name.endswith("_seconds") else _is_size
 
 
+_VALUES = dict.fromkeys(("objective", *Residuals._fields))
+_EVALUATED: Mapping[str, Accepts] = {
+    "values": _maybe(_named(_is_number)),
+    "bounds": _maybe(_is_bounds),
+    "quantities": _maybe(lambda value: isinstance(value, dict)),
+    "recover_seconds": _is_size,
+    "notes": lambda value: isinstance(value, list) and all(map(_is_text, value)),
+}
 _MEASURED: Mapping[str, Accepts] = {
     "claimed": lambda value: isinstance(value, str) and value in set(Status),
     "message": _is_text,
@@ -213,12 +226,16 @@ _MEASURED: Mapping[str, Accepts] = {
     "reported": _named(lambda v: v is None or _is_number(v) or _is_text(v)),
     "rank_seconds": _named(_is_mean_and_largest),
     "rank_counts": _named(_is_mean_and_largest),
-    "evaluated": lambda value: value is None or _is_evaluation(value),
     "rank_network": _named(_is_mean_and_largest),
     "first_seconds": _is_time,
     "canary_seconds": _is_size,
     **{journal_name(f.name): _cost(f) for f in fields(Measurement)},
 }
+_MEASURED_BY_RANKS = {**_MEASURED, "evaluated": _maybe(_is_evaluation)}
+#: of the event "emitted"
+_EMITTED: Mapping[str, Accepts] = {
+    "sizes": _named(_is_count), "digest": _is_text, "build_seconds": _is_size,
+}  # fmt: skip
 _CHECKED: Mapping[str, Accepts] = {
     "grade": _is_text, "message": _is_any_text, "work": _maybe(_is_number),
 }  # fmt: skip
@@ -233,27 +250,30 @@ _DESCRIBED: Mapping[str, Accepts] = {
     "notes": lambda value: isinstance(value, list) and all(map(_is_any_text, value)),
     "seconds": _is_size,
 }
+_EMITS: Mapping[str, Accepts] = {"emits": lambda value: isinstance(value, bool)}
 _SOLVED: Mapping[str, Accepts] = {"found": lambda value: isinstance(value, bool)}
 #: what may come, by what the request asks for
 _ANSWERS: Mapping[str, tuple[Mapping[str, Accepts], ...]] = {
     "qp": (_MEASURED,),
+    "case": (_MEASURED_BY_RANKS,),
     "check": (_CHECKED,),
     "build": (_BUILT, _UNBUILT),
     "describe": (_DESCRIBED, _UNBUILT),
+    "emits": (_EMITS,),
     "solve": (_SOLVED,),
 }
 
 
 def measures(request: Mapping[str, Any]) -> bool:
     """Whether a request is for a measurement, which has a clock of its own."""
-    return kind_of(request) == "qp"
+    return kind_of(request) in ("qp", "case")
 
 
 def kind_of(request: Mapping[str, Any]) -> str:
     """Tell what a request asks for; "" where it is none of ours."""
     kinds = [
         kind
-        for kind in ("build", "describe", "solve", "check", "qp")
+        for kind in ("build", "describe", "emits", "solve", "check", "qp", "case")
         if kind in request
     ]
     return kinds[0] if kinds else ""
@@ -268,7 +288,31 @@ def checked_answer(request: Mapping[str, Any], answer: dict[str, Any]) -> None:
         When it has other fields, or one of another type or out of range.
 
     """
-    allowed = _ANSWERS.get(kind_of(request), ())
+    _checked(_ANSWERS.get(kind_of(request), ()), answer)
+    seconds = [
+        answer.get(f"{phase}_seconds") for phase in ("prepare", "solve", "total")
+    ]
+    if measures(request) and any(s is None for s in seconds) != all(
+        s is None for s in seconds
+    ):
+        raise ForeignReplyError("an answer came with some of its times missing")
+
+
+def checked_emitted(told: dict[str, Any]) -> None:
+    """Compare what ranks tell of the QP that they have emitted with what may come.
+
+    Raises
+    ------
+    ForeignReplyError
+        As `checked_answer`.
+
+    """
+    _checked((_EMITTED,), told)
+
+
+def _checked(
+    allowed: tuple[Mapping[str, Accepts], ...], answer: dict[str, Any]
+) -> None:
     if not allowed:
         return
     fields = next((a for a in allowed if a.keys() == answer.keys()), None)
@@ -283,10 +327,3 @@ def checked_answer(request: Mapping[str, Any], answer: dict[str, Any]) -> None:
         if not accepts(answer[name]):
             got = _shown(json.dumps(answer[name]).encode())
             raise ForeignReplyError(f"an answer came with {name} = {got}")
-    seconds = [
-        answer.get(f"{phase}_seconds") for phase in ("prepare", "solve", "total")
-    ]
-    if measures(request) and any(s is None for s in seconds) != all(
-        s is None for s in seconds
-    ):
-        raise ForeignReplyError("an answer came with some of its times missing")

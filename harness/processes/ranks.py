@@ -22,7 +22,6 @@ import re
 import subprocess
 import sys
 import time
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -33,6 +32,13 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator
 
+from harness.distributed.failures import (
+    ALONE_SECONDS,
+    RankFailedError,
+    abort,
+    agreed,
+    in_a_line,
+)
 from harness.distributed.mpi import MISSING, mpiexec
 from harness.distributed.network import network
 from harness.distributed.vectors import (
@@ -53,7 +59,6 @@ from harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: tag of what rank 0 tells the others to do
 _IDLE_SECONDS = 2e-4  #: between two looks for an order
-_ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others to fail, too
 #: how a rank tells `launch` its process, and how mpiexec tells which one ended, and why
 _STARTED = re.compile(r"rank (\d+) is process (\d+)$")
 _ENDED = re.compile(r"PID (\d+) RUNNING")
@@ -136,8 +141,9 @@ def follow(
         try:
             if "case" in order:
                 run = share = emitted = None  # before another one is made
-                with suppress(InputError):  # as on rank 0, which goes on with the whole
-                    emitted = emit(order["case"], ranks)
+                # what all raise, or agree upon, is told by rank 0
+                with suppress(InputError, RankFailedError):
+                    emitted, _ = _emitted(emit, order["case"], ranks)
                 limit(order["memory_limit"])
             elif "declines" in order and emitted is not None:
                 solver.declines(emitted.share().qp)
@@ -157,13 +163,9 @@ def follow(
             elif run is not None and share is not None:
                 solution, _ = _solved(run, share, ranks)
         except BaseException as e:
-            if _ordered(ranks, _ALONE_SECONDS):
+            if _ordered(ranks, ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
-            traceback.print_exc()
-            what = " ".join(f"{type(e).__name__}: {e}".split())
-            print(f"rank {ranks.rank} of {ranks.size}: {what}", file=sys.stderr)
-            sys.stderr.flush()
-            ranks.comm.Abort(1)
+            abort(ranks, e)
 
 
 def _next_order(ranks: Ranks) -> dict[str, Any] | None:
@@ -206,28 +208,36 @@ class OnRanks:
         self._ranks = ranks
         self._emit = emit
         self._emitted: Emitted | None = None
+        self._unemitted: Exception | None = None
         self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
         self.spent = Spent()
         self._own: Solution | None = None
 
-    def emits(self, case: Mapping[str, Any], memory_limit: float | None) -> QP | None:
-        """Have all ranks make their shares of the next QP, where its family can.
+    def emits(
+        self, case: Mapping[str, Any], memory_limit: float | None
+    ) -> tuple[QP, dict[str, Any]]:
+        """Have all ranks make their shares of the next QP.
 
         Returns
         -------
-        its sizes, as a QP without content; None where it is to be loaded: it cannot be
-        emitted by ranks, or each solves the whole
+        its sizes, as a QP without content; and what is to be told of it: its `sizes`,
+        its `digest` and the seconds that the slowest rank took. Where ranks fail to
+        emit it, a QP of no size: what is wrong is said when it is to be solved.
 
         """
-        self._emitted = None
-        if self._copies:
-            return None
         self._order({"case": dict(case), "memory_limit": memory_limit})
-        with suppress(InputError):  # why it cannot be shared will be said of the whole
-            self._emitted = self._emit(case, self._ranks)
-        return None if self._emitted is None else _sized(self._emitted)
+        self._emitted = self._unemitted = self._own = None
+        try:
+            self._emitted, told = _emitted(self._emit, case, self._ranks)
+        except (InputError, RankFailedError) as e:
+            self._unemitted = e
+            return without_content(0, 0), {
+                "sizes": {}, "digest": "", "build_seconds": None
+            }  # fmt: skip
+        of = self._emitted
+        return without_content(of.variables, of.equality_rows), told
 
     def evaluated(self) -> dict[str, Any] | None:
         """Have all ranks evaluate the last answer, if they emitted its QP; see there.
@@ -243,7 +253,8 @@ class OnRanks:
         return evaluated_by_ranks(self._emitted, self._own, self._ranks)
 
     def takes(self, path: Path, memory_limit: float | None) -> None:
-        """Say in which file the next QP is, unless it is emitted."""
+        """Say in which file the next QP is, which is not emitted."""
+        self._emitted = self._unemitted = self._own = None
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
@@ -256,6 +267,9 @@ class OnRanks:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
+        if self._unemitted is not None:  # other failures show when it is prepared
+            of_input = isinstance(self._unemitted, InputError)
+            return str(self._unemitted) if of_input else None
         if self._emitted is not None:
             self._order({"declines": True})
             return self._solver.declines(self._emitted.share().qp)
@@ -271,6 +285,8 @@ class OnRanks:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Prepare on all ranks; it is done when the last one is."""
+        if self._unemitted is not None:
+            raise self._unemitted
         if self._emitted is not None:
             self._order({"tol": tol})
             share = self._emitted.share()
@@ -299,9 +315,37 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
-def _sized(emitted: Emitted) -> QP:
+def _emitted(
+    emit: Emit, case: Mapping[str, Any], ranks: Ranks
+) -> tuple[Emitted, dict[str, Any]]:
+    """Emit on all ranks, and tell of it what `OnRanks.emits` does.
+
+    Raises
+    ------
+    InputError, RankFailedError
+        On all ranks; the first as the family raises it.
+
+    """
+
+    def emitted() -> tuple[Emitted, dict[str, Any]]:
+        start = time.perf_counter()
+        made = emit(case, ranks)
+        slowest = ranks.extreme(time.perf_counter() - start, np.max)
+        told = {"sizes": made.sizes, "digest": made.digest(), "build_seconds": slowest}
+        return made, told
+
+    try:
+        return agreed(ranks, emitted)
+    except InputError:
+        raise
+    except Exception as e:
+        why = str(e) if isinstance(e, RankFailedError) else in_a_line(e)
+        raise RankFailedError(f"emission: {why}") from e
+
+
+def without_content(variables: int, equality_rows: int) -> QP:
     """Make a QP with the sizes of one that no process has; it holds no numbers."""
-    n, m = emitted.variables, emitted.equality_rows
+    n, m = variables, equality_rows
     nothing = np.broadcast_to(0.0, n)
     return QP(
         P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),

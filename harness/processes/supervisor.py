@@ -21,8 +21,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Hashable, Mapping
-from contextlib import suppress
+from collections.abc import Hashable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -40,7 +40,9 @@ from harness.processes.protocol import (
     LONGEST_REPLY,
     ForeignReplyError,
     checked_answer,
+    checked_emitted,
     event_of,
+    kind_of,
     measures,
 )
 from harness.record import Verdict
@@ -94,6 +96,8 @@ class Reply:
     clock: Clock | None = None  #: where a measurement was made
     threads: int | None = None  #: of the worker, as it found by itself
     cpu: int | None = None
+    #: sizes, digest and seconds of the QP that ranks have emitted, as soon as they had
+    emitted: Mapping[str, Any] | None = None
 
 
 class WorkerProcess:
@@ -128,6 +132,7 @@ class WorkerProcess:
         self._facts: dict[str, Any] = {}  # what it told of its warm-up
         self._footprint = Footprint()
         self._peak_mib = 0.0
+        self._emitted: dict[str, Any] | None = None  # what was told of the QP
         with self._listing:
             self._all.add(self)
 
@@ -154,10 +159,12 @@ class WorkerProcess:
         solve: the request goes to a new process then, once.
 
         time_limit : s, from the worker's "start" on: neither its imports nor its
-            warm-up nor loading the QP count
+            warm-up nor loading the QP count. Where ranks emit the QP themselves, they
+            have as long for that; and to evaluate the answer, but `POINT_SECONDS` at
+            least
         memory_limit : MiB, of all its processes together
         """
-        self._peak_mib = 0.0
+        self._peak_mib, self._emitted = 0.0, None
         self._stop_others()
         was_busy = self._resume()
         notes = [REPLACED] if was_busy else []
@@ -191,6 +198,7 @@ class WorkerProcess:
             message="; ".join(dict.fromkeys(notes)),
             clock=clock,
             peak_mib=peak,
+            emitted=self._emitted,
             **facts,
         )
 
@@ -216,6 +224,9 @@ class WorkerProcess:
             self._log.write_bytes(b"")
         asked = time.monotonic()
         self._send({**request, "nonce": nonce})
+        emits = kind_of(request) == "case"
+        if emits:
+            self._take_emitted(time_limit, memory_limit, nonce)
         self._await("start", START_SECONDS, memory_limit, nonce)
         started, used = time.monotonic(), self._cpu_seconds()
         waited = self._waiting_seconds()
@@ -235,8 +246,14 @@ class WorkerProcess:
                 )
                 self._footprint.notice(self._tree())
                 self._send({"go": nonce})
-                time_limit = POINT_SECONDS
-            answer = self._await("done", time_limit, memory_limit, nonce)
+                if emits:
+                    self._await("measured", POINT_SECONDS, memory_limit, nonce)
+                else:
+                    time_limit = POINT_SECONDS
+            if emits:
+                answer = self._evaluated(max(time_limit, POINT_SECONDS), nonce)
+            else:
+                answer = self._await("done", time_limit, memory_limit, nonce)
             checked_answer(request, answer)
         except ForeignReplyError as e:
             raise _EndedError("done", Verdict.FAILED, str(e)) from None
@@ -245,6 +262,25 @@ class WorkerProcess:
             raise
         self._trim_log()
         return answer, clock
+
+    def _take_emitted(self, limit: float, memory_limit: float, nonce: str) -> None:
+        """Wait until ranks have emitted the QP."""
+        try:
+            with _stage("emission"):
+                told = self._await("emitted", limit, memory_limit, nonce)
+            checked_emitted(told)
+        except ForeignReplyError as e:
+            raise _EndedError("emitted", Verdict.FAILED, str(e)) from None
+        self._emitted = told
+
+    def _evaluated(self, limit: float, nonce: str) -> dict[str, Any]:
+        """Wait until ranks have evaluated the answer; what they hold is not limited."""
+        peak = self._peak_mib
+        try:
+            with _stage("evaluation of the answer"):
+                return self._await("done", limit, inf, nonce)
+        finally:
+            self._peak_mib = peak
 
     def _ended(self, end: _EndedError, memory_limit: float) -> Reply:
         """Tell a solver's end from one that the machine or somebody brought about."""
@@ -264,6 +300,7 @@ class WorkerProcess:
             fault=is_fault,
             message=message,
             peak_mib=peak,
+            emitted=self._emitted,
             **self._facts,
         )
 
@@ -559,12 +596,22 @@ class _EndedError(Exception):
         *,
         is_fault: bool = False,
     ) -> None:
-        self.is_early = event not in ("timed", "done")
+        self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(f"before solving: {how}" if self.is_early else how)
         self.verdict = _BEFORE.get(verdict, verdict) if self.is_early else verdict
         self.signal = number
         self.is_fault = is_fault
         self.is_oom = False
+
+
+@contextmanager
+def _stage(name: str) -> Iterator[None]:
+    """Say of the end of a worker in which stage of a measurement it came."""
+    try:
+        yield
+    except _EndedError as end:
+        end.args = (f"{name}: {end}",)
+        raise
 
 
 def _facts(told: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,9 +7,12 @@ It answers the requests of `harness.processes.protocol` with these of its own:
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
   writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
   without which the file may hold no operator; ``memory_limit`` in MiB;
-  ``sample_seconds``, see `harness.verify.measure`; ``case``, whose QP it is, which
-  ranks may emit themselves (`harness.plugin.Family.emitted`); ``step`` 0, 1, … of a
-  sequence, and whether it ``tightens``: then every step comes with its own tolerance
+  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence, and
+  whether it ``tightens``: then every step comes with its own tolerance
+* ``{"case": {…}, "tol": TOL, "out": PATH, "evaluates": …}``: the same on ranks which
+  emit the QP of a case themselves (`harness.plugin.Family.emission`), and evaluate the
+  answer together if that is asked for. It says ``emitted`` when the QP is there, with
+  its ``sizes`` and ``digest``, and ``measured`` when the point is written
 * ``{"check": NAME}``: it runs one of `harness.conformance.conformance.CHECKS`
 
 Every measurement loads its QP afresh, so that nothing that a solver did to the last one
@@ -57,7 +60,7 @@ def serve(
     reply_fd: int,
     operators: Mapping[str, Maker] = NO_MAKERS,
     ranks: Ranks | None = None,
-    emit: Emit = lambda case, ranks: None,
+    emit: Emit | None = None,
     *,
     copies: bool = False,
 ) -> None:
@@ -69,7 +72,7 @@ def serve(
     copies : each of them solves by itself instead, all at the same time
     """
     bench = _Bench(solver, operators)
-    if ranks is None:
+    if ranks is None or emit is None:
         answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
         return
     if ranks.rank:
@@ -122,18 +125,15 @@ class _Bench:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        path, out = Path(request["qp"]), Path(request["out"])
+        out = Path(request["out"])
         out.unlink(missing_ok=True)
         self._shift_heap()
-        qp = self._emitted(request)
-        if qp is None:
-            self._check(path, request.get("digest"))
-            vouched = "digest" in request  # or it may be anybody's
-            qp, _ = load_qp(path, operators=self._operators if vouched else None)
+        if "case" in request:
+            qp = self._emitted(request, events)
+        else:
+            qp = self._loaded(request)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        if self.on_ranks is not None:
-            self.on_ranks.takes(path, request.get("memory_limit"))
         timed = _measured_here(
             self.on_ranks or self._solver,
             qp,
@@ -147,10 +147,13 @@ class _Bench:
         s = timed.solution
         _write_new(out, s)
         spent = Spent() if self.on_ranks is None else self.on_ranks.spent
-        evaluated = None
-        if self.on_ranks is not None and request.get("evaluates"):
-            evaluated = self.on_ranks.evaluated()
+        evaluated = dict[str, Any]()
+        if "case" in request and self.on_ranks is not None:
+            events.reached("measured", {})
+            found = self.on_ranks.evaluated() if request["evaluates"] else None
+            evaluated = {"evaluated": found}
         return {
+            **evaluated,
             "claimed": s.status,
             "message": s.message,
             "iterations": s.iterations,
@@ -159,17 +162,26 @@ class _Bench:
             "rank_seconds": spent.seconds,
             "rank_counts": spent.counts,
             "rank_network": spent.network,
-            "evaluated": evaluated,
             "first_seconds": timed.first_seconds,
             "canary_seconds": canary,
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
-    def _emitted(self, request: dict[str, Any]) -> QP | None:
-        """Have ranks emit the case of a request, unless it is a step of a sequence."""
-        if self.on_ranks is None or "case" not in request or "step" in request:
-            return None
-        return self.on_ranks.emits(request["case"], request.get("memory_limit"))
+    def _emitted(self, request: dict[str, Any], events: Events) -> QP:
+        """Have ranks emit the QP of a case; what is left here are its sizes."""
+        assert self.on_ranks is not None
+        qp, told = self.on_ranks.emits(request["case"], request.get("memory_limit"))
+        events.reached("emitted", told)
+        return qp
+
+    def _loaded(self, request: dict[str, Any]) -> QP:
+        path = Path(request["qp"])
+        self._check(path, request.get("digest"))
+        vouched = "digest" in request  # or it may be anybody's
+        qp, _ = load_qp(path, operators=self._operators if vouched else None)
+        if self.on_ranks is not None:
+            self.on_ranks.takes(path, request.get("memory_limit"))
+        return qp
 
     def _shift_heap(self) -> None:
         """Have arrays lie elsewhere than they did during the last measurement.

@@ -23,6 +23,8 @@ class Commands:
 
     solvers: Mapping[str, list[str]]  #: by label; they serve `harness.processes.worker`
     case_worker: list[str]  #: serves `harness.processes.case_worker`
+    #: whether no code but ours runs in the first: then ranks evaluate what they solve
+    own_code_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -193,7 +193,8 @@ class ExecutorPlugin(WorkerPlugin):
         def here(command: list[str]) -> list[str]:
             return [sys.executable if w == self._python else w for w in command]
 
-        return Commands(
+        return replace(
+            commands,
             solvers={label: here(c) for label, c in commands.solvers.items()},
             case_worker=here(commands.case_worker),
         )

@@ -16,10 +16,11 @@ from harness.files.qpfile import load_qp
 from harness.files.store import point_arrays, read_arrays, read_point
 from harness.operators import NO_MAKERS, Maker
 from harness.processes.case_folder import Entry, entry
-from harness.processes.measurement import measured
+from harness.processes.measurement import emission_request, measured
 from harness.processes.supervisor import WorkerProcess
 from harness.qp import QP
 from harness.record import Record, Verdict
+from harness.registry import COPIES
 from harness.results.work_unit import (
     Commands,
     Outcome,
@@ -65,6 +66,7 @@ class Executor:
         self._end = ""  # why there are fewer than its sequence asked for
         self._loaded: dict[str, QP] = {}  # theirs, by digest
         self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
+        self._emitted: dict[str, bool] = {}  # whether ranks emit the QP, by case
 
     def __enter__(self) -> Self:
         return self
@@ -126,23 +128,25 @@ class Executor:
             When something else than the solver failed.
 
         """
-        if not self._entries:
-            self._entries, self._end = self._built(block, turn)
-            self._loaded = {e.digest: self._qp(e) for e in self._entries}
+        emits = self._is_emitted(turn[0])
+        if emits and self._commands.own_code_only:
+            yield self._by_ranks(block, turn)
+            return
+        self._build(block, turn)
         worker = self._worker(turn[0].solver)
         there, beyond = turn[: len(self._entries)], turn[len(self._entries) :]
         for step, (record, at) in enumerate(zip(there, self._entries, strict=True)):
+            emitted = {**emission_request(record), "evaluates": False}
             request = {
-                "qp": str(at.qp),
-                "digest": at.digest,
+                **(emitted if emits else {"qp": str(at.qp), "digest": at.digest}),
                 "out": str(self._point),
                 "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
                 **({"step": step} if block.is_sequence else {}),
                 **({"tightens": True} if record.tighten else {}),
             }
-            record, solution = measured(
+            record, solution, _ = measured(
                 worker,
-                self._qp(at),
+                partial(self._qp, at),
                 record.but(
                     qp=at.meta.get("qp"),
                     build_seconds=at.meta.get("build_seconds"),
@@ -166,6 +170,51 @@ class Executor:
         for record in beyond:
             declined = record.but(verdict=Verdict.DECLINED, message=self._end)
             yield Result(record=declined)
+
+    def _by_ranks(self, block: WorkUnit, turn: tuple[Record, ...]) -> Result:
+        """Measure on ranks that emit the QP and evaluate the answer themselves.
+
+        The case is built where they cannot tell something of the answer.
+        """
+
+        def whole() -> QP:
+            self._build(block, turn)
+            return self._qp(self._entries[0])
+
+        def proven(qp: QP) -> Optimum | None:
+            return self._optimum(self._entries[0], qp)
+
+        request = {
+            **emission_request(turn[0]), "evaluates": True, "out": str(self._point),
+            "sample_seconds": SAMPLE_SECONDS,
+        }  # fmt: skip
+        record, solution, is_undescribed = measured(
+            self._worker(turn[0].solver), whole, turn[0], request,
+            time_limit=block.time_limit, memory_limit=block.memory_limit, prove=proven,
+        )  # fmt: skip
+        if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
+            refuse_full_disk(self._scratch, "")
+        if is_undescribed or solution is None or not has_point(solution):
+            return self._described(block, record, solution)
+        return Result(record=record, point=point_arrays(solution))
+
+    def _is_emitted(self, record: Record) -> bool:
+        """Whether the QP of a record is emitted by the ranks that solve it."""
+        if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
+            return False
+        if record.case not in self._emitted:
+            request = {"emits": _case(record)}
+            reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
+            if reply.answer is None:
+                raise FaultError(reply.message)
+            self._emitted[record.case] = reply.answer["emits"]
+        return self._emitted[record.case]
+
+    def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
+        """Have the cases of a block built, unless they are."""
+        if not self._entries:
+            self._entries, self._end = self._built(block, turn)
+            self._loaded = {e.digest: self._qp(e) for e in self._entries}
 
     def _built(
         self, block: WorkUnit, turn: tuple[Record, ...]

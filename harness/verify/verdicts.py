@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from harness.digest import hex_digest
+from harness.distributed.failures import agreed
 from harness.distributed.vectors import DistributedColumns, Emitted, Ranks
 from harness.names import CaseId
 from harness.plugin import Case
@@ -153,34 +154,65 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     return told
 
 
-def evaluated_by_ranks(
-    emitted: Emitted, s: Solution, ranks: Ranks
-) -> dict[str, Any] | None:
+def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str, Any]:
     """Evaluate an answer on all ranks together; each has its slice of the solution.
 
     By a share of its own, without what the solver has made of the first one. All ranks
-    call it.
+    call it. What one of them cannot do, none of them does (`harness.distributed
+    .failures`).
 
     Returns
     -------
-    objective and residuals; fields of `certified` where that does not need the whole,
-    and a note, perhaps empty. None where it cannot be evaluated in parts.
+    `values`: objective and residuals, None where they cannot be evaluated in parts;
+    `bounds`: fields of `certified`, and `quantities`, each None where it needs the
+    whole; `recover_seconds` that quantities took; `notes` on what failed.
 
+    """
+    found: dict[str, Any] = {
+        "values": None, "bounds": None, "quantities": None, "recover_seconds": None,
+        "notes": list[str](),
+    }  # fmt: skip
+    try:
+        found["values"] = agreed(ranks, lambda: _values_by_ranks(emitted, s, ranks))
+        if found["values"] is None:
+            return found
+        answered = agreed(ranks, lambda: emitted.answer(s))
+    except Exception as e:
+        return {**found, "notes": [note_of("evaluation by ranks", e)]}
+    if (certifiable := answered.certifiable) is not None:
+        found["bounds"], note = _certified(
+            lambda: agreed(ranks, lambda: certify_over_ranks(*certifiable))
+        )
+        found["notes"] += filter(None, [note])
+    if (results := answered.quantities) is not None:
+        start = perf_counter()
+        try:
+            found["quantities"] = plain(agreed(ranks, results))
+            found["recover_seconds"] = perf_counter() - start
+        except Exception as e:
+            found["quantities"] = {}
+            found["notes"].append(note_of("quantities", e))
+    return found
+
+
+def _values_by_ranks(
+    emitted: Emitted, s: Solution, ranks: Ranks
+) -> dict[str, float] | None:
+    """Evaluate objective and residuals; None where they are not finite.
+
+    And where some scale of energy is one that only the whole knows, which a distributed
+    vector refuses by a TypeError.
     """
     qp = emitted.share().qp
     qp = replace(qp, G=DistributedColumns(no_rows(qp.q.size), ranks))
     try:
         with np.errstate(all="ignore"):
             residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
-    except TypeError:  # some scale of energy is one that only the whole knows
+    except TypeError:
         return None
     if not np.isfinite([*residuals, objective]).all():
         return None
-    bounds, note = dict[str, Any](), ""
-    if (answer := emitted.answer) is not None:
-        bounds, note = _certified(lambda: certify_over_ranks(*answer(s)))
-    values = {"objective": float(objective), **residuals._asdict()}
-    return {"values": values, "bounds": bounds, "note": note}
+    return {"objective": float(objective), **residuals._asdict()}
 
 
 LATE = "scipy.optimize"  #: which `certify` imports for some bodies; it takes long
@@ -203,8 +235,10 @@ def _certified(certificate: Callable[[], Certificate]) -> tuple[dict[str, Any], 
 
 
 def has_point(s: Solution) -> bool:
-    """Whether all four vectors are finite."""
-    return all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))
+    """Whether there are variables, and all four vectors are finite."""
+    return bool(s.x.size) and all(
+        np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box)
+    )
 
 
 def note_of(what: str, e: Exception) -> str:

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING
 
 from harness.distributed.mpi import ranks_asked
 from harness.errors import InputError, say
-from harness.names import parse
+from harness.names import emitted_by_ranks, parse
 from harness.registry import check_name
 from harness.suite.solver_options import options_for
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from mortarbench.answer import Answer
+    from mortarbench.case import Case
 
 
 def run(registries: Registries, options: Namespace) -> int:
@@ -40,20 +43,18 @@ def run(registries: Registries, options: Namespace) -> int:
 
     from harness.record import Verdict
     from mortarbench.answer import answers_of
-    from mortarbench.case import built_case
+    from mortarbench.case import Case
 
     drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
-    forks = registries.hold_own_code_only() and not _loads_from_here()
+    is_ours = registries.hold_own_code_only()
+    forks = is_ours and not _loads_from_here()
     asked = answers_of(
         options.solver, registries, changed, forks=forks, ranks=options.mpi
     )
     with asked as solved:
-        case = built_case(parsed, registries)  # after the fork, which has no use for it
-        for remark in case.remarks:
-            say(remark)
-        if drawn and case.made.fields is None:
-            wanted = ", ".join(f"--{o}" for o in drawn)
-            raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
+        case = Case(id=parsed, registries=registries)
+        if drawn or options.mpi == 1 or not (is_ours and emitted_by_ranks(parsed)):
+            _build(case, drawn)  # after the fork, which has no use for it
         answer = solved(case, options.tol)
     record = answer.record
     if options.json:
@@ -66,6 +67,15 @@ def run(registries: Registries, options: Namespace) -> int:
     if drawn:
         _draw(answer, options)
     return 0 if record.verdict is Verdict.VERIFIED else 1
+
+
+def _build(case: Case, drawn: Sequence[str]) -> None:
+    """Build the case, and say what is odd about it; see that it can be drawn."""
+    for remark in case.remarks:
+        say(remark)
+    if drawn and case.made.fields is None:
+        wanted = ", ".join(f"--{o}" for o in drawn)
+        raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
 
 
 def _loads_from_here() -> bool:

@@ -40,7 +40,10 @@ class ContactSides:
     """The sides of bodies that may touch, and nothing else of the bodies."""
 
     mesh: Mesh  #: their nodes, without cells, m
+    body_of_node: NDArray[np.int64]  #: (N,)
+    names: tuple[str, ...]  #: of all bodies
     pairs: tuple[ContactPair, ...]
+    length: float  #: l, m, as of `Bodies`
     force: float  #: F₀, N/m, as of `Bodies`
 
 

@@ -2,56 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from harness import QP, Fields, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
-from problems.contact.bodies import Bodies
+from problems.contact.bodies import Bodies, ContactSides
 from problems.contact.sides import ACTIVE, active, bodies_of, contact_sides, states
 from problems.fem.mesh import as_vectors
 from problems.fem.stress import centre_stress, recover, von_mises
+
+
+class Inside(NamedTuple):
+    """What is reported of the inside of bodies, away from their contact."""
+
+    nodes: int
+    elements: int
+    supports: int  #: prescribed components
+    energy: float  #: ½uᵀKu − fᵀu, J/m
+    #: (bodies,) the largest patch-recovered von Mises stress, Pa
+    max_von_mises: Sequence[float]
 
 
 def quantities(
     bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Report counts, energy, contact forces and stresses.
+    """Report counts, energy, contact forces and stresses, as `results_of`.
 
     stresses : at the nodes (N,), where they are not those of linear elasticity
+    """
+    l, owner = bodies.length, bodies.body_of_node
+    stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
+    inside = Inside(
+        nodes=len(bodies.mesh.points), elements=len(bodies.mesh.cells),
+        supports=primal.b.size, energy=primal.objective(s.x) * bodies.force * l,
+        max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
+    )  # fmt: skip
+    return results_of(inside, bodies, primal, s, friction)
+
+
+def results_of(
+    inside: Inside, bodies: Bodies | ContactSides, primal: QP, s: Solution,
+    friction: Friction = NO_FRICTION,
+) -> dict[str, Any]:  # fmt: skip
+    """Report counts, energy, contact forces and stresses.
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
     its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
     max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
     `pair_results`. With friction those of `frictional`, too.
+
+    Parameters
+    ----------
+    bodies, primal, s, friction : of the whole, or of the nodes of the sides alone; of P
+        the diagonal is asked for, where there is friction
+
     """
-    l, F = bodies.length, bodies.force
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
-    stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
     return {
-        "nodes": len(bodies.mesh.points),
-        "elements": len(bodies.mesh.cells),
-        "dofs": bodies.mesh.dofs,
-        "equality_rows": primal.b.size,
+        "nodes": inside.nodes,
+        "elements": inside.elements,
+        "dofs": 2 * inside.nodes,
+        "equality_rows": inside.supports,
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
-        "energy": primal.objective(s.x) * F * l,
+        "energy": inside.energy,
         "contact_force": forces[_loaded(bodies)].sum(axis=0).tolist(),
-        "multiplier_sum": float(normal.sum() * F),
+        "multiplier_sum": float(normal.sum() * bodies.force),
         "max_von_mises": {
-            name: float(stress[bodies.body_of_node == b].max())
-            for b, name in enumerate(bodies.names)
+            name: float(largest)
+            for name, largest in zip(bodies.names, inside.max_von_mises, strict=True)
         },
         "contacts": pair_results(bodies, primal, s, friction),
     } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
 
 
-def _loaded(bodies: Bodies) -> NDArray[np.bool_]:
+def _loaded(bodies: Bodies | ContactSides) -> NDArray[np.bool_]:
     """Mark the nodes (N,) of the body that `contact_force` acts on; none if nothing."""
     owner = bodies.body_of_node
     if not bodies.pairs:
@@ -61,7 +92,7 @@ def _loaded(bodies: Bodies) -> NDArray[np.bool_]:
 
 
 def frictional(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction
+    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
     """Report what friction does.
 
@@ -81,7 +112,10 @@ def frictional(
 
 
 def pair_results(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+    bodies: Bodies | ContactSides,
+    primal: QP,
+    s: Solution,
+    friction: Friction = NO_FRICTION,
 ) -> dict[str, dict[str, Any]]:
     """Report each contact pair by its name.
 
@@ -131,7 +165,10 @@ def fields(
 
 
 def contact_forces(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+    bodies: Bodies | ContactSides,
+    primal: QP,
+    s: Solution,
+    friction: Friction = NO_FRICTION,
 ) -> NDArray[np.float64]:
     """Return the forces −Bᵀλ of contact and friction on the nodes (N, 2), N/m."""
     B, _ = contact_rows(primal, friction)

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 
 from harness import QP, ContactSide, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION
-from problems.contact.bodies import Bodies, ContactPair
+from problems.contact.bodies import Bodies, ContactPair, ContactSides
 from problems.contact.node_to_segment import tangent
 from problems.contact.polyline import current_polyline
 from problems.fem.mesh import Nodes, as_vectors, nodal_lengths
@@ -24,7 +24,10 @@ ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 
 
 def contact_sides(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION
+    bodies: Bodies | ContactSides,
+    primal: QP,
+    s: Solution,
+    friction: Friction = NO_FRICTION,
 ) -> tuple[ContactSide, ...]:
     """Evaluate every pair along its slave side; SI units.
 
@@ -93,7 +96,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
     return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
 
 
-def pair_names(bodies: Bodies) -> list[str]:
+def pair_names(bodies: Bodies | ContactSides) -> list[str]:
     """Name the pairs by their bodies, slave first; equal ones by a number, too."""
     names: list[str] = []
     for pair in bodies.pairs:
@@ -104,14 +107,14 @@ def pair_names(bodies: Bodies) -> list[str]:
     return names
 
 
-def bodies_of(bodies: Bodies, pair: ContactPair) -> tuple[str, str]:
+def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, str]:
     """Name the bodies of slave and master."""
     owner = bodies.body_of_node
     master = bodies.names[owner[pair.master[0]]] if pair.master.size else RIGID
     return bodies.names[owner[pair.slave[0]]], master
 
 
-def rows_of_pairs(B: csr_array, bodies: Bodies) -> list[slice]:
+def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Find which rows of B (m, n) belong to which pair."""
     m = B.shape[0]
     touches = csr_array(

@@ -38,10 +38,3 @@ class InSubdomains(Family):
             return emitted(self.in_subdomains(params), ranks)
 
         return emit
-
-    def emitted(
-        self, form: str, params: Mapping[str, Value], ranks: Ranks
-    ) -> Emitted | None:
-        """Have each rank make its share of the dual."""
-        emit = self.emission(form, params)
-        return None if emit is None else emit(ranks)

@@ -302,9 +302,9 @@ def boundary_edges(cells: Nodes) -> Nodes:
     """List the edges (k, 2) of exactly one cell, the body on their left."""
     edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
-    _, first, times = np.unique(
-        np.sort(edges), axis=0, return_index=True, return_counts=True
-    )
+    low, high = edges.min(axis=1), edges.max(axis=1)
+    name = low * (high.max(initial=0) + 1) + high  # in the order of low, then high
+    _, first, times = np.unique(name, return_index=True, return_counts=True)
     return np.asarray(edges[first[times == 1]])
 
 

@@ -10,6 +10,8 @@ share no nodes, so nothing is averaged across bodies.
 
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,9 +58,12 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     )  # fmt: skip
     offset = (centre[cells] - mesh.points[nodes]) / size
     basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, y about the node
-    normal, right = np.zeros((N, 3, 3)), np.zeros((N, 3, k))
-    np.add.at(normal, nodes, basis[:, :, None] * basis[:, None, :])
-    np.add.at(right, nodes, basis[:, :, None] * values[cells][:, None, :])
+    normal, right = np.empty((N, 3, 3)), np.empty((N, 3, k))
+    for p, q in combinations_with_replacement(range(3), 2):
+        sums = np.bincount(nodes, basis[:, p] * basis[:, q], N)
+        normal[:, p, q] = normal[:, q, p] = sums
+    for p, q in np.ndindex(3, k):
+        right[:, p, q] = np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
     interior = ~_on_boundary(mesh)
     polynomial = np.zeros((N, 3, k))
@@ -104,7 +109,10 @@ def _neighbours(
     mesh: Mesh, first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pair each node of `first` with those of `second` that share a cell with it."""
-    a, b = np.repeat(mesh.cells, 4, axis=1).ravel(), np.tile(mesh.cells, 4).ravel()
+    cells = mesh.cells[first[mesh.cells].any(axis=1)]
+    a, b = np.repeat(cells, 4, axis=1).ravel(), np.tile(cells, 4).ravel()
     keep = first[a] & second[b]
-    pairs = np.unique(np.stack([a[keep], b[keep]]), axis=1)
-    return pairs[0], pairs[1]
+    from_first, to_second = np.divmod(
+        np.unique(a[keep] * first.size + b[keep]), first.size
+    )
+    return from_first, to_second

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
-from harness import QP, Friction, Value, Vector
+from harness import QP, Friction, Solution, Status, Value, Vector, no_rows
 from harness.mechanics import NO_FRICTION, contact_rows
 from problems.contact.bodies import (
     Bodies,
@@ -22,11 +22,14 @@ from problems.contact.bodies import (
 from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.linearise import linearisation
 from problems.contact.node_to_segment import ContactRows
+from problems.contact.results import Inside, results_of
 from problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes
-from problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
+from problems.fem.mesh import Mesh, Nodes, as_vectors, boundary_edges, dofs_of
+from problems.fem.stress import centre_stress, recover, von_mises
 from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.subdivision import Subdivision
 from problems.feti.tearing import Decomposition, Part, decompose
@@ -125,18 +128,34 @@ def torn(
     )  # fmt: skip
 
 
+class AtSides(NamedTuple):
+    """What is known along the sides that may touch, as of the bodies themselves."""
+
+    bodies: ContactSides
+    primal: QP  #: of the nodes of the sides; of P, the diagonal where there is friction
+    solution: Solution
+    friction: Friction
+
+
+def nothing_more(found: OwnSolution, at: AtSides) -> dict[str, Any]:
+    """Report nothing besides what all elastic bodies report."""
+    return {}
+
+
 def in_parts(
     layout: Subdivision,
     *,
     materials: tuple[Material, ...],
     plane: Plane,
     units: tuple[float, float],
+    names: tuple[str, ...],
     fixed: Nodes,
     load: tuple[Nodes, Vector],
     pairs: Sequence[ContactPair],
     linearise: Callable[[ContactSides], ContactRows],
     laws: Sequence[FrictionLaw] = (),
     glue: str,
+    results: Callable[[OwnSolution, AtSides], Mapping[str, Any]] = nothing_more,
 ) -> ProblemInParts:
     """Describe elastic bodies in contact, linearised at rest, before they are torn.
 
@@ -145,23 +164,37 @@ def in_parts(
 
     Parameters
     ----------
-    materials, plane, units, fixed, pairs : as of `assemble`
+    materials, plane, units, names, fixed, pairs : as of `assemble`
     load : components with a force, and the forces, N/m; each component once
     linearise : takes the rows at rest from the nodes of the sides alone
     laws : of friction with a given bound, one per pair
+    results : reports more of what ranks have found than of all elastic bodies; called
+        by all ranks
 
     """
     length, force = units
     D = elasticity_matrices(materials, plane) * (length / force)
     E = np.array([m.E for m in materials]) * (length / force)
     share = longitudinal_share(D)
+    sides = _sides_at_rest(layout, pairs, names, units, linearise, laws)
+
+    def reported(found: OwnSolution) -> dict[str, Any]:
+        largest, elements = _largest_von_mises(layout, found, length, materials, plane)
+        inside = Inside(
+            nodes=layout.nodes, elements=elements, supports=fixed.size,
+            energy=found.energy * force * length, max_von_mises=largest,
+        )  # fmt: skip
+        at = sides.found(found)
+        known = results_of(inside, at.bodies, at.primal, at.solution, at.friction)
+        return {**known, **results(found, at)}
+
     return ProblemInParts(
         layout=layout, components=2, material=layout.body,
         kind=partial(elastic_kind, D=D, E=E), E=E,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         held=fixed,
         load=forces_at(load[0], load[1] / force), glue=glue,
-        contact=_contact_of_sides(layout, pairs, linearise, laws, units),
+        contact=sides.of_whole(layout.nodes), results=reported,
     )  # fmt: skip
 
 
@@ -188,31 +221,194 @@ def at_rest(
     )
 
 
-def _contact_of_sides(
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SidesAtRest:
+    """Contact linearised at rest from the nodes of the sides alone, not dimensional."""
+
+    bodies: ContactSides  #: of N nodes
+    node: Nodes  #: (N,) their numbers in the whole
+    B: csr_array  #: (m, 2N)
+    c: Vector  #: (m,)
+    friction: Friction  #: none without rows
+
+    def of_whole(self, nodes: int) -> Contact:
+        """Give the rows the columns of all components of so many nodes."""
+        friction, B, c = self.friction, self.B, self.c
+        if friction.bound.size:
+            B = csr_array(vstack([B, friction.T]))
+            c = np.append(c, friction.start)
+        column = dofs_of(self.node)[B.indices]
+        rows = csr_array((B.data, column, B.indptr), shape=(B.shape[0], 2 * nodes))
+        return Contact(rows, c, friction.bound)
+
+    def found(self, found: OwnSolution) -> AtSides:
+        """Gather what ranks have found along the sides; called by all of them."""
+        at = dofs_of(self.node)
+        K = found.diagonal(at) if self.friction.bound.size else np.zeros(at.size)
+        free = np.full(at.size, np.inf)
+        primal = QP(
+            P=csc_array(diags_array(K)), q=np.zeros(at.size), A=no_rows(at.size),
+            b=np.zeros(0), G=self.B, h=self.c, lb=-free, ub=free,
+        )  # fmt: skip
+        s = Solution(
+            status=Status.SOLVED, x=found.at(at), y=np.zeros(0), z=found.z,
+            z_box=np.zeros(at.size),
+        )  # fmt: skip
+        return AtSides(self.bodies, primal, s, self.friction)
+
+
+def _sides_at_rest(
     layout: Subdivision,
     pairs: Sequence[ContactPair],
+    names: tuple[str, ...],
+    units: tuple[float, float],
     linearise: Callable[[ContactSides], ContactRows],
     laws: Sequence[FrictionLaw],
-    units: tuple[float, float],
-) -> Contact:
-    """Linearise contact at rest from the nodes of the sides alone."""
-    n = 2 * layout.nodes
+) -> _SidesAtRest:
+    """Linearise contact at rest."""
     length, force = units
     node = np.unique(np.concatenate([side for pair in pairs for side in pair]))
-    sides = ContactSides(
+    bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
+        body_of_node=np.asarray(layout.body[layout.holder(node)]), names=names,
         pairs=tuple(
             ContactPair(*(np.searchsorted(node, side) for side in pair))
             for pair in pairs
         ),
-        force=force,
+        length=length, force=force,
     )  # fmt: skip
-    rows = linearise(sides)
+    rows = linearise(bodies)
     pressed = np.zeros(sum(pair.slave.size for pair in pairs))
-    friction = friction_of(sides, rows, laws, np.zeros(sides.mesh.dofs), pressed)
-    B = csr_array(vstack([rows.B, friction.T])) if friction.bound.size else rows.B
-    of_whole = csr_array(
-        (B.data, dofs_of(node)[B.indices], B.indptr), shape=(B.shape[0], n)
-    )
-    c = np.append(rows.c / length, friction.start)
-    return Contact(of_whole, c, friction.bound)
+    at_rest = np.zeros(bodies.mesh.dofs)
+    return _SidesAtRest(
+        bodies=bodies, node=node, B=csr_array(rows.B), c=rows.c / length,
+        friction=friction_of(bodies, rows, laws, at_rest, pressed),
+    )  # fmt: skip
+
+
+class OwnMesh(NamedTuple):
+    """Some subdomains of a rank and the cells around them, with their displacement."""
+
+    body: int
+    mesh: Mesh  #: N nodes
+    inner: NDArray[np.bool_]  #: (N,) those of the subdomains
+    u: Vector  #: (2N,) m
+    elements: int  #: cells of the subdomains
+
+
+BATCH = 2**15  #: nodes of subdomains that are evaluated at once
+REACH = 3  #: cells from a node to the last that its recovered stress may depend on
+
+
+def own_meshes(
+    layout: Subdivision, found: OwnSolution, length: float, reach: int = 0
+) -> Iterator[OwnMesh]:
+    """Give the displaced subdomains of each rank; called by all ranks.
+
+    Parameters
+    ----------
+    length : of which displacements are multiples, m
+    reach : how many cells around subdomains are added, where there are so many
+
+    """
+    batches = _batches(layout, found.subdomains.number)
+    around = [_around(layout, batch, reach) for batch in batches]
+    node = np.unique(np.concatenate([part.node for part in around]))
+    here = found.bodies.components[::2] // 2
+    place = np.minimum(np.searchsorted(here, node), here.size - 1)
+    lacks = here[place] != node
+    u = as_vectors(found.u)[place]
+    everyones = found.bodies.ranks.comm.allgather(node[lacks])
+    asked = np.unique(np.concatenate(everyones))
+    told = as_vectors(found.at(dofs_of(asked)))
+    u[lacks] = told[np.searchsorted(asked, node[lacks])]
+
+    def meshes() -> Iterator[OwnMesh]:
+        for batch, part in zip(batches, around, strict=True):
+            at = np.searchsorted(node, part.node)
+            mesh = Mesh(layout.position(part.node), part.cells, {})
+            yield OwnMesh(
+                int(layout.body[batch[0]]), mesh, part.inner, u[at].ravel() * length,
+                part.elements,
+            )  # fmt: skip
+
+    return meshes()
+
+
+def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
+    """Put subdomains of one body together, up to `BATCH` nodes or one subdomain."""
+    sizes = np.diff(layout.torn_nodes(subdomains).start)
+    first, held = [0], 0
+    for s, size in enumerate(sizes):
+        other = layout.body[subdomains[s]] != layout.body[subdomains[first[-1]]]
+        if s > first[-1] and (other or held + size > BATCH):
+            first.append(s)
+            held = 0
+        held += int(size)
+    return np.split(subdomains, first[1:])
+
+
+class _Around(NamedTuple):
+    """Subdomains of one body with cells around them."""
+
+    node: Nodes  #: (N,) in the whole
+    cells: Nodes  #: (E, 4) of these nodes
+    inner: NDArray[np.bool_]  #: (N,) those of the subdomains
+    elements: int  #: cells of the subdomains
+
+
+def _around(layout: Subdivision, subdomains: Nodes, reach: int) -> _Around:
+    """Take subdomains of one body and so many layers of cells around them."""
+    taken, (nodes, cells) = subdomains, _cells_of(layout, subdomains)
+    reached, elements = nodes, len(cells)
+    own, kept = nodes, np.ones(elements, dtype=bool)
+    for _ in range(reach):
+        more = np.setdiff1d(_holders(layout, reached), taken)
+        if more.size:
+            taken = np.concatenate([taken, more])
+            nodes, cells = _cells_of(layout, taken)
+        kept = np.asarray(np.isin(nodes, reached)[cells].any(axis=1))
+        reached = nodes[np.unique(cells[kept])]
+    used, corner = np.unique(cells[kept], return_inverse=True)
+    inner = np.isin(nodes[used], own)
+    return _Around(nodes[used], corner.reshape(-1, 4), inner, elements)
+
+
+def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
+    """Return the nodes of subdomains, and their cells (E, 4) as places in these."""
+    torn = layout.torn_nodes(subdomains)
+    cells = [
+        torn.number[begin:end][layout.cells(int(s))]
+        for s, begin, end in zip(subdomains, torn.start, torn.start[1:], strict=False)
+    ]
+    nodes, corner = np.unique(np.concatenate(cells), return_inverse=True)
+    return nodes, corner.reshape(-1, 4)
+
+
+def _holders(layout: Subdivision, node: Nodes) -> Nodes:
+    """List the subdomains that have any of some nodes besides others."""
+    times = layout.times(node)
+    several = times > 1
+    copies = range(int(times.max(initial=1)))
+    held = [layout.holder(node[several & (times > c)], c) for c in copies]
+    return np.unique(np.concatenate(held))
+
+
+def _largest_von_mises(
+    layout: Subdivision,
+    found: OwnSolution,
+    length: float,
+    materials: tuple[Material, ...],
+    plane: Plane,
+) -> tuple[list[float], int]:
+    """Return the largest von Mises stress at nodes of each body, Pa; and all cells."""
+    D = elasticity_matrices(materials, plane)
+    largest, elements = np.zeros(len(materials)), 0
+    for b, mesh, inner, u, own in own_meshes(layout, found, length, REACH):
+        stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
+        most = von_mises(stress, materials[b].nu, plane).max()
+        largest[b] = max(largest[b], most)
+        elements += own
+    everyones = found.bodies.ranks.everyones(np.append(largest, elements))
+    most_of_all = everyones[:, :-1].max(axis=0)
+    return [float(most) for most in most_of_all], int(everyones[:, -1].sum())

@@ -18,18 +18,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import chain
+from functools import cached_property, partial
+from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
 
 from harness import QP, InputError, Vector, no_rows
 from harness.digest import hex_digest
 from harness.distributed.vectors import (
+    EMITTED,
     DistributedColumns,
     Emitted,
     Ranks,
@@ -45,8 +46,13 @@ from problems.feti.distributed import (
     owners,
 )
 from problems.feti.gluing import GLUE
-from problems.feti.operators import DualOperator, explicit_kinds
-from problems.feti.own_bodies import answers
+from problems.feti.operators import (
+    DualOperator,
+    block_bytes,
+    explicit_kinds,
+    touched,
+)
+from problems.feti.own_bodies import Results, answers
 from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
 from problems.feti.tearing import ALIKE, Part, classify, images, spread_of
 from problems.feti.torn import Kind, Subdomains
@@ -76,6 +82,8 @@ class ProblemInParts:
     held: Nodes  #: components of the whole that are zero, in the order of their rows
     contact: Contact
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
+    #: what an answer means physically; None where only the whole tells
+    results: Results | None = None
 
 
 class Entries(NamedTuple):
@@ -285,8 +293,63 @@ def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    answer = answers(own, at, _contact_scale(problem))
-    return Emitted(total, b.size, share, answer)
+    finite = sum(np.count_nonzero(np.isfinite(v)) for v in (lower, upper))
+    answer = answers(own, at, _contact_scale(problem), _torn(own, explicit))
+    return Emitted(
+        variables=total, equality_rows=b.size,
+        bounds=int(ranks.total(np.array([finite]))[0]), share=share,
+        digest=partial(_digest, own), answer=answer,
+    )  # fmt: skip
+
+
+def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
+    """Report how bodies are torn, as `problems.duality.torn_dual.torn_quantities`.
+
+    explicit_mib: what blocks take on all ranks together; one of a kind that several
+    ranks have is on each of these.
+    """
+    domains, rows, ranks = own.domains, own.rows, own.ranks
+    sizes = np.array([part.size for part in touched(rows.B, domains)])
+    taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
+    counts = [own.f.size, explicit[domains.kind].sum(), taken]
+    torn_dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
+    kinds = ranks.comm.allgather({_name_of(kind) for kind in domains.kinds})
+    return {
+        "subdomains": own.rank.size, "kinds": len(set().union(*kinds)),
+        "torn_dofs": int(torn_dofs), "multipliers": rows.total,
+        "explicit_subdomains": int(formed), "explicit_mib": mib,
+    }  # fmt: skip
+
+
+def _name_of(kind: Kind) -> str:
+    """Name a kind of subdomain by its numbers."""
+    return hex_digest(map(np.ndarray.tobytes, (
+        kind.K.data, kind.K.indices, kind.K.indptr, kind.R, kind.fixing, kind.boundary,
+    )), 32)  # fmt: skip
+
+
+def _digest(own: OwnSubdomains) -> str:
+    """Name the numbers of the QP, whichever rank has which subdomain.
+
+    That of each subdomain: its kind, its load, and its columns of B; and of all of them
+    in turn, with what every rank has of the contact.
+    """
+    domains, rows, contact = own.domains, own.rows, own.problem.contact
+    names = [_name_of(kind).encode() for kind in domains.kinds]
+    B = csc_array(rows.B)
+    B.sort_indices()
+    told = []
+    for s, (begin, end) in enumerate(pairwise(domains.start)):
+        ends = B.indptr[begin : end + 1]
+        entries = slice(ends[0], ends[-1])
+        parts = rows.number[B.indices[entries]], B.data[entries], ends - ends[0]
+        numbers = (*map(np.ndarray.tobytes, parts), own.f[begin:end].tobytes())
+        name = hex_digest((names[domains.kind[s]], *numbers))
+        told.append((int(own.number[s]), name))
+    of_all = sorted(chain.from_iterable(own.ranks.comm.allgather(told)))
+    shared = contact.rows.data, contact.c, contact.bound
+    content = (*(name.encode() for _, name in of_all), *(v.tobytes() for v in shared))
+    return EMITTED + hex_digest(content, 16)
 
 
 def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:

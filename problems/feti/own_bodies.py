@@ -1,14 +1,17 @@
-"""What a rank has of torn bodies, as certificates over ranks take it."""
+"""What a rank has of torn bodies and of an answer, to certify and to report it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import bsr_array, csr_array
 
 from harness import Solution, Vector
+from harness.distributed.vectors import Answered
 from harness.verify.over_ranks import Contact, OwnBodies
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import Halo
@@ -18,26 +21,63 @@ from problems.feti.torn import Torn
 if TYPE_CHECKING:
     from problems.feti.emission import OwnSubdomains, ProblemInParts
 
-#: of this rank's slice of a solution → its bodies, the displacement (n,) of its
-#: components, and the multipliers (m,) of all rows of contact and friction
-Answer = Callable[[Solution], tuple[OwnBodies, Vector, Vector]]
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OwnSolution:
+    """What one rank has of a displacement, and the forces along all contacts.
+
+    Its methods are called by all ranks, and give them the same.
+    """
+
+    subdomains: OwnSubdomains
+    bodies: OwnBodies
+    u: Vector  #: (n,) at `bodies.components`, the same of copies on several ranks
+    z: Vector  #: (m,) multipliers of all rows of contact and friction, on every rank
+
+    def at(self, component: Nodes) -> Vector:
+        """Tell all ranks the displacement at components (w,) of the whole."""
+        return np.asarray(self.bodies.among.traced(self.u, component))
+
+    def diagonal(self, component: Nodes) -> Vector:
+        """Tell all ranks the diagonal of K at components (w,) of the whole."""
+        among = self.bodies.among
+        places, here = among.places(component)
+        known = np.unique(places[here])
+        found = np.zeros(self.u.size)
+        found[known] = self.bodies.parts.diagonal(known)
+        return np.asarray(among.traced(among.completed(found), component))
+
+    @cached_property
+    def energy(self) -> float:
+        """½uᵀKu − fᵀu of the whole."""
+        v = self.bodies.parts.spread @ self.u
+        work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
+        return self.bodies.among.total(float(work))[0]
 
 
-def answers(own: OwnSubdomains, halo: Halo, scale: Vector) -> Answer | None:
+#: of what ranks have found → physical results, SI, the same on all ranks
+Results = Callable[[OwnSolution], Mapping[str, Any]]
+
+
+def answers(
+    own: OwnSubdomains, halo: Halo, scale: Vector, torn: Mapping[str, Any]
+) -> Callable[[Solution], Answered]:
     """Make the way back from multipliers to displacements, on each rank for its own.
 
     It is that of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
-    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. None where the
-    supports leave a rigid motion of some body: only the whole knows what holds it.
+    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Where the
+    supports leave a rigid motion of some body, only the whole knows what holds it.
 
+    Parameters
+    ----------
     scale : (m,) by which the rows of contact and friction are multiplied
-    """
-    if not _is_held(own.problem):
-        return None
-    problem, domains, rows = own.problem, own.domains, own.rows
-    equalities = rows.equalities
+    torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
 
-    def answer(s: Solution) -> tuple[OwnBodies, Vector, Vector]:
+    """
+    problem, domains, rows = own.problem, own.domains, own.rows
+    equalities, is_held = rows.equalities, _is_held(problem)
+
+    def answer(s: Solution) -> Answered:
         bodies, times = _bodies(own)
         T, R = bodies.parts.spread, bodies.parts.kernel
         touched = halo.gathered(np.asarray(s.x))
@@ -49,7 +89,15 @@ def answers(own: OwnSubdomains, halo: Halo, scale: Vector) -> Answer | None:
         z = np.zeros(scale.size)
         z[owned[is_contact] - equalities] = np.asarray(s.x)[is_contact]
         z = scale * own.ranks.total(z)
-        return bodies, u, z[_carrying(problem)]
+        found, results = OwnSolution(subdomains=own, bodies=bodies, u=u, z=z), None
+        if (reported := problem.results) is not None:
+
+            def results() -> Mapping[str, Any]:
+                return {**reported(found), **torn}
+
+        return Answered(
+            (bodies, u, z[_carrying(problem)]) if is_held else None, results
+        )
 
     return answer
 

@@ -51,6 +51,7 @@ from problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m
+NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
 
@@ -98,7 +99,7 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
     load = np.zeros(mesh.dofs)
     load[_tip(sides)[1]] = -LOAD
     return assemble(
-        mesh, body, names=("beam", "ring"), materials=(BEAM, RING), plane=plane,
+        mesh, body, names=NAMES, materials=(BEAM, RING), plane=plane,
         units=(LENGTH, LOAD), fixed=_clamps(sides), load=load,
         pairs=(_pair(sides),),
     )  # fmt: skip
@@ -109,12 +110,14 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     p: Any = params
     grids, laws = _grids(p["Nr"], p["Nh"], p["radial"]), (law_of(params),)
     sides = joined_sides(grids)
+    tip = _tip(sides)
     return in_parts(
         Layout.of(grids, p["feti"]), materials=(BEAM, RING), plane=p["plane"],
-        units=(LENGTH, LOAD), fixed=_clamps(sides),
-        load=(_tip(sides)[1:], np.array([-LOAD / p["steps"]])),
+        units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
+        load=(tip[1:], np.array([-LOAD / p["steps"]])),
         pairs=(_pair(sides),),
         linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=lambda found, _: {"tip": (found.at(tip) * LENGTH).tolist()},
     )  # fmt: skip
 
 

@@ -132,7 +132,8 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     named = np.concatenate([fixed, bodies.interface]) // 2
     return in_parts(
         mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
-        plane=bodies.plane, units=(bodies.length, bodies.force), fixed=fixed,
+        plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
+        fixed=fixed,
         load=(loaded, bodies.f[loaded] * (bodies.force / p["steps"])),
         pairs=bodies.pairs, linearise=at_rest(*method, laws), laws=laws, glue=p["glue"],
     )  # fmt: skip

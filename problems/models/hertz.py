@@ -46,6 +46,7 @@ from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vect
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
+    ContactSides,
     assemble,
     clamped,
     floating,
@@ -64,6 +65,7 @@ from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
 from problems.fem.mesh import HalfDisc, Mesh, Nodes, join, joined_sides, nodal_lengths
 from problems.feti.elastic import (
+    AtSides,
     SubdividedBodies,
     at_rest,
     in_parts,
@@ -71,11 +73,13 @@ from problems.feti.elastic import (
     subdivide,
 )
 from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.subdivision import half_discs_in_blocks
 from problems.feti.tearing import Block, compact_blocks, labelled
 from problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
+ALONE, NAMES = ("cylinder",), ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
@@ -122,6 +126,11 @@ class Halves(NamedTuple):
         """
         return [compact_blocks(disc.lengths(), most) for disc in self.discs]
 
+    def results(self, found: OwnSolution, at: AtSides) -> dict[str, Any]:
+        """Compare what ranks have found with the exact pressure."""
+        del found
+        return pressure_quantities(at.bodies, at.primal, self.exact, at.solution)
+
 
 def half_on_plane(params: Mapping[str, Value]) -> Halves:
     """Divide the cylinder on a rigid plane, n cells per a."""
@@ -142,7 +151,7 @@ def _on_plane(
     mesh = disc.mesh()
     sides = mesh.boundaries
     bodies = assemble(
-        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("cylinder",),
+        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=ALONE,
         materials=materials, plane=p["plane"], units=(RADIUS, exact.P),
         fixed=2 * _on_axis(sides),
         load=_loaded(mesh, _pressed((disc,), "flat", exact.P)),
@@ -159,10 +168,11 @@ def on_plane_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     return in_parts(
         half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
         materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
-        fixed=2 * _on_axis(sides), load=_pressed(halves.discs, "flat", halves.exact.P),
+        names=ALONE, fixed=2 * _on_axis(sides),
+        load=_pressed(halves.discs, "flat", halves.exact.P),
         pairs=(_on_rigid(sides),),
         linearise=lambda arc: above_plane(arc.mesh, arc.pairs[0].slave),
-        glue=p["glue"],
+        glue=p["glue"], results=halves.results,
     )  # fmt: skip
 
 
@@ -246,7 +256,7 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     else:
         fixed = _guided(sides)
     bodies = assemble(
-        mesh, body, names=("upper", "lower"), materials=materials,
+        mesh, body, names=NAMES, materials=materials,
         plane=p["plane"], units=(RADIUS, exact.P), fixed=fixed, load=load,
         pairs=(_pair(params, sides),),
     )  # fmt: skip
@@ -261,10 +271,11 @@ def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     return in_parts(
         half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
         materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
-        fixed=_guided(sides),
+        names=NAMES, fixed=_guided(sides),
         load=_pressed(halves.discs, "upper_flat", halves.exact.P),
         pairs=(_pair(params, sides),),
         linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=halves.results,
     )  # fmt: skip
 
 
@@ -401,7 +412,7 @@ def _loaded(mesh: Mesh, load: tuple[Nodes, Vector]) -> Vector:
 
 
 def pressure_quantities(
-    bodies: Bodies, primal: QP, exact: LineContact, s: Solution
+    bodies: Bodies | ContactSides, primal: QP, exact: LineContact, s: Solution
 ) -> dict[str, Any]:
     """Compare the pressure on the slave side with Hertz's.
 

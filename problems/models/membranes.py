@@ -41,6 +41,7 @@ from problems.fem.mesh import (
 )
 from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import Part, blocks, decompose
@@ -151,6 +152,7 @@ class Membranes:
             kind=membrane_kind, E=np.ones(2), load=self.load, glue=rows,
             held=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
+            results=self.results,
         )  # fmt: skip
 
     @property
@@ -181,16 +183,25 @@ class Membranes:
 
         Of a solution of the primal problem; energy and force are per tension.
         """
+        return self._reported(s.z, self.qp.objective(s.x), float(s.x.min()))
+
+    def results(self, found: OwnSolution) -> dict[str, Any]:
+        """Report what ranks have found, as `quantities`; called by all of them."""
+        lowest = found.bodies.ranks.extreme(float(found.u.min()), np.min)
+        return self._reported(found.z, found.energy, lowest)
+
+    def _reported(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
+        nodes = 2 * (self.side + 1) ** 2
         return {
-            "nodes": len(self.mesh.points),
-            "elements": len(self.mesh.cells),
-            "dofs": self.qp.q.size,
-            "equality_rows": self.qp.b.size,
-            "contact_rows": self.qp.h.size,
-            "active": int(active(s.z).sum()),
-            "energy": self.qp.objective(s.x),
-            "contact_force": float(s.z.sum()),
-            "lowest": float(s.x.min()),
+            "nodes": nodes,
+            "elements": 2 * self.side**2,
+            "dofs": nodes,
+            "equality_rows": self.side + 1,
+            "contact_rows": z.size,
+            "active": int(active(z).sum()),
+            "energy": energy,
+            "contact_force": float(z.sum()),
+            "lowest": lowest,
         }
 
 

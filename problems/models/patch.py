@@ -37,6 +37,7 @@ from problems.contact.bodies import (
     ContactPair,
     assemble,
     clamped,
+    elasticity_matrices,
     floating,
     supported,
 )
@@ -51,6 +52,7 @@ from problems.fem.elasticity import Material
 from problems.fem.finite_strain import cauchy_stress, strain_energy
 from problems.fem.hyperelastic import Hyperelastic, hyperelastic
 from problems.fem.mesh import (
+    Mesh,
     Nodes,
     StructuredGrid,
     as_vectors,
@@ -61,18 +63,22 @@ from problems.fem.mesh import (
 )
 from problems.fem.stress import gauss_stress
 from problems.feti.elastic import (
+    AtSides,
     SubdividedBodies,
     at_rest,
     in_parts,
+    own_meshes,
     posed_on,
     subdivide,
 )
 from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.tearing import structured_bodies
 from problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
+NAMES = ("lower", "upper")
 PRESSURE = 1e6  #: p, Pa
 UNITS = (LENGTH, PRESSURE * LENGTH)  #: l and F₀, m and N/m
 E_UPPER, NU = 10e6, 0.3  #: Pa
@@ -253,7 +259,7 @@ def model(params: Mapping[str, Value]) -> Bodies:
     load = np.zeros(mesh.dofs)
     load[component] = force
     return assemble(
-        mesh, body, names=("lower", "upper"), materials=_materials(params),
+        mesh, body, names=NAMES, materials=_materials(params),
         plane=p["plane"], units=UNITS, fixed=_rollers(sides), load=load,
         pairs=(_pair(params, sides),),
     )  # fmt: skip
@@ -262,13 +268,22 @@ def model(params: Mapping[str, Value]) -> Bodies:
 def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     """Describe the linear problem in subdomains."""
     p: Any = params
-    grids, laws = _grids(params), (law_of(params),)
-    sides = joined_sides(grids)
+    grids, laws, materials = _grids(params), (law_of(params),), _materials(params)
+    sides, layout = joined_sides(grids), Layout.of(grids, p["feti"])
+    D = elasticity_matrices(materials, p["plane"])
+
+    def error(found: OwnSolution, _: AtSides) -> dict[str, Any]:
+        largest = max(
+            _stress_error(of.mesh, D[of.body], of.u)
+            for of in own_meshes(layout, found, LENGTH)
+        )
+        return {"stress_error": found.bodies.ranks.extreme(largest, np.max)}
+
     return in_parts(
-        Layout.of(grids, p["feti"]), materials=_materials(params), plane=p["plane"],
-        units=UNITS, fixed=_rollers(sides), load=_pressure(grids),
-        pairs=(_pair(params, sides),),
+        layout, materials=materials, plane=p["plane"], units=UNITS, names=NAMES,
+        fixed=_rollers(sides), load=_pressure(grids), pairs=(_pair(params, sides),),
         linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        results=error,
     )  # fmt: skip
 
 
@@ -309,5 +324,9 @@ def _divisions(n: int) -> tuple[int, int]:
 
 def stress_error(bodies: Bodies, s: Solution) -> float:
     """Return the largest |σ_y + p|/p over all Gauss points."""
-    stress = gauss_stress(bodies.mesh, bodies.D, s.x * bodies.length)
+    return _stress_error(bodies.mesh, bodies.D, s.x * bodies.length)
+
+
+def _stress_error(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> float:
+    stress = gauss_stress(mesh, D, u)
     return float(np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE)

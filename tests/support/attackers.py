@@ -136,7 +136,7 @@ class Forges(Honest):
     answer: ClassVar[dict] = dict(
         claimed="solved", message="", iterations=1, counts={}, reported={},
         prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6,
-        rank_seconds={}, rank_counts={}, rank_network={}, evaluated=None,
+        rank_seconds={}, rank_counts={}, rank_network={},
         first_seconds=None,
         peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=1.0,
         inner=1, canary_seconds=1e-6,

@@ -14,7 +14,7 @@ from harness.distributed.vectors import Ranks
 from harness.names import parse
 from harness.verify.certificate import UncertifiableError
 from harness.verify.kkt import kkt_residuals
-from harness.verify.verdicts import evaluated_by_ranks
+from harness.verify.verdicts import evaluated_by_ranks, plain
 from problems import PROBLEMS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
@@ -25,13 +25,18 @@ TOLS = (1e-4, 1e-6)
 def evaluated(name, ranks):
     """Evaluate answers by all ranks, and what they are together by one process."""
     case_id = parse(name, PROBLEMS)
-    emitted = case_id.family.emitted(case_id.form, case_id.params, ranks)
+    emitted = case_id.family.emission(case_id.form, case_id.params)(ranks)
+    digest = emitted.digest()
+    alone = case_id.family.emission(case_id.form, case_id.params)(
+        Ranks(MPI.COMM_SELF)
+    ).digest()
     found = []
     for tol in TOLS:
         share = emitted.share()
         s = SMALBE().prepare(share.qp, tol)()
         by_ranks = evaluated_by_ranks(emitted, s, ranks)
-        same = ranks.comm.allgather(by_ranks["bounds"].get("energy_bound"))
+        bounds = by_ranks["bounds"] or {}
+        same = ranks.comm.allgather(bounds.get("energy_bound"))
         whole = share.whole(s)
         if whole is None:
             continue
@@ -45,7 +50,11 @@ def evaluated(name, ranks):
             bound, parts = np.nan, {}
         found.append({
             "by_ranks": by_ranks, "same": len(set(same)) == 1,
-            "by_one": {"values": one, "bound": bound, "parts": parts},
+            "by_one": {
+                "values": one, "bound": bound, "parts": parts,
+                "quantities": plain(case.quantities(whole)),
+            },
+            "digests": [digest, alone], "sizes": [emitted.sizes, case.qp.sizes],
         })  # fmt: skip
     return found
 

@@ -18,7 +18,12 @@ from harness.files.qpfile import save_qp
 from harness.names import assemble
 from harness.processes import supervisor
 from harness.processes.measurement import _believed, measured, scratch_folder
-from harness.processes.protocol import ForeignReplyError, checked_answer, event_of
+from harness.processes.protocol import (
+    ForeignReplyError,
+    checked_answer,
+    checked_emitted,
+    event_of,
+)
 from harness.processes.reaper import lives, state
 from harness.processes.supervisor import REPLACED, Clock, Reply, WorkerProcess
 from harness.registry import SolverSpec, load_plugin, resolve
@@ -94,7 +99,7 @@ ANSWER = dict(
     claimed="solved", message="", iterations=1, counts={"products": 3},
     reported={"linear_solver": "ldl", "seconds": 0.1, "none": None},
     prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6, first_seconds=None,
-    rank_seconds={}, rank_counts={}, rank_network={}, evaluated=None,
+    rank_seconds={}, rank_counts={}, rank_network={},
     peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None, inner=1,
     canary_seconds=1e-6,
 )  # fmt: skip
@@ -172,7 +177,7 @@ class Bench:
         )  # fmt: skip
         worker = self.workers[solver]
         return measured(
-            worker, self.qp, record, request, time_limit=time_limit,
+            worker, lambda: self.qp, record, request, time_limit=time_limit,
             memory_limit=self.memory_limit, prove=proves(reference_solution),
         )[0]  # fmt: skip
 
@@ -237,6 +242,48 @@ def test_an_answer_of_another_form_is_refused(change, message):
         checked_answer({"qp": ""}, ANSWER | change)
 
     assert len(str(e.value)) < 300
+
+
+EVALUATED = dict(
+    values=dict(objective=1.0, primal=0.0, dual=0.0, complementarity=0.0, gap=0.0),
+    bounds={"energy_bound": 1e-9}, quantities={}, recover_seconds=0.1, notes=[],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"values": {"objective": 1.0}},
+        {"values": EVALUATED["values"] | {"primal": "0"}},
+        {"values": EVALUATED["values"] | {"dual": float("nan")}},
+        {"bounds": {"status": 1.0}},
+        {"quantities": []},
+        {"recover_seconds": -1.0},
+        {"notes": "text"},
+        {"status": "verified"},
+    ],
+)
+def test_an_evaluation_by_ranks_of_another_form_is_refused(change):
+    sound = ANSWER | {"evaluated": EVALUATED}
+    checked_answer({"case": {}}, dict(sound))
+    checked_answer({"case": {}}, ANSWER | {"evaluated": None})
+    with pytest.raises(ForeignReplyError, match="evaluated = "):
+        checked_answer({"case": {}}, sound | {"evaluated": EVALUATED | change})
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"sizes": {"variables": -1}, "digest": "", "build_seconds": 0.0},
+        {"sizes": {}, "digest": 7, "build_seconds": 0.0},
+        {"sizes": {}, "digest": "", "build_seconds": "0"},
+        {"sizes": {}, "digest": ""},
+    ],
+)
+def test_what_is_told_of_an_emitted_qp_has_one_form(told):
+    checked_emitted({"sizes": {"variables": 3}, "digest": "", "build_seconds": None})
+    with pytest.raises(ForeignReplyError):
+        checked_emitted(told)
 
 
 CLOCK = Clock(least=0.1, seen=0.15, most=0.2)

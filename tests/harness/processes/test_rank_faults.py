@@ -1,0 +1,159 @@
+"""What becomes of a measurement where one of its ranks fails, stage by stage."""
+
+import os
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+import mortarbench as mb
+from harness.processes import supervisor
+from tests.support import SUPPORT
+from tests.support.waiting import soon
+
+pytestmark = pytest.mark.together
+
+SUITE = """
+name = "ranks"
+tolerances = [1e-6]
+repeats = 1
+time_limit = {limit}
+memory_limit = 4096
+solvers = ["smalbe"]
+ranks = [2]
+[[problems]]
+family = "beam-ring"
+forms = ["dual"]
+params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
+"""
+MEASURING = ("emission", "prepare", "solve")
+EVALUATING = ("residuals", "certificate", "quantities")
+#: s that each stage may take: those before the planted one must come to their end
+LIMIT = 20
+KILLED = "rank 1 of 2 ranks ended: Killed"
+RAISED = "rank 1 of 2: ValueError: planted"
+
+
+@pytest.fixture
+def measured(tmp_path, monkeypatch):
+    """Measure once where one rank fails; no process may be left."""
+
+    def run(stage, kind, rank="1", limit=LIMIT):
+        monkeypatch.setenv("FAULT", str(tmp_path))
+        monkeypatch.setenv("FAULT_STAGE", stage)
+        monkeypatch.setenv("FAULT_KIND", kind)
+        monkeypatch.setenv("FAULT_RANK", rank)
+        paths = [str(SUPPORT / "faulty_ranks"), os.environ.get("PYTHONPATH", "")]
+        monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+        monkeypatch.setattr(supervisor, "POINT_SECONDS", limit)
+        suite = tmp_path / "ranks.toml"
+        suite.write_text(SUITE.format(limit=limit))
+        results = mb.run(suite, out=tmp_path / "out")
+        assert soon(lambda: not left(tmp_path))
+        (record,) = results.records
+        assert mb.load(tmp_path / "out").records == results.records
+        return record
+
+    return run
+
+
+def left(mark):
+    """Processes with the mark of a test in their environment, but for this one."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (entry / "environ").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if f"FAULT={mark}".encode() in environment and int(entry.name) != os.getpid():
+            found.append(int(entry.name))
+    return found
+
+
+def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
+    record = measured("emission", "hangs", limit=2)
+
+    assert record.verdict == "time_limit"
+    assert record.message == "emission: killed after 2 s"
+
+
+def test_what_one_rank_cannot_certify_none_does_and_the_note_says_which(measured):
+    record = measured("certificate", "raises-after")
+
+    assert record.verdict == "verified"
+    assert f"no energy_bound: RankFailedError: {RAISED}" in record.message
+    assert record.energy_bound is None
+    assert record.quantities["dofs"] == 848
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", MEASURING + EVALUATING)
+def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, stage):
+    record = measured(stage, "killed")
+
+    assert record.verdict == "crashed"
+    assert KILLED in record.message
+    assert named(record.message, stage)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", MEASURING + EVALUATING)
+def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
+    record = measured(stage, "hangs")
+
+    assert record.verdict == "time_limit"
+    assert f"killed after {LIMIT} s" in record.message
+    assert named(record.message, stage)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stage", "rank"), list(product(MEASURING + EVALUATING, ["0", "1"]))
+)
+def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage, rank):
+    record = measured(stage, "raises", rank=rank)
+
+    if rank == "0" and stage in ("prepare", "solve"):  # the solver of the parent's rank
+        assert (record.verdict, record.claimed) == ("failed", "failed")
+        assert "ValueError: planted" in record.message
+    else:
+        assert record.verdict == "crashed"
+        assert f"rank {rank} of 2: ValueError: planted" in record.message
+        assert named(record.message, stage)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", ["1", "all"])
+def test_a_case_that_ranks_cannot_emit_fails_with_the_reason(measured, rank):
+    record = measured("emission", "raises-after", rank=rank)
+
+    assert record.verdict == "failed"
+    said = RAISED if rank == "1" else "ValueError: planted"
+    assert f"emission: {said}" in record.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", ["1", "all"])
+def test_an_answer_that_ranks_cannot_judge_is_judged_by_one_process(measured, rank):
+    record = measured("residuals", "raises-after", rank=rank)
+
+    assert record.verdict == "verified"
+    assert "no evaluation by ranks" in record.message
+    assert record.energy_bound < 1e-5
+    assert record.quantities["dofs"] == 848
+
+
+@pytest.mark.slow
+def test_quantities_that_fail_on_a_rank_cost_neither_verdict_nor_bound(measured):
+    record = measured("quantities", "raises-after")
+
+    assert record.verdict == "verified"
+    assert f"no quantities: RankFailedError: {RAISED}" in record.message
+    assert record.energy_bound < 1e-5
+
+
+def named(message, stage):
+    """Whether a message says in which stage it was, where the clock did not run."""
+    if stage == "emission":
+        return message.startswith("emission: ")
+    return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

@@ -1,0 +1,83 @@
+"""Makes one rank fail in one stage of a measurement, as FAULT_… of the environment say.
+
+Python imports this module when it starts, where its folder is on PYTHONPATH: the ranks
+of tests/harness/processes/test_rank_faults.py are those of users but for what is
+planted here. FAULT_RANK: which of them, or "all". FAULT_STAGE: one of `STAGES`.
+FAULT_KIND: killed, hangs, raises (while others go on), raises-after (when all are
+through).
+"""
+
+import os
+import signal
+import sys
+import time
+from importlib.machinery import PathFinder
+
+#: module and name of what fails; of a class, its method
+STAGES = {
+    "emission": ("problems.feti.emission", "emitted"),
+    "prepare": ("solvers.smalbe.solver", "SMALBE.prepare"),
+    "solve": ("solvers.smalbe.solver", "SMALBE.prepare"),
+    "residuals": ("harness.verify.verdicts", "_values_by_ranks"),
+    "certificate": ("harness.verify.verdicts", "certify_over_ranks"),
+    "quantities": ("problems.feti.elastic", "_largest_von_mises"),
+}
+KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
+
+
+def fail():
+    if KIND == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if KIND == "hangs":
+        time.sleep(3600)
+    raise ValueError("planted")
+
+
+def failing(work):
+    def fails(*args, **kwargs):
+        found = work(*args, **kwargs) if KIND == "raises-after" else None
+        fail()
+        return found
+
+    return fails
+
+
+def in_stage(work):
+    """Make what fails in the stage; solvers warm up on QPs that no ranks share."""
+    if STAGE not in ("prepare", "solve"):
+        return failing(work)
+
+    def prepare(solver, qp, tol):
+        if type(qp.A).__name__ != "DistributedColumns":
+            return work(solver, qp, tol)
+        if STAGE == "prepare":
+            return failing(work)(solver, qp, tol)
+        return failing(work(solver, qp, tol))
+
+    return prepare
+
+
+class Planter:
+    """Finds the module where something is to fail, and plants that when it is there."""
+
+    def find_spec(self, name, path=None, target=None):
+        module, _, of = STAGES[STAGE][0], *STAGES[STAGE]
+        if name != module:
+            return None
+        spec = PathFinder.find_spec(name, path, target)
+        run = spec.loader.exec_module
+
+        def exec_module(loaded):
+            run(loaded)
+            *holder, last = of.split(".")
+            where = getattr(loaded, holder[0]) if holder else loaded
+            setattr(where, last, in_stage(getattr(where, last)))
+
+        spec.loader.exec_module = exec_module
+        return spec
+
+
+if STAGE and os.environ.get("PMI_RANK") in (
+    [os.environ["FAULT_RANK"]] if os.environ["FAULT_RANK"] != "all" else ["0", "1"]
+):
+    sys.meta_path.insert(0, Planter())
