@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from harness import Vector
 from problems.fem.mesh import Nodes, StructuredGrid, cells_of_block
-from problems.feti.subdivision import Integers, Points, Surroundings, TornNodes
+from problems.feti.subdivision import Integers, Points, TornNodes
 from problems.feti.tearing import blocks
 
 
@@ -168,20 +168,6 @@ class Layout:
         """List the cells (E, 4) of a block."""
         _, _, columns, rows = self.corner(np.array([subdomain]))
         return cells_of_block(int(columns[0]), int(rows[0]))
-
-    def around(self, subdomain: int, reach: int) -> Surroundings:
-        """Give a block and the cells around it, within its grid."""
-        left, low, wide, high = (int(x[0]) for x in self.corner(np.array([subdomain])))
-        b = int(self.body[subdomain])
-        grid = self.grids[b]
-        i = np.arange(max(left - reach, 0), min(left + wide + reach, grid.columns.size))
-        j = np.arange(max(low - reach, 0), min(low + high + reach, grid.rows.size))
-        inner = ((j >= low) & (j < low + high))[:, None]
-        inner = inner & (i >= left) & (i < left + wide)
-        node = self.node_start[b] + j[:, None] * grid.columns.size + i
-        points = grid.block(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1))
-        cells = cells_of_block(i.size, j.size)
-        return Surroundings(node.ravel(), points, cells, inner.ravel())
 
     def places(self, node: Nodes) -> Places:
         """Find nodes by their numbers (k,)."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -34,15 +34,6 @@ class TornNodes(NamedTuple):
     times: Integers  #: (M,) copies of it in all subdomains
     copy: Integers  #: (M,) which of these it is, from 0 on
     start: NDArray[np.int64]  #: (subdomains + 1,) first of each, and M
-
-
-class Surroundings(NamedTuple):
-    """A subdomain of one body, with the cells around it."""
-
-    node: Nodes  #: (n,) in the whole
-    points: Points  #: (n, 2)
-    cells: Nodes  #: (E, 4) places in `node`
-    inner: NDArray[np.bool_]  #: (n,) those of the subdomain
 
 
 class Subdivision(Protocol):
@@ -74,9 +65,6 @@ class Subdivision(Protocol):
 
     def cells(self, subdomain: int) -> Nodes:
         """List the cells (E, 4) of one; corners are places in its list of nodes."""
-
-    def around(self, subdomain: int, reach: int) -> Surroundings:
-        """Give a subdomain and at least all cells that are `reach` nodes away."""
 
     def times(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,)."""
@@ -118,8 +106,6 @@ class Listed:
     held_by: Nodes  #: (l,) subdomains that have it, ascending for each
     #: nodes (n,) of a subdomain, ascending, and its cells (E, 4) as places in these
     part: Callable[[int], tuple[Nodes, Nodes]]
-    #: as `part`, with at least all cells that are so many nodes away
-    wider: Callable[[int, int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
 
     @property
@@ -160,12 +146,6 @@ class Listed:
     def cells(self, subdomain: int) -> Nodes:
         """List the cells (E, 4) of one; corners are places in its list of nodes."""
         return self.part(subdomain)[1]
-
-    def around(self, subdomain: int, reach: int) -> Surroundings:
-        """Give a subdomain and at least all cells that are `reach` nodes away."""
-        node, cells = self.wider(subdomain, reach)
-        inner = np.isin(node, self.part(subdomain)[0])
-        return Surroundings(node, self.position(node), cells, inner)
 
     def _place(self, node: Nodes) -> Nodes:
         """Find listed nodes."""
@@ -250,15 +230,6 @@ def half_discs_in_blocks(
         nodes, cells = disc.block(angles, rings)
         return begin + nodes, cells
 
-    def wider(s: int, reach: int) -> tuple[Nodes, Nodes]:
-        disc, begin, rings, angles = every[s]
-        a, r = disc.divisions
-        deep = slice(max(rings.start - reach, 0), min(rings.stop + reach, r))
-        wide = slice(max(angles.start - reach, 0), min(angles.stop + reach, a))
-        # at the centre all triangles are neighbours
-        nodes, cells = disc.block(wide if deep.stop < r else slice(0, a), deep)
-        return begin + nodes, cells
-
     def position(node: Nodes) -> Points:
         of = np.searchsorted(first, node, side="right") - 1
         found = np.empty((node.size, 2))
@@ -272,7 +243,7 @@ def half_discs_in_blocks(
     )
     return Listed(
         nodes=int(first[-1]), body=body, node=node, start=start, held_by=held_by,
-        part=part, wider=wider, position=position,
+        part=part, position=position,
     )  # fmt: skip
 
 
@@ -309,26 +280,12 @@ def mesh_in_parts(
     several = kept[number]
     node, start, held_by = listed_by_holders(number[several], subdomain[several], S)
 
-    def among(own: Nodes) -> tuple[Nodes, Nodes]:
-        nodes, corner = np.unique(cells[own], return_inverse=True)
-        return nodes, corner.reshape(-1, cells.shape[1])
-
     def part(s: int) -> tuple[Nodes, Nodes]:
-        return among(by_label[ends[s] : ends[s + 1]])
-
-    @cache
-    def cells_at() -> csr_array:
-        corners = np.arange(0, cells.size + 1, cells.shape[1])
-        at = (np.ones(cells.size, dtype=np.int8), cells.ravel(), corners)
-        return csr_array(csr_array(at, shape=(len(cells), N)).T)
-
-    def wider(s: int, reach: int) -> tuple[Nodes, Nodes]:
-        own = by_label[ends[s] : ends[s + 1]]
-        for _ in range(reach):
-            own = np.unique(cells_at()[among(own)[0]].indices)
-        return among(own)
+        own = cells[by_label[ends[s] : ends[s + 1]]]
+        nodes, corner = np.unique(own, return_inverse=True)
+        return nodes, corner.reshape(own.shape)
 
     return Listed(
         nodes=N, body=body[by_label[ends[:-1]]], node=node, start=start,
-        held_by=held_by, part=part, wider=wider, position=points.__getitem__,
+        held_by=held_by, part=part, position=points.__getitem__,
     )  # fmt: skip

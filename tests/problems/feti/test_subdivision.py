@@ -130,23 +130,6 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
         assert_array_equal(of.cells(s), of.cells(first))
 
 
-@pytest.mark.parametrize("reach", [0, 1, 2])
-def test_around_a_subdomain_are_all_cells_within_reach(known, reach):
-    of, mesh, _, whole = known
-    own = np.split(whole.node, whole.start[1:-1])
-    rows = {row.tobytes(): e for e, row in enumerate(mesh.cells)}
-    for s in range(0, of.count, max(1, of.count // 8)):
-        found = of.around(s, reach)
-        cells = {rows[row.tobytes()] for row in found.node[found.cells]}
-        near = own[s][of.cells(s)]
-        for _ in range(reach):
-            near = mesh.cells[np.isin(mesh.cells, near).any(axis=1)]
-
-        assert {rows[row.tobytes()] for row in near} <= cells
-        assert_array_equal(found.points, mesh.points[found.node])
-        assert_array_equal(found.node[found.inner], own[s])
-
-
 def test_sides_of_bodies_and_interfaces_have_holders_and_points(known):
     of, mesh, _, whole = known
     times = np.bincount(whole.node)
