@@ -35,7 +35,8 @@ def found(request):
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "evaluated_on_ranks.py"), *HELD, HELD_BY_CONTACT, PATCH, HERTZ,
+            str(SUPPORT / "evaluated_on_ranks.py"),
+            *HELD, HELD_BY_CONTACT, PATCH, HERTZ,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
