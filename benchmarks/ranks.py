@@ -6,8 +6,9 @@ Products are bound by memory, which the CPUs of a machine share: two copies of a
 two CPUs do not do twice as much as one either. So the speed-up of a solve on all ranks
 is shown beside what so many copies, each on a rank of its own, reach together. Rounds
 of all three ways are interleaved in one job, on one QP; medians are printed, with the
-least and the largest, and of the last solve on all ranks what each of them spent on its
-parts. Nothing is asserted: machines differ.
+least and the largest, and what each rank spent on the parts of a solve, in all three
+ways. Measurements during which other processes used the CPUs are left out, and how many
+were kept is printed (Linux). Nothing is asserted: machines differ.
 """
 
 import os
@@ -23,6 +24,7 @@ from solvers.smalbe.solver import SMALBE
 
 CASE = "beam-ring/Nr=224/Nh=128/steps=1/feti=32/dual"
 TOL = 1e-6
+OTHERS = 0.04  #: of a CPU, that others may take of a measurement
 
 
 def together(comm: MPI.Comm) -> None:
@@ -30,6 +32,26 @@ def together(comm: MPI.Comm) -> None:
     request = comm.Ibarrier()
     while not request.Test():
         time.sleep(1e-3)
+
+
+def busy():
+    """CPU seconds that this machine has spent on anything since it started."""
+    with open("/proc/stat") as stat:
+        spent = [int(ticks) for ticks in stat.readline().split()[1:9]]
+    return (sum(spent) - sum(spent[3:5])) / os.sysconf("SC_CLK_TCK")  # without idle
+
+
+def undisturbed(world, act):
+    """Have every rank do something; None where other processes took CPU time."""
+    together(world)
+    others, start = busy() - time.process_time(), time.perf_counter()
+    before = time.process_time()
+    found = act()
+    together(world)
+    ours = world.allreduce(time.process_time() - before)
+    passed = time.perf_counter() - start
+    others = busy() - (others + before) - ours
+    return found if world.bcast(others / passed) < OTHERS else None
 
 
 def timed(qp, comm):
@@ -46,7 +68,9 @@ def timed(qp, comm):
     comm.Barrier()
     end = time.perf_counter()
     qp.P.forget()
-    return (ready - start, end - ready), dict(ranks.seconds) | ranks.counts
+    parts = dict(ranks.seconds)
+    parts["vectors"] = end - ready - sum(parts.values())
+    return {"prepare": ready - start, "solve": end - ready} | parts | ranks.counts
 
 
 def main(name: str = CASE, repeats: str = "5") -> None:
@@ -55,38 +79,50 @@ def main(name: str = CASE, repeats: str = "5") -> None:
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})  # as ranks of a run
     qp = mb.build(name).qp
-    found: dict[str, list[tuple[float, ...]]] = {"alone": [], "copies": [], "ranks": []}
-    for round_ in range(int(repeats) + 1):
-        together(world)
-        one, _ = timed(qp, alone) if world.rank == 0 else ((0.0, 0.0), {})
-        together(world)
-        copies, _ = timed(qp, alone)
-        together(world)
-        all_, parts = timed(qp, world)
-        slowest = [world.allreduce(seconds, MPI.MAX) for seconds in copies]
-        if round_:  # the first one warms up
-            for way, times in zip(found, (one, slowest, all_), strict=True):
-                found[way].append(tuple(times))
-    of_each = world.gather(parts)
-    if of_each is None:
+    ways = {
+        "alone": lambda: timed(qp, alone) if world.rank == 0 else {},
+        "copies": lambda: timed(qp, alone),
+        "ranks": lambda: timed(qp, world),
+    }
+    found: dict[str, list[list[dict[str, float]]]] = {way: [] for way in ways}
+    rounds = int(repeats) + 1
+    for round_ in range(rounds):
+        for way, act in ways.items():
+            one = undisturbed(world, act)
+            if round_ and one is not None:  # the first one warms up
+                found[way].append(world.allgather(one))
+    if world.rank:
         return
     print(f"{name}: {qp.q.size} multipliers, {world.size} ranks")
-    for i, phase in enumerate(("prepare", "solve")):
-        columns = {way: [t[i] for t in times] for way, times in found.items()}
-        for way, times in columns.items():
+    kept = ", ".join(f"{way} {len(found[way])}" for way in found)
+    print(f"  undisturbed, of {rounds - 1} rounds: {kept}")
+    if not all(found.values()):
+        return
+    for phase in ("prepare", "solve"):
+        slowest = {
+            way: [max(rank.get(phase, 0.0) for rank in one) for one in each]
+            for way, each in found.items()
+        }
+        for way, times in slowest.items():
             print(
                 f"  {phase:8} {way:7} {median(times):8.3f} s"
                 f" [{min(times):.3f}, {max(times):.3f}]"
             )
-        one, copies, ranks = map(median, columns.values())
+        one, copies, ranks = map(median, slowest.values())
         speed, most = one / ranks, world.size * one / copies
         print(
             f"  {phase:8} speed-up {speed:.2f}, of {most:.2f} that copies reach: "
             f"{speed / most:.2f}"
         )
-    for part in of_each[0]:
-        each = ", ".join(f"{one[part]:.3g}" for one in of_each)
-        print(f"  solve, {part:10} by rank: {each}")
+    for part in list(found["ranks"][0][0])[2:]:
+        each = "; ".join(
+            f"{way} " + ", ".join(
+                f"{median(one[rank][part] for one in of_way):.3g}"
+                for rank in range(world.size) if part in of_way[0][rank]
+            )
+            for way, of_way in found.items()
+        )  # fmt: skip
+        print(f"  solve, {part:10} {each}")
 
 
 if __name__ == "__main__":

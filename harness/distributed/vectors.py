@@ -14,8 +14,7 @@ the slice alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from time import perf_counter
@@ -104,38 +103,72 @@ class Ranks:
             self.comm.Allgather(part, parts)
         return parts
 
-    def exchanged(
+    def exchange(
         self,
         out: NDArray[np.float64],
         sizes: NDArray[np.int64],
         coming: NDArray[np.int64],
-    ) -> NDArray[np.float64]:
-        """Send consecutive parts to all ranks, and return what comes from them.
+    ) -> Callable[[], NDArray[np.float64]]:
+        """Send consecutive parts to other ranks, who send at the same time.
 
         sizes, coming : (size,) of what goes to each and of what comes from each
+
+        Returns
+        -------
+        waits until all is there, and returns what came, in the order of the ranks;
+        what is done before that is done meanwhile
+
         """
         out, found = np.ascontiguousarray(out), np.empty(int(coming.sum()))
-        starts = np.cumsum(sizes) - sizes, np.cumsum(coming) - coming
-        self.counts["messages"] += int(np.count_nonzero(sizes))
+        ends, at = np.cumsum(sizes), np.cumsum(coming)
+        sends, comes = (np.flatnonzero(n).tolist() for n in (sizes, coming))
+        self.counts["messages"] += len(sends)
         self.counts["bytes"] += out.nbytes
-        with self.clocked("waiting"):
-            self.comm.Alltoallv([out, (sizes, starts[0])], [found, (coming, starts[1])])
-        return found
+        posted = [
+            self.comm.Irecv(found[at[r] - coming[r] : at[r]], source=r) for r in comes
+        ]
+        posted += [
+            self.comm.Isend(out[ends[r] - sizes[r] : ends[r]], dest=r) for r in sends
+        ]
 
-    @contextmanager
-    def clocked(self, what: str) -> Iterator[None]:
+        def arrived() -> NDArray[np.float64]:
+            if posted:
+                with self.clocked("waiting"):
+                    for request in posted:
+                        request.Wait()
+            return found
+
+        return arrived
+
+    def clocked(self, what: str) -> _Clock:
         """Note how long something takes, one of the `PARTS`, less other parts in it."""
-        start, before = perf_counter(), sum(self.seconds.values())
-        try:
-            yield
-        finally:
-            within = sum(self.seconds.values()) - before
-            self.seconds[what] += perf_counter() - start - within
+        return _Clock(self.seconds, what)
 
     def clear(self) -> None:
         """Begin to count anew."""
         for table in (self.seconds, self.counts):
             table.update(dict.fromkeys(table, 0))
+
+
+class _Clock:
+    """Adds what a block takes to a part, without what other parts in it took.
+
+    A class, since as a generator it would take a few times as long.
+    """
+
+    __slots__ = ("before", "seconds", "start", "what")
+
+    def __init__(self, seconds: dict[str, float], what: str) -> None:
+        self.seconds, self.what = seconds, what
+
+    def __enter__(self) -> None:
+        self.before = sum(self.seconds.values())
+        self.start = perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        passed = perf_counter() - self.start
+        within = sum(self.seconds.values()) - self.before
+        self.seconds[self.what] += passed - within
 
 
 class DistributedVector(np.ndarray):

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,23 +150,36 @@ class Halo:
         shared[self.borrowed] = shared[self.own[self.lent]] = True
         return shared
 
+    def borrowing(self, x: Vector) -> Callable[[], Vector]:
+        """Send of the owned rows (o,) what others need; returns theirs (t − o,)."""
+        with self.ranks.clocked("exchange"):
+            return self.ranks.exchange(x[self.lent], self.lends, self.borrows)
+
+    def returning(self, y: Vector) -> Callable[[Vector], Vector]:
+        """Send what this rank has for rows of others (t − o,).
+
+        Returns what adds that of the others to what it has for its own rows (o,).
+        """
+        with self.ranks.clocked("exchange"):
+            arrived = self.ranks.exchange(y, self.borrows, self.lends)
+
+        def added(own: Vector) -> Vector:
+            with self.ranks.clocked("exchange"):
+                np.add.at(own, self.lent, arrived())
+            return own
+
+        return added
+
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
-        with self.ranks.clocked("exchange"):
-            found = np.empty(self.rows.size)
-            found[self.own] = x
-            found[self.borrowed] = self.ranks.exchanged(
-                x[self.lent], self.lends, self.borrows
-            )
+        arrived, found = self.borrowing(x), np.empty(self.rows.size)
+        found[self.own] = x
+        found[self.borrowed] = arrived()
         return found
 
     def added(self, y: Vector) -> Vector:
         """Add up what all ranks have for the rows that this one owns (o,)."""
-        with self.ranks.clocked("exchange"):
-            found = y[self.own]
-            come = self.ranks.exchanged(y[self.borrowed], self.borrows, self.lends)
-            np.add.at(found, self.lent, come)
-        return found
+        return self.returning(y[self.borrowed])(y[self.own])
 
 
 def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) -> Halo:
@@ -195,6 +208,47 @@ def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) 
 
 
 @dataclass(frozen=True, eq=False)
+class RowsOverRanks:
+    """Rows B of multipliers on what a rank has of them, in products Bᵀx and By.
+
+    What neighbours exchange is sent first, and waited for when own rows are done.
+    """
+
+    at: Halo
+    own: csr_array  #: (o, M) of owned rows
+    transposed: csr_array  #: (M, o)
+    borrowed: csr_array  #: (t − o, M) of the neighbours' rows
+    borrowed_transposed: (
+        csr_array  #: (k, t − o) rows of its transpose, without zero ones
+    )
+    reached: Nodes  #: (k,) which ones they are
+
+    @classmethod
+    def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
+        """Split B (t, M) of all rows that a rank touches."""
+        own, borrowed = csr_array(B[at.own]), csr_array(B[at.borrowed])
+        reached = np.unique(borrowed.indices)
+        return cls(
+            at, own, csr_array(own.T), borrowed,
+            csr_array(borrowed[:, reached].T), reached,
+        )  # fmt: skip
+
+    def transposed_times(self, x: Vector) -> Vector:
+        """Return Bᵀx (M,) of this rank's slice x (o,)."""
+        arrived = self.at.borrowing(x)
+        with self.at.ranks.clocked("products"):
+            X = self.transposed @ x
+            X[self.reached] += self.borrowed_transposed @ arrived()
+        return np.asarray(X)
+
+    def times(self, X: Vector) -> Vector:
+        """Return this rank's slice (o,) of Σ_ranks B X, with X (M,) of each."""
+        with self.at.ranks.clocked("products"):
+            added = self.at.returning(self.borrowed @ X)
+            return added(self.own @ X)
+
+
+@dataclass(frozen=True, eq=False)
 class RankOperator:
     """F over ranks: takes and gives this rank's slice of vectors of multipliers."""
 
@@ -208,7 +262,8 @@ class RankOperator:
 
     def __call__(self, x: Dense) -> DistributedVector:
         """Multiply with F."""
-        return self._over(x, self.local)
+        y = self._congruence(self._rows, self.local.inverses, np.asarray(x))
+        return distributed(y, self.halo.ranks)
 
     def __matmul__(self, x: Dense) -> DistributedVector:
         return self(x)
@@ -217,26 +272,29 @@ class RankOperator:
         """Give the diagonal of F."""
         return distributed(self.halo.added(self.local.diagonal()), self.halo.ranks)
 
-    def _over(self, x: Dense, local: Product) -> DistributedVector:
-        ranks = self.halo.ranks
-        touched_x = self.halo.gathered(np.asarray(x))
-        with ranks.clocked("products"):
-            y = local(touched_x)
-        return distributed(self.halo.added(y), ranks)
+    @cached_property
+    def _rows(self) -> RowsOverRanks:
+        return RowsOverRanks.of(self.local.packed.B, self.halo)
+
+    def _congruence(
+        self, rows: RowsOverRanks, blocks: Sequence[Any], x: Vector
+    ) -> Vector:
+        X = rows.transposed_times(x)
+        with self.halo.ranks.clocked("products"):
+            Y = self.local.packed.multiplied(blocks, X)
+        return rows.times(Y)
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
         of, ranks = self.local.packed, self.halo.ranks
         blocks, weights = self.local.weighted_blocks(kind, scaling)
         BW = csr_array(of.B @ diags_array(weights))
-        WB = csr_array(BW.T)
+        rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ of.BT))
 
-        def local(x: Dense) -> Dense:
-            return np.asarray(BW @ of.multiplied(blocks, WB @ x))
-
         def product(x: Dense) -> Dense:
-            return distributed(solve(self._over(solve(np.asarray(x)), local)), ranks)
+            y = self._congruence(rows, blocks, solve(np.asarray(x)))
+            return distributed(solve(y), ranks)
 
         return product
 

@@ -93,8 +93,11 @@ class Packed:
         for block, group in zip(blocks, self.groups, strict=True):
             n = group.touched.size
             begin, end = end, end + n * group.members.size
-            part = X[begin:end]
-            Y[begin:end] = (block @ part.reshape(n, -1)).reshape(part.shape)
+            x, y = (v[begin:end].reshape(n, -1) for v in (X, Y))
+            if isinstance(block, np.ndarray):
+                np.matmul(block, x, out=y)
+            else:
+                y[:] = block @ x
         return Y
 
     def diagonal(self, blocks: Sequence[Any]) -> Vector:
@@ -170,7 +173,7 @@ class DualOperator:
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
-        return self.packed.congruence([inverse for inverse, _ in self._blocks], x)
+        return self.packed.congruence(self.inverses, x)
 
     def diagonal(self) -> Vector:
         """Give the diagonal of F."""
@@ -242,9 +245,14 @@ class DualOperator:
         """Its rows on what they touch."""
         return packed(self.B, self.domains, self.explicit)
 
+    @property
+    def inverses(self) -> list[Any]:
+        """(K⁺)_bb of each group: a matrix, or what multiplies with it."""
+        return [inverse for inverse, _ in self._blocks]
+
     @cached_property
     def _diagonal(self) -> Vector:
-        return self.packed.diagonal([inverse for inverse, _ in self._blocks])
+        return self.packed.diagonal(self.inverses)
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:

@@ -19,8 +19,12 @@ lengths, the step and the new gradient, the next direction. Its loops over vecto
 `vectors.h`.
 """
 
+from cpython.buffer cimport (
+    PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer,
+)
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
+from libc.stdlib cimport calloc, free as give_back, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
@@ -72,12 +76,59 @@ cdef extern from "vectors.h" nogil:
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
-    void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    void add_gram(const double *s, const double *V, double *S, Py_ssize_t k)
     int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
+
+
+# --- numbers ------------------------------------------------------------------------
+#
+# A memoryview takes as long as a pass over a thousand numbers: small problems would spend
+# more on these than on their products. Arrays are read and written by their addresses,
+# with the lengths that `Solver` and its like know, and stay referred to for as long.
+
+
+cdef class Room:
+    """Numbers, zeros at first, that are there as long as this is."""
+
+    cdef double *at
+
+    def __cinit__(self, Py_ssize_t size):
+        self.at = <double *> calloc(max(size, 1), sizeof(double))
+        if not self.at:
+            raise MemoryError(f"no room for {size} numbers")
+
+    def __dealloc__(self):
+        give_back(self.at)
+
+
+cdef double *numbers(a) except NULL:
+    """Return where an array has its components, row by row.
+
+    Raises ValueError where it has no doubles, or they have gaps.
+    """
+    cdef Py_buffer told
+    cdef bint has_doubles
+    PyObject_GetBuffer(a, &told, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)
+    has_doubles = told.format[0] == b"d"[0]
+    PyBuffer_Release(&told)
+    if not has_doubles:
+        raise ValueError(f"an array of {a.dtype}; expected float64")
+    return <double *> told.buf
+
+
+def _whole(a):
+    return np.ascontiguousarray(a, dtype=float)
+
+
+cdef copied(const double *v, Py_ssize_t n):
+    """Make an array of it."""
+    told = np.empty(n)
+    memcpy(numbers(told), v, n * sizeof(double))
+    return told
 
 
 # --- the matrix ---------------------------------------------------------------------
@@ -98,12 +149,11 @@ cdef class Product:
     cdef object held
 
     def __cinit__(self, P, Py_ssize_t n):
-        cdef const double[:, ::1] rows
         self.n, self.matrix = n, P
         if isinstance(P, np.ndarray) and n:
             whole = P if P.flags.c_contiguous else P.T
-            rows = np.ascontiguousarray(whole, dtype=float)
-            self.held, self.dense = rows, &rows[0, 0]
+            self.held = _whole(whole)
+            self.dense = numbers(self.held)
         elif issparse(P) and P.nnz and P.nnz < 2**31:
             M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
             self.hold_rows(M.data, M.indptr, M.indices)
@@ -131,16 +181,13 @@ cdef class Product:
 
     def __call__(self, v):
         """Return Pv for v (n,)."""
-        cdef const double[::1] vector = np.ascontiguousarray(v, dtype=float)
-        cdef double[::1] result = np.empty(self.n)
-        if self.n:
-            self.apply(&vector[0], &result[0])
-        return np.asarray(result)
+        result, vector = np.empty(self.n), _whole(v)
+        self.apply(numbers(vector), numbers(result))
+        return result
 
     cdef int apply(self, const double *v, double *y, double s=1.0) except -1:
         """y ← s Pv."""
         self.count += 1
-        cdef double[::1] vector, result
         cdef int n = self.n, one = 1
         cdef double zero = 0.0
         if self.dense and self.n < BY_BLAS:
@@ -151,26 +198,13 @@ cdef class Product:
         elif self.rows.data:
             sparse_product(&self.rows, s, v, y)
         elif self.n:
-            told = np.empty(self.n)
-            vector = told
-            memcpy(&vector[0], v, self.n * sizeof(double))
-            result = np.ascontiguousarray(self.matrix @ told, dtype=float)
-            if result.shape[0] != self.n:
-                raise ValueError(
-                    f"P @ v has {result.shape[0]} components; expected {self.n}"
-                )
-            memcpy(y, &result[0], self.n * sizeof(double))
+            result = _whole(self.matrix @ copied(v, self.n))
+            if result.size != self.n:
+                raise ValueError(f"P @ v has {result.size} components; expected {self.n}")
+            memcpy(y, numbers(result), self.n * sizeof(double))
             if s != 1:
                 scale(s, y, self.n)
         return 0
-
-
-cdef double *pointer(double[::1] v) noexcept:
-    return &v[0] if v.shape[0] else NULL
-
-
-cdef double *first(const double[:, ::1] M) noexcept:
-    return <double *> &M[0, 0] if M.shape[0] and M.shape[1] else NULL
 
 
 cdef void without(
@@ -184,80 +218,90 @@ cdef void without(
 # --- preparation --------------------------------------------------------------------
 
 
-def orthonormal(const double[:, ::1] G, const double[::1] e):
+def orthonormal(G, e):
     """Find orthonormal rows and x̃ for Gx = e, G (m, n), as `orthonormal_rows` does.
 
     Returns the fields of `Rows` but the last, and the QR factorisation that multipliers
     need: R (r, r), the rows kept (r,), their sizes (m,).
     """
     cdef Py_ssize_t i, j, m = G.shape[0], n = G.shape[1], w = min(m, n)
-    cdef int rows = m, columns = n, info = 0, most, r = 0
+    cdef int rows = m, columns = n, info = 0, most = 64 * (m + n), r = 0
     cdef double mismatch = 0.0, most_x = 0.0, most_e = 0.0, square = 0.0, z, error
     cdef double least_pivot = 1.0
     sizes, x_tildes, unit = np.ones(m), np.zeros(n), np.empty((m, n))
-    pivots, tau, work = np.zeros(m, dtype=np.int32), np.empty(w), np.empty(64 * (m + n))
-    cdef double[::1] size = sizes, x_tilde = x_tildes, t = tau, space = work
-    cdef double[:, ::1] A = unit, R, GC  # A (m, n) by rows is (n, m) by columns
+    pivots = np.zeros(m, dtype=np.int32)
+    cdef double *size = numbers(sizes)
+    cdef double *x_tilde = numbers(x_tildes)
+    cdef double *A = numbers(unit)  # A (m, n) by rows is (n, m) by columns
+    cdef const double *given = numbers(G)
+    cdef const double *right = numbers(e)
     cdef int[::1] pivot = pivots
-    most = space.shape[0]
+    cdef Room room = Room(w + most)
+    cdef double *t = room.at
+    cdef double *space = t + w
+    cdef double *R
+    cdef double *GC
     for i in range(m):
-        size[i] = sqrt(dot(&G[i, 0], &G[i, 0], n)) if n else 0.0
-        size[i] = size[i] or 1.0
-        most_e = fmax(most_e, fabs(e[i]) / size[i])
-        square += e[i] * e[i]
+        size[i] = sqrt(dot(given + i * n, given + i * n, n)) or 1.0
+        most_e = fmax(most_e, fabs(right[i]) / size[i])
+        square += right[i] * right[i]
         for j in range(n):
-            A[i, j] = G[i, j] / size[i]
+            A[i * n + j] = given[i * n + j] / size[i]
     if w:
-        dgeqp3(&columns, &rows, &A[0, 0], &columns, &pivot[0], &t[0], &space[0], &most,
-               &info)
+        dgeqp3(&columns, &rows, A, &columns, &pivot[0], t, space, &most, &info)
     for i in range(w):
-        if fabs(A[i, i]) > RANK:
+        if fabs(A[i * n + i]) > RANK:
             r += 1
-            least_pivot = fmin(least_pivot, fabs(A[i, i]))
-    R, GC = np.zeros((r, r)), np.empty((m, r))
+            least_pivot = fmin(least_pivot, fabs(A[i * n + i]))
+    triangle, products = np.zeros((r, r)), np.empty((m, r))
+    R, GC = numbers(triangle), numbers(products)
     for i in range(r):
         for j in range(i, r):
-            R[i, j] = A[j, i]
+            R[i * r + j] = A[j * n + i]
     if r:
-        dorgqr(&columns, &r, &r, &A[0, 0], &columns, &t[0], &space[0], &most, &info)
+        dorgqr(&columns, &r, &r, A, &columns, t, space, &most, &info)
     for i in range(r):  # x̃ = Cᵀz with Rᵀz = e/size
         pivot[i] -= 1
-        z = e[pivot[i]] / size[pivot[i]]
+        z = right[pivot[i]] / size[pivot[i]]
         for j in range(i):
-            z -= R[j, i] * space[j]
-        space[i] = z / R[i, i]
-        add(space[i], &A[i, 0], &x_tilde[0], n)
+            z -= R[j * r + i] * space[j]
+        space[i] = z / R[i * r + i]
+        add(space[i], A + i * n, x_tilde, n)
     for i in range(n):
         most_x = fmax(most_x, fabs(x_tilde[i]))
     for i in range(m):
-        error = (dot(&G[i, 0], &x_tilde[0], n) if n else 0.0) - e[i]
+        error = dot(given + i * n, x_tilde, n) - right[i]
         mismatch = fmax(mismatch, fabs(error) / size[i])
         for j in range(r):
-            GC[i, j] = dot(&G[i, 0], &A[j, 0], n)
+            GC[i * r + j] = dot(given + i * n, A + j * n, n)
     return (
-        (np.asarray(G), unit[:r], np.asarray(GC), sqrt(square), least_pivot, x_tildes,
+        (G, unit[:r], products, sqrt(square), least_pivot, x_tildes,
          mismatch <= 1e-8 * (most_x + most_e)),
-        (np.asarray(R), pivots[:r], sizes),
+        (triangle, pivots[:r], sizes),
     )
 
 
 cdef double RANK = 1e-13  # pivots of the normalised rows below this are rounding errors
 
 
-def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
-                const double[::1] size, const double[::1] a):
-    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
-    cdef Py_ssize_t i, j
+def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
+
+    triangle, rows_kept, sizes, told_a : R (r, r), the rows kept (r,), their sizes (m,), a
+    """
+    cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
     result = np.zeros(m)
-    if not m:
-        return result
-    cdef double[::1] y = result
-    for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
+    cdef double *y = numbers(result)
+    cdef const double *R = numbers(triangle)
+    cdef const double *size = numbers(sizes)
+    cdef const double *a = numbers(told_a)
+    cdef const int[::1] kept = rows_kept
+    for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
-        for j in range(i + 1, R.shape[0]):
-            s -= R[i, j] * y[kept[j]] * size[kept[j]]
-        y[kept[i]] = s / (R[i, i] * size[kept[i]])
+        for j in range(i + 1, r):
+            s -= R[i * r + j] * y[kept[j]] * size[kept[j]]
+        y[kept[i]] = s / (R[i * r + i] * size[kept[i]])
     return result
 
 
@@ -267,87 +311,103 @@ cdef enum:
     FEW = 5
 
 
-cdef bint is_flat(const double[::1] diagonal, const double[::1] off) except -1:
+cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
     """Whether all Ritz values of the first FEW steps are of one size."""
-    cdef double[::1] theta = np.array(diagonal[:FEW]), between = np.array(off[:FEW])
+    cdef double theta[FEW]
+    cdef double between[FEW]
     cdef double none
     cdef int order = FEW, one = 1, info = 0
-    dstev(b"N", &order, &theta[0], &between[0], &none, &one, &none, &info)
+    memcpy(theta, diagonal, FEW * sizeof(double))
+    memcpy(between, off, FEW * sizeof(double))
+    dstev(b"N", &order, theta, between, &none, &one, &none, &info)
     return theta[0] >= theta[FEW - 1] / FLAT
 
 
-def lanczos(Product F, const double[:, ::1] C, const double[::1] start, int steps):
-    """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`."""
-    cdef Py_ssize_t i, k, n = start.shape[0], r = C.shape[0]
-    cdef int kept, info = 0, again
+def lanczos(Product F, C, start, int steps):
+    """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`.
+
+    C : (r, n)
+    """
+    cdef Py_ssize_t i, k, n = F.n, r = len(C)
+    cdef int kept = 0, info = 0, again
     steps = min(steps, n - r)  # in the range of P
-    bases, told, offs = np.zeros((steps, n)), np.zeros(steps), np.zeros(steps)
-    cdef double[:, ::1] basis = bases
-    cdef double[::1] diagonal = told, off = offs, v = np.array(start), Cv = np.empty(r)
-    cdef double[::1] Fv = np.empty(n)
-    cdef double beta, largest = 0.0, s
-    kept = 0
-    if n:
-        without(first(C), r, &v[0], pointer(Cv), n)
-        beta = sqrt(dot(&v[0], &v[0], n))
-    else:
-        beta = 0.0
+    cdef Room room = Room((steps + 2) * n + r + (steps + 5) * steps)
+    cdef const double *rows = numbers(C)
+    cdef double *basis = room.at
+    cdef double *v = basis + steps * n
+    cdef double *Fv = v + n
+    cdef double *Cv = Fv + n
+    cdef double *diagonal = Cv + r
+    cdef double *off = diagonal + steps
+    cdef double *share = off + steps
+    cdef double *space = share + steps  # (2 steps,)
+    cdef double *S = space + 2 * steps  # (kept, kept) by columns
+    cdef double *value
+    cdef double *residual
+    cdef double *vector
+    cdef double beta, largest = 0.0, at_start
+    memcpy(v, numbers(start), n * sizeof(double))
+    without(rows, r, v, Cv, n)
+    beta = sqrt(dot(v, v, n))
     for k in range(steps if beta else 0):
-        memcpy(&basis[k, 0], &v[0], n * sizeof(double))
-        scale(1 / beta, &basis[k, 0], n)
-        memcpy(&Fv[0], &basis[k, 0], n * sizeof(double))
-        without(first(C), r, &Fv[0], pointer(Cv), n)
-        F.apply(&Fv[0], &v[0])
-        without(first(C), r, &v[0], pointer(Cv), n)
-        diagonal[k] = dot(&basis[k, 0], &v[0], n)
+        memcpy(basis + k * n, v, n * sizeof(double))
+        scale(1 / beta, basis + k * n, n)
+        memcpy(Fv, basis + k * n, n * sizeof(double))
+        without(rows, r, Fv, Cv, n)
+        F.apply(Fv, v)
+        without(rows, r, v, Cv, n)
+        diagonal[k] = dot(basis + k * n, v, n)
         largest = fmax(largest, fabs(diagonal[k]))
         for again in range(2):
-            for i in range(k + 1):
-                s = dot(&basis[i, 0], &v[0], n)
-                add(-s, &basis[i, 0], &v[0], n)
-        beta = sqrt(dot(&v[0], &v[0], n))
+            without(basis, k + 1, v, share, n)
+        beta = sqrt(dot(v, v, n))
         off[k] = beta
         kept = k + 1
         if beta <= 1e-12 * largest:
             break
-        if kept == FEW and is_flat(told, offs):
+        if kept == FEW and is_flat(diagonal, off):
             break
     if not kept:
         return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
-    at_start = told[0]
-    cdef double[::1] theta = told[:kept].copy(), between = offs[:kept].copy()
-    cdef double[::1, :] S = np.zeros((kept, kept), order="F")
-    cdef double[::1] space = np.empty(max(1, 2 * kept))
-    dstev(b"V", &kept, &theta[0], &between[0], &S[0, 0], &kept, &space[0], &info)
-    whole = np.asarray(S)
-    vectors = whole[:, ::-1].T @ bases[:kept]
-    residuals = offs[kept - 1] * np.abs(whole[-1, ::-1])
-    return np.asarray(theta)[::-1].copy(), residuals, vectors, at_start
+    at_start = diagonal[0]
+    beta = off[kept - 1]
+    dstev(b"V", &kept, diagonal, off, S, &kept, space, &info)
+    values, residuals, vectors = np.empty(kept), np.empty(kept), np.zeros((kept, n))
+    value, residual, vector = numbers(values), numbers(residuals), numbers(vectors)
+    for i in range(kept):  # in descending order
+        k = kept - 1 - i
+        value[i] = diagonal[k]
+        residual[i] = beta * fabs(S[k * kept + kept - 1])
+        add_combination(1.0, basis, S + k * kept, vector + i * n, kept, n)
+    return values, residuals, vectors, at_start
 
 
-def homogenised(Product F, const double[:, ::1] C, const double[::1] x_tilde, q, lb, ub,
-                double norm):
+def homogenised(Product F, C, x_tilde, q, lb, ub, double norm):
     """Return b (n,) and the bounds of ν = x − x̃, as `_normalised` finds them."""
-    cdef Py_ssize_t i, n = x_tilde.shape[0], r = C.shape[0]
-    cdef double[:, ::1] found = np.zeros((3, n))
-    cdef double[::1] b = found[0], Cb = np.empty(r)
-    cdef const double[::1] cost = _whole(q), low = _whole(lb), high = _whole(ub)
+    cdef Py_ssize_t i, n = F.n, r = len(C)
+    q, lb, ub, found = _whole(q), _whole(lb), _whole(ub), np.zeros((3, n))
+    cdef Room room = Room(r)
+    cdef const double *rows = numbers(C)
+    cdef const double *shift = numbers(x_tilde)
+    cdef const double *cost = numbers(q)
+    cdef const double *low = numbers(lb)
+    cdef const double *high = numbers(ub)
+    cdef double *b = numbers(found)
     cdef double square = 0.0
     cdef bint moved = False
     for i in range(n):
-        found[1, i], found[2, i] = low[i] - x_tilde[i], high[i] - x_tilde[i]
-        moved = moved or x_tilde[i] != 0
+        b[n + i], b[2 * n + i] = low[i] - shift[i], high[i] - shift[i]
+        moved = moved or shift[i] != 0
     if moved:
-        F.apply(&x_tilde[0], &b[0])
+        F.apply(shift, b)
     for i in range(n):
         b[i] = -cost[i] - b[i]
         square += b[i] * b[i]
-    without(first(C), r, pointer(b), pointer(Cb), n)
-    if dot(pointer(b), pointer(b), n) <= 1e-28 * square:
-        b[:] = 0.0  # nothing but rounding errors is left of d
-    scale(1 / norm, pointer(b), n)
-    whole = np.asarray(found)
-    return whole[0], (whole[1], whole[2])
+    without(rows, r, b, room.at, n)
+    if dot(b, b, n) <= 1e-28 * square:
+        memset(b, 0, n * sizeof(double))  # nothing but rounding errors is left of d
+    scale(1 / norm, b, n)
+    return found[0], (found[1], found[2])
 
 
 # --- MPRGP and the outer loop -------------------------------------------------------
@@ -360,6 +420,7 @@ cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
+    KEPT = 200  # directions of CG on a face
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
     MOST_IDLE = 2
@@ -376,44 +437,62 @@ cdef struct Until:
 
 
 cdef class Gram:
-    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last.
+
+    Its upper triangle.
+    """
 
     cdef Py_ssize_t n, k, stride, flips
-    cdef double[:, ::1] U
-    cdef double[::1] room
-    cdef int[::1] where
+    cdef const double *U
+    cdef Room holder, room  # of U, and of all others
+    cdef int *where
     cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *column
+    cdef double *columns  # (4, stride)
     cdef double *held
 
-    def __cinit__(self, double[:, ::1] U):
-        self.U, self.k, self.n = U, U.shape[0], U.shape[1]
-        self.stride, self.flips = (self.k + 3) & ~3, self.n + 1
-        self.room = np.zeros(self.stride * (self.stride + 1) + self.n)
-        self.where = np.empty(self.n, dtype=np.int32)
-        self.values = &self.room[0]
-        self.column = self.values + self.stride * self.stride
-        self.held = self.column + self.stride
+    @staticmethod
+    cdef Gram of(Model B):
+        cdef Gram made = Gram.__new__(Gram)
+        made.U, made.holder, made.k, made.n = B.U, B.holder, B.k, B.n
+        made.stride, made.flips = (B.k + 3) & ~3, B.n + 1
+        made.room = Room(made.stride * (made.stride + 4) + 2 * B.n)
+        made.values = made.room.at
+        made.columns = made.values + made.stride * made.stride
+        made.held = made.columns + 4 * made.stride
+        made.where = <int *> (made.held + B.n)
+        return made
 
     cdef void enter(self, const double *piece) noexcept:
         """Have it be that of the face where `piece` is zero.
 
         The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
         """
-        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        cdef Py_ssize_t i, j, c, q, count, k = self.k, stride = self.stride
+        cdef double sign[4]
+        cdef bint is_held
         if self.flips > self.n:
-            self.flips = 0
+            self.flips = count = 0
+            for i in range(self.n):
+                count += piece[i] != 0
+            is_held = 2 * count > self.n
             memset(self.values, 0, stride * stride * sizeof(double))
             for i in range(k):
-                self.values[i * stride + i] = 1.0
-            memset(self.held, 0, self.n * sizeof(double))
-        for c in range(changed(piece, self.held, self.n, &self.where[0])):
-            i = self.where[c]
-            for j in range(k):
-                self.column[j] = self.U[j, i]
-            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
-            self.flips += 1
+                self.values[i * stride + i] = not is_held
+            for i in range(self.n):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.n, self.where)
+        self.flips += count
+        for c in range(0, count, 4):
+            for q in range(4):
+                sign[q] = 0.0
+                if c + q < count:
+                    i = self.where[c + q]
+                    sign[q] = 1 - 2 * self.held[i]
+                    for j in range(k):
+                        self.columns[q * stride + j] = self.U[j * self.n + i]
+            add_gram(sign, self.columns, self.values, stride)
 
 
 cdef class Model:
@@ -421,31 +500,38 @@ cdef class Model:
 
     cdef Py_ssize_t n, k
     cdef double tau
-    cdef double[:, ::1] U
-    cdef double[::1] room
+    cdef const double *U
+    cdef Room holder, room  # of U, and of the others
     cdef double *w  # (k,)
     cdef double *root  # of w
     cdef Gram gram
 
     @staticmethod
-    cdef Model above_tail(double[:, ::1] U, const double *w, double shift, double tau):
-        """Add `shift` to w, and leave out the rows where that is not positive."""
+    cdef Model above_tail(const double *U, Room holder, Py_ssize_t found, Py_ssize_t n,
+                          const double *w, double shift, double tau):
+        """Add `shift` to w (found,), and leave out the rows where that is not positive.
+
+        holder : of U (found, n)
+        """
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0, found = U.shape[0]
-        B.room = np.empty(2 * found)
-        B.w, B.root = pointer(B.room), pointer(B.room) + found
+        cdef Py_ssize_t i, k = 0
+        B.room = Room(2 * found)
+        B.w, B.root = B.room.at, B.room.at + found
         for i in range(found):
             B.w[k] = w[i] + shift
             k += B.w[k] > 0
+        B.U, B.holder = U, holder
         if k < found:
-            U = np.asarray(U)[[i for i in range(found) if w[i] + shift > 0]]
+            B.holder = Room(k * n)
+            B.U, k = B.holder.at, 0
+            for i in range(found):
+                if w[i] + shift > 0:
+                    memcpy(B.holder.at + k * n, U + i * n, n * sizeof(double))
+                    k += 1
         for i in range(k):
             B.root[i] = sqrt(B.w[i])
-        B.U, B.tau, B.k, B.n = U, tau, k, U.shape[1]
+        B.tau, B.k, B.n = tau, k, n
         return B
-
-    cdef double *rows(self) noexcept:
-        return &self.U[0, 0] if self.k else NULL
 
     @staticmethod
     cdef Model of_norm(double norm, Py_ssize_t n):
@@ -458,7 +544,8 @@ cdef class Model:
         cdef Model B
         if not self.k:
             return Model.of_norm(tau, self.n)
-        B = Model.above_tail(self.U, self.w, self.tau - tau, tau)
+        B = Model.above_tail(self.U, self.holder, self.k, self.n, self.w, self.tau - tau,
+                             tau)
         if B.k == self.k:
             B.gram = self.gram  # of the same rows
         return B
@@ -466,23 +553,88 @@ cdef class Model:
     cdef int enter(self, const double *piece) except -1:
         """Have the Gram matrix of the face where `piece` is zero."""
         if self.gram is None:
-            self.gram = Gram(self.U)
+            self.gram = Gram.of(self)
         self.gram.enter(piece)
         return 0
 
 
-def _whole(a):
-    return np.ascontiguousarray(a, dtype=float)
+cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
+    """Make room for so many numbers, and keep those that are there."""
+    held = <double *> realloc(held, max(size, 1) * sizeof(double))
+    if not held:
+        raise MemoryError
+    return held
 
 
-cdef copied(const double *v, Py_ssize_t n):
-    """Make an array of it."""
-    cdef double[::1] made
-    told = np.empty(n)
-    made = told
-    if n:
-        memcpy(&made[0], v, n * sizeof(double))
-    return told
+cdef class Directions:
+    """The last conjugate directions of CG on a face, as `solvers.smalbe.mprgp` has them.
+
+    free : the face, 1 where a component is off its bounds (n,)
+    """
+
+    cdef Py_ssize_t n, count, most, oldest, room
+    cdef double *p  # (room, n)
+    cdef double *Hp
+    cdef double *share
+    cdef double *free
+
+    def __cinit__(self, Py_ssize_t n, Py_ssize_t most):
+        self.n, self.most = n, most
+        self.share = <double *> calloc(max(most + n, 1), sizeof(double))
+        if not self.share:
+            raise MemoryError
+        self.free = self.share + most
+
+    def __dealloc__(self):
+        give_back(self.p)
+        give_back(self.Hp)
+        give_back(self.share)
+
+    cdef void begin(self, const double *free) noexcept:
+        """Forget all, on another face."""
+        self.count = self.oldest = 0
+        if self.n:
+            memcpy(self.free, free, self.n * sizeof(double))
+
+    cdef bint is_on(self, const double *free) noexcept:
+        """Whether they are directions on that face."""
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            if self.free[i] != free[i]:
+                return False
+        return True
+
+    cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
+        """Add one with pᵀHp, in place of the oldest where there are too many."""
+        cdef Py_ssize_t at = self.count
+        if not self.most:
+            return 0
+        if at == self.most:
+            at, self.oldest = self.oldest, (self.oldest + 1) % self.most
+        elif at == self.room:
+            self.room = min(max(16, 2 * self.room), self.most)
+            self.p = enlarged(self.p, self.room * self.n)
+            self.Hp = enlarged(self.Hp, self.room * self.n)
+        memcpy(self.p + at * self.n, p, self.n * sizeof(double))
+        memcpy(self.Hp + at * self.n, Hp, self.n * sizeof(double))
+        scale(1 / sqrt(curvature), self.p + at * self.n, self.n)
+        scale(1 / sqrt(curvature), self.Hp + at * self.n, self.n)
+        self.count = min(self.count + 1, self.most)
+        return 0
+
+    cdef void conjugate(self, double *p) noexcept:
+        """Take from p its part along them."""
+        if self.count:
+            rows_times(self.Hp, p, self.share, self.count, self.n)
+            add_combination(-1.0, self.p, self.share, p, self.count, self.n)
+
+    cdef void minimise(self, const double *g, double *s, double *Hs) noexcept:
+        """Find s and Hs, for which x − s minimises the cost along all of them."""
+        rows_times(self.p, g, self.share, self.count, self.n)
+        memset(s, 0, self.n * sizeof(double))
+        memset(Hs, 0, self.n * sizeof(double))
+        add_combination(1.0, self.p, self.share, s, self.count, self.n)
+        add_combination(1.0, self.Hp, self.share, Hs, self.count, self.n)
 
 
 cdef class Solver:
@@ -497,16 +649,19 @@ cdef class Solver:
     cdef double inverse_norm, norm, e_size, x_tilde_size, alpha, Gamma_square, rho
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef int expansion
-    cdef double[:, ::1] C, GC, vectors
-    cdef const double[::1] told_q, told_diagonal
-    cdef double[::1] shift, right, least, most, above, room
+    cdef Py_ssize_t found  # directions of the model: Ritz vectors, then C
+    cdef tuple held  # the arrays that are read
+    cdef Room vectors, room  # of these directions, and of all that is written
+    cdef const double *C
+    cdef const double *GC
     cdef const double *q
     cdef const double *diagonal  # NULL where an operator does not tell
-    cdef double *x_tilde
-    cdef double *b
-    cdef double *lower
-    cdef double *upper
-    cdef double *upper_if_any  # NULL where all are inf
+    cdef const double *x_tilde
+    cdef const double *b
+    cdef double *above  # (found,) their eigenvalues above the tail
+    cdef const double *lower
+    cdef const double *upper
+    cdef const double *upper_if_any  # NULL where all are inf
     cdef double *rhs
     cdef double *x
     cdef double *g
@@ -538,40 +693,47 @@ cdef class Solver:
     cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
+    cdef Directions directions
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
 
     def __init__(self, problem, Product F, options, bint preconditioned):
-        cdef Py_ssize_t i, k, n
-        rows, spectrum = problem.rows, problem.spectrum
-        self.problem, self.F = problem, F
-        self.C, self.GC, self.shift = map(_whole, (rows.C, rows.GC, rows.x_tilde))
-        self.n, self.r, self.m = F.n, self.C.shape[0], self.GC.shape[0]
+        cdef Py_ssize_t i, k, n = F.n
+        rows, spectrum, bounds = problem.rows, problem.spectrum, problem.bounds
+        self.problem, self.F, self.n = problem, F, n
+        self.r, self.m = rows.GC.shape[1], rows.GC.shape[0]
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
-        self.e_size, self.x_tilde_size = rows.e_size, np.linalg.norm(rows.x_tilde)
-        self.right, self.told_q = _whole(problem.b), _whole(problem.q)
-        self.least, self.most = map(_whole, problem.bounds)
-        self.told_diagonal = _whole(problem.diagonal)
+        self.held = (
+            _whole(rows.C), _whole(rows.GC), _whole(rows.x_tilde), _whole(problem.b),
+            _whole(problem.q), _whole(problem.diagonal), _whole(bounds[0]),
+            _whole(bounds[1]),
+        )
+        self.C, self.GC = numbers(self.held[0]), numbers(self.held[1])
+        self.x_tilde, self.b = numbers(self.held[2]), numbers(self.held[3])
+        self.q, self.diagonal = numbers(self.held[4]), numbers(self.held[5])
+        self.lower, self.upper = numbers(self.held[6]), numbers(self.held[7])
+        if not len(problem.diagonal):
+            self.diagonal = NULL
+        for i in range(n):
+            if self.upper[i] < INFINITY:
+                self.upper_if_any = self.upper
+                break
+        self.e_size = rows.e_size
+        self.x_tilde_size = sqrt(dot(self.x_tilde, self.x_tilde, n))
         self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
         self.reduced = options.reduced
         self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
         self.newton_proportions = options.proportioning == "model"
         self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
+        kept = KEPT if options.recycle and not issparse(F.matrix) else 0
+        self.directions = Directions(self.n, kept)
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
-            self.find_upper_end(_whole(values), _whole(residuals), vectors, rows.C)
-        k = self.above.shape[0] if spectrum.ritz is not None else 0
-        n = self.n
-        self.q, self.b, self.x_tilde = &self.told_q[0], pointer(self.right), pointer(self.shift)
-        self.lower, self.upper = pointer(self.least), pointer(self.most)
-        for i in range(n):
-            if self.upper[i] < INFINITY:
-                self.upper_if_any = self.upper
-                break
-        self.diagonal = &self.told_diagonal[0] if self.told_diagonal.shape[0] else NULL
-        self.room = np.zeros(19 * n + 2 * self.r + (9 + k) * (k + 3))
-        cdef double *at = pointer(self.room)
+            self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
+        k = self.found
+        self.room = Room(19 * n + 2 * self.r + (9 + k) * (k + 3))
+        cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
         self.phi, self.free, self.z, self.s = at, at + n, at + 2 * n, at + 3 * n
@@ -587,22 +749,28 @@ cdef class Solver:
         self.Cw = self.Cv + self.r
         self.core = self.Cw + self.r
 
-    cdef int find_upper_end(self, const double[::1] values, const double[::1] residuals,
-                            vectors, rows) except -1:
+    cdef int find_upper_end(self, values, residuals, vectors) except -1:
         """Choose what a model holds, as `Projected.upper_end` does."""
-        cdef Py_ssize_t i, found = values.shape[0], kept
-        kept = max(found - (1 if residuals[found - 1] <= 1e-10 * values[0] else 2), 0)
+        cdef Py_ssize_t i, found = len(values), kept, n = self.n
+        cdef const double *value = numbers(values)
+        cdef const double *residual = numbers(residuals)
+        kept = max(found - (1 if residual[found - 1] <= 1e-10 * value[0] else 2), 0)
         for i in range(kept):
-            if residuals[i] > values[i]:
+            if residual[i] > value[i]:
                 kept = i
                 break
-        if residuals[0] > FOUND * values[0]:
+        if residual[0] > FOUND * value[0]:
             kept = 0
-        self.tail = fmax((values[kept] + residuals[kept]) / self.norm, TAIL)
-        self.vectors = np.concatenate((vectors[:kept], rows))
-        self.above = np.full(kept + self.r, -self.tail)
-        for i in range(kept):
-            self.above[i] += (values[i] + residuals[i]) / self.norm
+        self.tail = fmax((value[kept] + residual[kept]) / self.norm, TAIL)
+        self.found = kept + self.r
+        self.vectors = Room(self.found * (n + 1))
+        self.above = self.vectors.at + self.found * n
+        memcpy(self.vectors.at, numbers(vectors), kept * n * sizeof(double))
+        memcpy(self.vectors.at + kept * n, self.C, self.r * n * sizeof(double))
+        for i in range(self.found):
+            self.above[i] = -self.tail
+            if i < kept:
+                self.above[i] += (value[i] + residual[i]) / self.norm
         return 0
 
     # the operator
@@ -615,12 +783,12 @@ cdef class Solver:
             self.F.apply(v, out, self.inverse_norm)
             return 0
         memcpy(Pv, v, n * sizeof(double))
-        without(first(self.C), self.r, Pv, self.Cv, n)
+        without(self.C, self.r, Pv, self.Cv, n)
         self.F.apply(Pv, out, self.inverse_norm)
-        rows_times(first(self.C), out, self.Cw, self.r, n)
+        rows_times(self.C, out, self.Cw, self.r, n)
         for i in range(self.r):
             self.Cw[i] = self.rho * self.Cv[i] - self.Cw[i]
-        add_combination(1.0, first(self.C), self.Cw, out, self.r, n)
+        add_combination(1.0, self.C, self.Cw, out, self.r, n)
         return 0
 
     cdef int lengths_along(self, const double *p, double *Hp) except -1:
@@ -647,7 +815,7 @@ cdef class Solver:
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
         cdef Py_ssize_t i
         cdef double square = 0.0
-        rows_times(first(self.C), x, self.Cv, self.r, self.n)
+        rows_times(self.C, x, self.Cv, self.r, self.n)
         for i in range(self.r):
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
@@ -656,11 +824,12 @@ cdef class Solver:
 
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
-        cdef Py_ssize_t i, k = self.above.shape[0]
+        cdef Py_ssize_t i, k = self.found
         if self.known is None or self.known_rho != rho:
             for i in range(k):
                 self.c[i] = self.above[i] + (rho if i >= k - self.r else 0.0)
-            self.known = Model.above_tail(self.vectors, self.c, 0.0, self.tail)
+            self.known = Model.above_tail(self.vectors.at, self.vectors, k, self.n,
+                                          self.c, 0.0, self.tail)
             self.known_rho = rho
         return self.known
 
@@ -689,9 +858,9 @@ cdef class Solver:
             tilted(x, g, B.tau, lower, upper, s, piece, n)
             return
         memcpy(t, g, n * sizeof(double))
-        add_combination(1.0, B.rows(), y, t, B.k, n)
+        add_combination(1.0, B.U, y, t, B.k, n)
         tilted(x, t, B.tau, lower, upper, s, piece, n)
-        rows_times(B.rows(), s, slope, B.k, n)
+        rows_times(B.U, s, slope, B.k, n)
         for i in range(B.k):
             slope[i] -= y[i] / B.w[i]
 
@@ -756,7 +925,7 @@ cdef class Solver:
         cdef Py_ssize_t i
         cdef double square = dot(s, s, self.n), rest = square, missing, tau
         missing = sHs - B.tau * square
-        rows_times(B.rows(), s, self.c, B.k, self.n)
+        rows_times(B.U, s, self.c, B.k, self.n)
         for i in range(B.k):
             rest -= self.c[i] * self.c[i]
             missing -= B.w[i] * self.c[i] * self.c[i]
@@ -791,13 +960,13 @@ cdef class Solver:
         if not self.preconditioned or not M.k:
             return self.phi  # directions have no length
         memcpy(z, self.phi, n * sizeof(double))
-        rows_times(M.rows(), z, self.c, M.k, n)
+        rows_times(M.U, z, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         solve(self.core, self.c, M.k, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        add_combination(-1.0, M.rows(), self.c, z, M.k, n)
+        add_combination(-1.0, M.U, self.c, z, M.k, n)
         for i in range(n):
             z[i] *= self.free[i] / M.tau
         return z
@@ -1002,9 +1171,11 @@ cdef class Solver:
         cdef double chopped = INFINITY
         cdef double weight, began
         self.split()
+        self.minimise_along_directions()
         self.enter_face()
         began = self.phi_square
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        self.directions.conjugate(self.p)
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
@@ -1023,7 +1194,9 @@ cdef class Solver:
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
+                    self.directions.add(self.p, self.Hp, self.told[3])
                     self.minimise_along_p()
+                    self.directions.conjugate(self.p)
                     self.tell(b"c", trace, note)
                     inside += 1
                     continue
@@ -1035,10 +1208,24 @@ cdef class Solver:
             if not letter:
                 return 0
             self.split()
+            self.directions.begin(self.free)
             self.enter_face()
             inside, began = 0, self.phi_square
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
+
+    cdef int minimise_along_directions(self) except -1:
+        """Minimise along the directions known on this face, as far as is feasible."""
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
+        if self.directions.count and self.directions.is_on(self.free):
+            self.directions.minimise(self.g, s, Hs)
+            lengths(self.x, self.g, s, Hs, self.lower, self.upper, self.n, self.told)
+            self.to(fmin(1.0, self.told[1]), s, Hs)
+            self.split()
+        if not self.directions.is_on(self.free):
+            self.directions.begin(self.free)
+        return 0
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
@@ -1088,7 +1275,7 @@ cdef class Solver:
         if self.e_size == 0 or self.x_tilde_size <= NO_SHIFT * part:
             return error <= tol * fmax(part, b_size)
         for i in range(self.m):
-            part = dot(&self.GC[i, 0], self.Cv, self.r) if self.r else 0.0
+            part = dot(self.GC + i * self.r, self.Cv, self.r)
             square += part * part
         return error <= tol * self.x_tilde_size and sqrt(square) <= tol * self.e_size
 
@@ -1115,24 +1302,25 @@ cdef class Solver:
 
     # the outer loop
 
-    def begin(self, const double[::1] x, const double[::1] mu, double rho):
+    def begin(self, x, mu, double rho):
         """Return ν (n,), moved into the bounds, and its gradient, as `first_iterate`."""
         cdef Py_ssize_t i, n = self.n
         start, gradient = np.empty(n), np.zeros(n)
         cdef bint moved = False
-        cdef double[::1] nu = start, g = gradient
+        cdef double *nu = numbers(start)
+        cdef double *g = numbers(gradient)
+        cdef const double *at = numbers(x)
         self.rho = rho
         for i in range(n):
-            nu[i] = fmin(fmax(x[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
+            nu[i] = fmin(fmax(at[i] - self.x_tilde[i], self.lower[i]), self.upper[i])
             moved = moved or nu[i] + self.x_tilde[i] != 0
         if moved:
-            self.H(pointer(nu), pointer(g))
+            self.H(nu, g)
         else:  # PFPν = 0
-            self.infeasibility(pointer(nu))
-            add_combination(rho, first(self.C), self.Cv, pointer(g), self.r, n)
-        add(-1.0, self.b, pointer(g), n)
-        for i in range(self.r):
-            add(mu[i], &self.C[i, 0], pointer(g), n)
+            self.infeasibility(nu)
+            add_combination(rho, self.C, self.Cv, g, self.r, n)
+        add(-1.0, self.b, g, n)
+        add_combination(1.0, self.C, numbers(mu), g, self.r, n)
         return start, gradient
 
     def smalbe(self, options, double tol, at, infeasible, watch=None):
@@ -1151,12 +1339,13 @@ cdef class Solver:
         cdef double energy = options.energy
         cdef bint stopped, enough, solved, stalled
         cdef Until until
-        cdef const double[::1] nu = _whole(at.nu), g = _whole(at.g)
-        if n:
-            memcpy(self.x, &nu[0], n * sizeof(double))
-            memcpy(self.g, &g[0], n * sizeof(double))
+        memcpy(self.x, numbers(at.nu), n * sizeof(double))
+        memcpy(self.g, numbers(at.g), n * sizeof(double))
+        if at.rho != self.rho or not at.outer:
+            self.directions.begin(self.free)
         self.rho, self.most_products = at.rho, 0
-        cdef double[::1] mu = np.array(at.mu)
+        multipliers = np.array(at.mu)
+        cdef double *mu = numbers(multipliers)
         cdef double b_size = sqrt(dot(self.b, self.b, n))
         b_size = b_size or sqrt(dot(self.g, self.g, n))
         until.small, until.coarse = tol * b_size, options.eta * b_size
@@ -1166,7 +1355,7 @@ cdef class Solver:
             trace, until.M = bytearray(), M
             memcpy(self.rhs, self.b, n * sizeof(double))
             for i in range(self.r):
-                add(-mu[i], &self.C[i, 0], self.rhs, n)
+                add(-mu[i], self.C + i * n, self.rhs, n)
             if self.plain:
                 self.B = self.plain_model()
             if self.preconditioned or not self.plain:
@@ -1190,7 +1379,7 @@ cdef class Solver:
             before = lagrangian
             done.append((trace.decode(), M, self.rho, error, lagrangian))
             for i in range(self.r):
-                add(self.rho * self.Cv[i], &self.C[i, 0], self.g, n)
+                add(self.rho * self.Cv[i], self.C + i * n, self.g, n)
                 mu[i] += self.rho * self.Cv[i]
             if not enough:
                 M *= options.beta
@@ -1214,7 +1403,7 @@ cdef class Solver:
                 if self.rho >= MOST_RHO:
                     break
                 self.change_penalty(fmin(10 * self.rho, MOST_RHO))
-        return (copied(self.x, n), copied(self.g, n), np.asarray(mu), M, self.rho, done,
+        return (copied(self.x, n), copied(self.g, n), multipliers, M, self.rho, done,
                 status)
 
     cdef Model plain_model(self):
@@ -1227,8 +1416,9 @@ cdef class Solver:
         cdef Py_ssize_t i
         self.infeasibility(self.x)
         for i in range(self.r):
-            add((rho - self.rho) * self.Cv[i], &self.C[i, 0], self.g, self.n)
+            add((rho - self.rho) * self.Cv[i], self.C + i * self.n, self.g, self.n)
         self.rho = rho
+        self.directions.begin(self.free)  # of another H
 
     # back to the problem as given
 
@@ -1240,11 +1430,15 @@ cdef class Solver:
         """
         cdef Py_ssize_t i, j, k, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result, multipliers = np.zeros((3, n)), np.empty(r)
-        cdef double[:, ::1] whole = result, S
-        cdef const double[::1] v = nu, least = _whole(lb), most = _whole(ub), at_mu = mu
-        cdef double[::1] a = multipliers
-        cdef double *x = first(whole)
+        result, multipliers, lb, ub = np.zeros((3, n)), np.empty(r), _whole(lb), _whole(ub)
+        cdef Room room = Room(r * r)
+        cdef double *S = room.at
+        cdef const double *v = numbers(nu)
+        cdef const double *least = numbers(lb)
+        cdef const double *most = numbers(ub)
+        cdef const double *at_mu = numbers(mu)
+        cdef double *a = numbers(multipliers)
+        cdef double *x = numbers(result)
         cdef double *z_box = x + n
         cdef double *Fx = z_box + n
         cdef double *rest = self.s
@@ -1260,26 +1454,25 @@ cdef class Solver:
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
         if r:
-            S = np.zeros((r, r))
-            rows_times(first(self.C), rest, da, r, n)
+            rows_times(self.C, rest, da, r, n)
             for i in range(r):
                 a[i] = self.norm * at_mu[i] - da[i]
                 da[i] = 0.0
-            add_combination(1.0, first(self.C), pointer(a), rest, r, n)
+            add_combination(1.0, self.C, a, rest, r, n)
             for k in range(n):
                 if at[k] == 0:
                     for i in range(r):
-                        da[i] += self.C[i, k] * rest[k]
+                        da[i] += self.C[i * n + k] * rest[k]
                         for j in range(i + 1):
-                            S[i, j] += self.C[i, k] * self.C[j, k]
-            dpotrf(b"U", &order, &S[0, 0], &order, &info)
+                            S[i * r + j] += self.C[i * n + k] * self.C[j * n + k]
+            dpotrf(b"U", &order, S, &order, &info)
             for i in range(r):
-                if info or S[i, i] < 1e-4:
+                if info or S[i * r + i] < 1e-4:
                     return None
-            dpotrs(b"U", &order, &one, &S[0, 0], &order, da, &order, &info)
+            dpotrs(b"U", &order, &one, S, &order, da, &order, &info)
             for i in range(r):
                 a[i] -= da[i]
-            add_combination(-1.0, first(self.C), da, rest, r, n)
+            add_combination(-1.0, self.C, da, rest, r, n)
         for i in range(n):
             if at[i] < 0:
                 z_box[i] = -fmax(rest[i], 0.0)
@@ -1289,36 +1482,41 @@ cdef class Solver:
 
 
 def residual_bound(
-    cost, told_diagonal, const double[::1] x, const double[::1] y,
-    const double[::1] z_box, const double[::1] Fx, lower, upper, right,
-    const double[:, ::1] rows,
+    cost, told_diagonal, at_x, at_y, at_z, told_Fx, lower, upper, right, told_rows
 ):
     """Bound the worst of `harness.kkt_residuals` from above, without products.
 
     cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
-    x, y, z_box, Fx : the point and Px
-    lower, upper, right, rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
+    at_x, at_y, at_z, told_Fx : x, y, z_box of the point, and Px
+    lower, upper, right, told_rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
 
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef const double[::1] q = _whole(cost), diagonal = _whole(told_diagonal)
-    cdef const double[::1] e = _whole(right)
-    cdef const double[::1] lb = _whole(lower), ub = _whole(upper)
-    cdef Py_ssize_t i, j, n = x.shape[0], m = e.shape[0]
-    cdef double xFx = 0.0, qx = 0.0, held = 0.0, energy, most, worst = 0.0, S = 0.0
+    cdef Py_ssize_t i, j, n = len(at_x), m = len(at_y)
+    held = tuple(map(_whole, (cost, told_diagonal, right, lower, upper, at_x, at_y, at_z,
+                              told_Fx, told_rows)))
+    cdef const double *q = numbers(held[0])
+    cdef const double *diagonal = numbers(held[1])
+    cdef const double *e = numbers(held[2])
+    cdef const double *lb = numbers(held[3])
+    cdef const double *ub = numbers(held[4])
+    cdef const double *x = numbers(held[5])
+    cdef const double *y = numbers(held[6])
+    cdef const double *z_box = numbers(held[7])
+    cdef const double *Fx = numbers(held[8])
+    cdef const double *rows = numbers(held[9])
+    cdef double xFx = 0.0, qx = 0.0, held_by = 0.0, energy, most, worst = 0.0, S = 0.0
     cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
-    cdef double[:, ::1] room
-    cdef double *forces
-    cdef double *size
-    if not diagonal.shape[0] or not n:
+    cdef Room room = Room(2 * n)
+    cdef double *forces = room.at
+    cdef double *size = forces + n
+    if not len(held[1]) or not n:
         return INFINITY
-    room = np.empty((2, n))
-    forces, size = &room[0, 0], &room[1, 0]
-    memcpy(forces, &z_box[0], n * sizeof(double))
+    memcpy(forces, z_box, n * sizeof(double))
     for i in range(m):
-        add(y[i], &rows[i, 0], forces, n)
-        held += e[i] * y[i]
+        add(y[i], rows + i * n, forces, n)
+        held_by += e[i] * y[i]
     for i in range(n):
         if not lb[i] <= x[i] <= ub[i]:
             return INFINITY
@@ -1326,16 +1524,16 @@ def residual_bound(
         qx += q[i] * x[i]
         if z_box[i]:
             step = ub[i] if z_box[i] > 0 else lb[i]
-            held += step * z_box[i]
+            held_by += step * z_box[i]
             worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
         if diagonal[i] > 0:
             least = fmin(least, diagonal[i])
         S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(q[i]), fabs(forces[i])))
-    most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held))
+    most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held_by))
     energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
     if not energy > 0:
         return INFINITY
-    worst = fmax(worst, fabs(xFx + qx + held)) / energy
+    worst = fmax(worst, fabs(xFx + qx + held_by)) / energy
     if isfinite(least):
         S = fmax(S, sqrt(energy * least))
     for i in range(n):
@@ -1362,9 +1560,9 @@ def residual_bound(
     for i in range(m):
         violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
         for j in range(n):
-            violated += rows[i, j] * x[j]
-            terms += fabs(rows[i, j] * x[j])
-            known += fabs(rows[i, j]) * size[j]
+            violated += rows[i * n + j] * x[j]
+            terms += fabs(rows[i * n + j] * x[j])
+            known += fabs(rows[i * n + j]) * size[j]
         total += violated
         if violated:
             worst = fmax(worst, fabs(violated) / known)

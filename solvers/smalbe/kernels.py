@@ -1,4 +1,7 @@
-"""The vector operations of an MPRGP step."""
+"""The vector operations of an MPRGP step.
+
+Few components of a dual have a bound, or are on one: only of these is asked where.
+"""
 
 from __future__ import annotations
 
@@ -27,10 +30,10 @@ def lengths(
 
 @on_slices
 def _to_bounds(x: Vector, p: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return, of components that move, the α at which they are on a bound."""
-    moves = p != 0
-    bound = np.where(p > 0, lower, upper)[moves]
-    found: Vector = (x[moves] - bound) / p[moves]
+    """Return, of components that move to a bound, the α at which they are there."""
+    bound = np.where(p > 0, lower, upper)
+    at = np.flatnonzero(np.isfinite(bound) & (p != 0))
+    found: Vector = (x[at] - bound[at]) / p[at]
     return found
 
 
@@ -44,11 +47,14 @@ def moved(
     What is beyond a bound, or nearer to it than rounding can tell, is on the bound: a
     step as far as it is feasible must not stop short of the face.
     """
-    step = alpha * p
-    new, noise = x - step, ROUNDING * (np.abs(x) + np.abs(step))
-    down = (new - lower <= noise) & (step >= 0)
-    up = (upper - new <= noise) & (step <= 0) & ~down
-    return np.where(down, lower, np.where(up, upper, new)), g - alpha * Hp
+    new = x - alpha * p
+    at = np.flatnonzero((lower > -np.inf) | (upper < np.inf))
+    step, to, low, high = alpha * p[at], new[at], lower[at], upper[at]
+    noise = ROUNDING * (np.abs(x[at]) + np.abs(step))
+    down = (to - low <= noise) & (step >= 0)
+    up = (high - to <= noise) & (step <= 0) & ~down
+    new[at] = np.where(down, low, np.where(up, high, to))
+    return new, g - alpha * Hp
 
 
 def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
@@ -71,10 +77,13 @@ def split(
 def _parted(
     x: Vector, g: Vector, lower: Vector, upper: Vector
 ) -> tuple[Mask, Vector, Vector]:
-    at_lower, at_upper = x <= lower, x >= upper
-    free = ~(at_lower | at_upper)
-    leads_inside = ((g < 0) & ~at_upper) | ((g > 0) & ~at_lower)
-    return free, np.where(free, g, 0.0), np.where(~free & leads_inside, g, 0.0)
+    free = (x > lower) & (x < upper)
+    held = np.flatnonzero(~free)
+    at, leads = x[held], g[held]
+    inside = ((leads < 0) & (at < upper[held])) | ((leads > 0) & (at > lower[held]))
+    phi, beta = g.copy(), np.zeros_like(g)
+    phi[held], beta[held] = 0.0, np.where(inside, leads, 0.0)
+    return free, phi, beta
 
 
 @on_slices
@@ -89,7 +98,7 @@ def reduced(
 def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
     """Return z − (zᵀHp / pᵀHp) p."""
     along, curvature = inner_products((z, Hp), (p, Hp))
-    return z - along / curvature * p
+    return combined(1.0, z, -along / curvature, p)
 
 
 @on_slices
@@ -100,8 +109,25 @@ def tilted_step(
 
     The piece is −1 where s ends at the lower bound, 1 at the upper, 0 between.
     """
-    target = x - g / tau
-    down = target <= lower
-    up = (target >= upper) & ~down
-    s = np.where(down, lower, np.where(up, upper, target)) - x
-    return s, up.astype(np.int8) - down.astype(np.int8)
+    target, piece = x - g / tau, np.zeros(x.size, dtype=np.int8)
+    ends = np.flatnonzero((target <= lower) | (target >= upper))
+    down = target[ends] <= lower[ends]
+    target[ends] = np.where(down, lower[ends], upper[ends])
+    piece[ends] = np.where(down, -1, 1)
+    return target - x, piece
+
+
+@on_slices
+def weighted_difference(v: Vector, w: Vector, weights: Vector) -> Vector:
+    """Return vᵢ − wᵢ times a weight."""
+    found: Vector = v - w
+    found *= weights
+    return found
+
+
+@on_slices
+def combined(s: float, v: Vector, t: float, w: Vector) -> Vector:
+    """Return sv + tw."""
+    found: Vector = s * v
+    found += w if t == 1 else t * w
+    return found

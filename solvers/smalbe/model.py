@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
+from harness.distributed.vectors import inner_products
 from solvers.smalbe import kernels
 from solvers.smalbe.kernels import Mask
 
@@ -43,8 +44,8 @@ class BoxModel(Protocol):
 class Tilted(NamedTuple):
     """What s(y) is at some y."""
 
-    s: Vector
-    piece: NDArray[np.int8]  #: at which bounds x + s is
+    s: Vector  #: of the components that are looked at
+    piece: NDArray[np.int8]  #: at which bounds x + s is, of these
     slope: Vector  #: of the function of y
 
 
@@ -77,7 +78,8 @@ class Model:
         root = np.sqrt(w)
 
         def at(y: Vector) -> Tilted:
-            return tilted(x, g + y @ U, tau, bounds, lambda s: U @ s - y / w)
+            s, piece = kernels.tilted_step(x, g + y @ U, tau, *bounds)
+            return Tilted(s, piece, U @ s - y / w)
 
         def newton(slope: Vector, free: Mask) -> Vector:
             core = _core(U[:, free], root, tau)
@@ -85,10 +87,10 @@ class Model:
 
         if not w.size:
             return kernels.tilted_step(x, g, tau, *bounds)[0]
-        s = minimised(at, newton, w.size)
-        if s is None:
+        found = minimised(at, newton, w.size)
+        if found is None:
             return Model.of_norm(tau + float(w.max()), x.size).step(x, g, bounds)
-        return s
+        return found[1].s
 
     def raised(self, s: Vector, sHs: float) -> Model:
         """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
@@ -132,25 +134,14 @@ def _core(U_f: NDArray[np.float64], root: Vector, tau: float) -> NDArray[np.floa
     return np.asarray(S @ S.T + tau * np.eye(root.size))
 
 
-def tilted(
-    x: Vector,
-    g: Vector,
-    tau: float,
-    bounds: tuple[Vector, Vector],
-    slope: Callable[[Vector], Vector],
-) -> Tilted:
-    """Minimise gᵀs + τ/2‖s‖² over the box."""
-    s, piece = kernels.tilted_step(x, g, tau, *bounds)
-    return Tilted(s, piece, slope(s))
-
-
 def minimised(
     at: Callable[[Vector], Tilted],
     newton: Callable[[Vector, Mask], Vector],
     k: int,
-) -> Vector | None:
-    """Maximise the dual function of k multipliers y; return s(y), None where not found.
+) -> tuple[Vector, Tilted] | None:
+    """Maximise the dual function of k multipliers y; None where that is not found.
 
+    at : what s(y) is; of components that have bounds at least
     newton : the step dy for a slope, where the free components are those
     """
     y: Vector = np.zeros(k)
@@ -159,7 +150,7 @@ def minimised(
         dy = newton(here.slope, here.piece == 0)
         there = at(y + dy)
         if (there.piece == here.piece).all():  # where Newton's method is exact
-            return there.s
+            return y + dy, there
         t, here = _searched(at, y, dy, (here, there))
         y = y + t * dy
     return None
@@ -173,7 +164,7 @@ def _searched(
 ) -> tuple[float, Tilted]:
     """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0."""
     there = ends[1]
-    first, slope = float(ends[0].slope @ dy), float(there.slope @ dy)
+    first, slope = inner_products((ends[0].slope, dy), (there.slope, dy))
     low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
     for _ in range(SEARCH_STEPS):
         if abs(slope) <= 0.1 * first or (slope > 0 and t == 1) or at_low <= at_high:

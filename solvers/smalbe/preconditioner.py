@@ -33,6 +33,7 @@ from scipy.sparse import csc_matrix, diags_array
 
 from harness import QP, Structure, Vector
 from harness.operators import Preconditioned, SerialisableOperator
+from solvers.smalbe import kernels
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.mprgp import Operator, Precondition
 from solvers.smalbe.projected import Projected
@@ -83,7 +84,8 @@ def face_preconditioner(
         def apply(v: Vector) -> Vector:
             problem.counts["preconditioner_applies"] += 1
             Pv = of_penalty(v)
-            return of_penalty(problem.spectrum.norm * M(Pv) - Pv) + Pv
+            rest = kernels.combined(problem.spectrum.norm, M(Pv), -1.0, Pv)
+            return of_penalty(rest) + Pv
 
         return apply
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from harness import QP, Matrix, Vector
 from harness.distributed.vectors import DistributedVector
 from solvers.common.conversion import boxed
-from solvers.smalbe import compiled
+from solvers.smalbe import compiled, kernels
 from solvers.smalbe.compiled import Product
 from solvers.smalbe.model import BoxModel, Model
 from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
@@ -87,9 +87,9 @@ class Projected:
         C = self.rows.C
         Cv = C @ v
         Fv = self.F(v - C.T @ Cv)
-        shift = rho * Cv - (C @ Fv) / self.spectrum.norm
-        Hv: Vector = Fv / self.spectrum.norm + C.T @ shift
-        return Hv
+        scale = 1 / self.spectrum.norm
+        shift = kernels.combined(rho, Cv, -scale, C @ Fv)
+        return kernels.combined(scale, Fv, 1.0, C.T @ shift)
 
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.
@@ -169,13 +169,15 @@ def _normalised(
 
 def _diagonal(qp: QP) -> Vector:
     """Copy the diagonal of P; empty where that is an operator that does not tell."""
+    if isinstance(qp.P, np.ndarray):
+        return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()
     return np.zeros(0) if diagonal is None else np.array(diagonal)
 
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
     """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
-    mean = float(diagonal.sum()) / diagonal.size if diagonal.size else 0.0
+    mean = float(np.add.reduce(diagonal)) / max(diagonal.size, 1)
     if spectrum.norm > NOTHING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)

@@ -23,8 +23,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Protocol, TypeAlias
+from functools import cached_property, partial
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,10 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
-from harness.distributed.vectors import DistributedColumns, distributed
-from solvers.smalbe import compiled
+from harness.distributed.vectors import DistributedColumns, Ranks, distributed
+from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
-from solvers.smalbe.model import BoxModel, Model, Tilted, minimised, tilted
+from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
 
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
@@ -95,6 +95,10 @@ class Rows(ABC):
             np.linalg.norm(Cnu) <= tol * size
             and np.linalg.norm(self.error(nu, Cnu)) <= tol * self.e_size
         )
+
+    def violation(self, nu: Vector) -> float:
+        """Return ‖Cν‖."""
+        return float(np.linalg.norm(self.C @ nu))
 
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
@@ -148,6 +152,11 @@ class SparseRows(Rows):
 
     unit: SparseColumns  #: (r, n) the rows of G divided by their norms
     gram: GramFactor  #: of these
+    bounded: NDArray[np.int64]  #: (b,) components that have a bound
+    of_bounded: SparseColumns  #: (r, b) the columns of `unit` of these
+
+    def violation(self, nu: Vector) -> float:
+        return self.gram.norm(self.unit @ nu)
 
     @property
     def no_multipliers(self) -> Vector:
@@ -165,8 +174,8 @@ class SparseRows(Rows):
         return PenaltyModel(tau, self, rho - tau)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        solve = self.gram.in_face(free, FREE_RANK)
-        y = -solve(self.unit @ np.where(free, r, 0.0))
+        t = self.unit @ np.where(free, r, 0.0)
+        y = -self.gram.solved_in_face(free, FREE_RANK, t)
         return self.gram.forward(self.gram.product(y))
 
 
@@ -179,11 +188,17 @@ class GramFactor(Protocol):
     def forward(self, t: Vector) -> Vector:
         """Return L⁻¹t."""
 
+    def norm(self, t: Vector) -> float:
+        """Return ‖L⁻¹t‖."""
+
     def backward(self, a: Vector) -> Vector:
         """Return L⁻ᵀa."""
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         """Return solves with G_F G_Fᵀ + shift·GGᵀ."""
+
+    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
+        """Do one of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +217,9 @@ class _Whole:
         t = self.factor.apply_P(t)
         return np.asarray(self.factor.solve_L(t, use_LDLt_decomposition=False))
 
+    def norm(self, t: Vector) -> float:
+        return float(np.linalg.norm(self.forward(t)))
+
     def backward(self, a: Vector) -> Vector:
         x = self.factor.solve_Lt(a, use_LDLt_decomposition=False)
         return np.asarray(self.factor.apply_Pt(x))
@@ -212,6 +230,39 @@ class _Whole:
         held = _gram(self.unit, ~free)
         factor = self.factor.cholesky(with_int32((1 + shift) * self.matrix - held))
         return lambda t: np.asarray(factor(t))
+
+    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
+        return self.in_face(free, shift)(t)
+
+
+class OuterProducts(NamedTuple):
+    """The entries of gⱼgⱼᵀ for columns gⱼ (b,) of a sparse matrix."""
+
+    size: int  #: b
+    place: NDArray[np.int64]  #: (e,) of each entry in (b, b), row by row
+    value: Vector  #: (e,)
+    column: NDArray[np.int64]  #: (e,) the j of each
+
+    @classmethod
+    def of(cls, G: csr_array, columns: Mask) -> OuterProducts:
+        """List those of some columns (n,) of G (b, n)."""
+        part = csc_array(G)[:, columns]
+        entries = np.diff(part.indptr)[np.repeat(
+            np.arange(part.shape[1]), np.diff(part.indptr)
+        )]  # fmt: skip
+        left = np.repeat(np.arange(part.nnz), entries)
+        first = np.repeat(part.indptr[:-1], np.diff(part.indptr) ** 2)
+        within = np.arange(left.size) - np.repeat(np.cumsum(entries) - entries, entries)
+        right = first + within
+        number = np.repeat(np.flatnonzero(columns), np.diff(part.indptr) ** 2)
+        place = part.indices[left].astype(np.int64) * G.shape[0] + part.indices[right]
+        return cls(G.shape[0], place, part.data[left] * part.data[right], number)
+
+    def summed(self, some: Mask) -> NDArray[np.float64]:
+        """Add them up for some of all columns (n,): (b, b)."""
+        value = np.where(some[self.column], self.value, 0.0)
+        found = np.bincount(self.place, value, self.size**2)
+        return np.asarray(found.reshape(self.size, self.size), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,8 +276,7 @@ class _OverRanks:
     matrix: csc_array  #: G_p G_pᵀ of the columns of this rank
     local: LocalFactor
     factor: SummedFactor
-    bounded: Mask  #: (n_p,) its bounded components
-    touching: csc_array  #: of G_p, rows on the border and bounded components
+    bounded: OuterProducts  #: of its bounded components, on the border
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
@@ -234,34 +284,50 @@ class _OverRanks:
     def forward(self, t: Vector) -> Vector:
         return self.factor.forward(t)
 
+    def norm(self, t: Vector) -> float:
+        return self.factor.norm(t)
+
     def backward(self, a: Vector) -> Vector:
         return self.factor.backward(a)
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         with self.local.at.ranks.clocked("coarse"):
-            held = self.touching[:, ~np.asarray(free)[self.bounded]]
-            return self.local.completed(1 + shift, (held @ held.T).toarray())
+            held = self.bounded.summed(~np.asarray(free))
+            return self.local.completed(1 + shift, held)
+
+    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
+        with self.local.at.ranks.clocked("coarse"):
+            held = self.bounded.summed(~np.asarray(free))
+            return self.local.solved(t, 1 + shift, held)
 
 
 @dataclass(frozen=True, eq=False)
 class _LocalRows:
-    """The rows of distributed columns that a rank touches: products are additive."""
+    """The rows of distributed columns that a rank touches: products are additive.
 
-    part: csr_array  #: (k, n_p)
-    transposed: csr_array  #: (n_p, k), by rows: it is multiplied with as often
-    columns: DistributedColumns
+    Held once, column by column. Both products then go along the components, and jump
+    about among the rows alone, which are few and stay in the cache.
+    """
+
+    part: csc_array  #: (k, n_p)
+    ranks: Ranks
 
     @property
     def shape(self) -> tuple[int, int]:
         rows, columns = self.part.shape
         return rows, columns
 
+    @cached_property
+    def transposed(self) -> csr_array:
+        """(n_p, k), the same entries."""
+        return self.part.T
+
     @property
     def T(self) -> _LocalRowsTransposed:
         return _LocalRowsTransposed(self)
 
     def __matmul__(self, v: Vector) -> Vector:
-        return distributed(self.part @ np.asarray(v), self.columns.ranks)
+        return distributed(self.part @ np.asarray(v), self.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,8 +335,7 @@ class _LocalRowsTransposed:
     rows: _LocalRows
 
     def __matmul__(self, y: Vector) -> Vector:
-        part = self.rows.transposed @ np.asarray(y)
-        return distributed(part, self.rows.columns.ranks)
+        return distributed(self.rows.transposed @ np.asarray(y), self.rows.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,15 +349,14 @@ class _Bordered:
     order: NDArray[np.int64]  #: (r,) rows, those of c last
     factor: Factor  #: of S in that order
     L_cc: NDArray[np.float64]
-    touching: SparseColumns  #: G_c (c, n)
+    #: held components H (n,) → (G_H G_Hᵀ)_cc
+    held: Callable[[Mask], NDArray[np.float64]]
 
     def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
         """Return solves with (1 + shift)S − G_H G_Hᵀ."""
         L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
-        schur = cho_factor(
-            scale * (L_cc @ L_cc.T) - _gram(self.touching, held).toarray(), lower=True
-        )
+        schur = cho_factor(scale * (L_cc @ L_cc.T) - self.held(held), lower=True)
 
         def solve(t: Vector) -> Vector:
             u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
@@ -318,9 +382,11 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
     factor.cholesky_inplace(S)
     L_cc = factor.L()[rest.size :, rest.size :].toarray()
     touching = unit[c]
-    if not isinstance(touching, DistributedColumns):
-        touching = csc_array(touching)
-    return _Bordered(order, factor, L_cc, touching)
+    if isinstance(touching, DistributedColumns):
+        return _Bordered(
+            order, factor, L_cc, lambda held: touching.gram(held).toarray()
+        )
+    return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,20 +403,35 @@ class PenaltyModel:
         """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
 
         As `Model.step`, with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs: the gradient of
-        the dual function is Gs(y) − GGᵀy/w.
+        the dual function is Gs(y) − GGᵀy/w. Of components without bounds s is
+        −(g + Gᵀy)/τ, so that only those with bounds, b, are looked at for each y:
+
+            Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
         """
-        G, gram, tau, w = self.rows.unit, self.rows.gram, self.tau, self.w
+        rows, gram, tau, w = self.rows, self.rows.gram, self.tau, self.w
+        b, G_b = rows.bounded, rows.of_bounded
+        x_b, g_b, box = x[b], g[b], (bounds[0][b], bounds[1][b])
+        Gg = rows.unit @ g
 
         def at(y: Vector) -> Tilted:
-            return tilted(
-                x, g + G.T @ y, tau, bounds, lambda s: G @ s - gram.product(y) / w
-            )
+            tilt = g_b + G_b.T @ y
+            s_b, piece = kernels.tilted_step(x_b, tilt, tau, *box)
+            held = G_b @ kernels.combined(1 / tau, tilt, 1.0, s_b)
+            shift = kernels.combined(1 / tau, Gg, 1 / tau + 1 / w, gram.product(y))
+            return Tilted(s_b, piece, held - shift)
 
         def newton(slope: Vector, free: Mask) -> Vector:
-            return tau * gram.in_face(free, tau / w)(slope)
+            of_all = np.ones(x.size, dtype=bool)
+            of_all[b] = free
+            return tau * gram.solved_in_face(of_all, tau / w, slope)
 
-        s = minimised(at, newton, G.shape[0])
-        return Model.of_norm(tau + w, x.size).step(x, g, bounds) if s is None else s
+        found = minimised(at, newton, rows.unit.shape[0])
+        if found is None:
+            return Model.of_norm(tau + w, x.size).step(x, g, bounds)
+        y, there = found
+        s: Vector = kernels.combined(-1 / tau, g, -1 / tau, rows.unit.T @ y)
+        s[b] = there.s
+        return s
 
     def raised(self, s: Vector, sHs: float) -> BoxModel:
         """As `Model.raised`."""
@@ -372,10 +453,11 @@ class PenaltyModel:
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
         """Return v → B_FF⁻¹v_F, zero off the face F."""
         G, solve = self.rows.unit, self.rows.gram.in_face(free, self.tau / self.w)
+        inverse = np.where(free, 1 / self.tau, 0.0)
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
-            return np.where(free, v - G.T @ solve(G @ v), 0.0) / self.tau
+            return kernels.weighted_difference(v, G.T @ solve(G @ v), inverse)
 
         return apply
 
@@ -459,12 +541,14 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
     least = float(factor.D().min())  # pivots may be negative, too
     if least <= RANK:
         return None
+    b = np.flatnonzero(np.asarray(bounded))
     whole = _Whole(unit, gram, factor, _bordered(unit, gram, bounded))
     return SparseRows(
         G=G, C=_Factored(unit, whole, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
         multipliers=lambda a: whole.backward(a) / size,
         unit=unit, gram=whole,
+        bounded=b, of_bounded=_columns(unit, b),
     )  # fmt: skip
 
 
@@ -495,21 +579,21 @@ def rows_over_ranks(
             return None
         if factor.least_pivot <= np.sqrt(RANK):
             return None
-        gram = _OverRanks(
-            matrix, local, factor, here,
-            csc_array(csr_array(of_bounded)[local.border]),
-        )  # fmt: skip
+        of_border = OuterProducts.of(csr_array(unit[local.border]), here)
+        gram = _OverRanks(matrix, local, factor, of_border)
 
     def multipliers(a: Vector) -> Vector:
         whole = np.zeros(e.size)
         whole[rows] = np.asarray(factor.backward(a)) / at.touching
         return ranks.total(whole) / size
 
-    own = _LocalRows(unit, csr_array(unit.T), G)
+    own = _LocalRows(csc_array(unit), ranks)
     return SparseRows(
         G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
         x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
+        bounded=np.flatnonzero(here),
+        of_bounded=_LocalRows(of_bounded, ranks),
     )  # fmt: skip
 
 
@@ -519,6 +603,13 @@ def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
         return G.gram(columns)
     part = G if columns is None else G[:, np.flatnonzero(columns)]
     return csc_array(part @ part.T)
+
+
+def _columns(G: SparseColumns, at: NDArray[np.int64]) -> SparseColumns:
+    """Return some of the columns."""
+    if isinstance(G, DistributedColumns):
+        return DistributedColumns(csr_array(G.part[:, at]), G.ranks)
+    return csr_array(G[:, at])
 
 
 def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
@@ -552,12 +643,21 @@ def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
 
 def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
     """Do what `orthonormal_rows` does, compiled."""
+    if not e.size:
+        none, n = np.zeros((0, G.shape[1])), G.shape[1]
+        return DenseRows(
+            none, none, 0.0, 1.0, np.zeros(n), True, _themselves, np.zeros((0, 0))
+        )
     found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e))
     dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
     multipliers = partial(compiled.multipliers, e.size, *triangle)
     return DenseRows(
         dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
     )
+
+
+def _themselves(a: Vector) -> Vector:
+    return a
 
 
 def as_dense(G: Matrix) -> NDArray[np.float64]:

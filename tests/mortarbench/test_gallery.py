@@ -8,14 +8,20 @@ import json
 from collections import Counter
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 from tests.support import ROOT
 from tests.support.fork_server import INSTALL
 
 GALLERY = ROOT / "docs" / "gallery"
+
+
+def read(name):
+    import nbformat  # late, as below: what collects tests would wait for it
+
+    notebook = nbformat.read(GALLERY / f"{name}.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    return notebook
 
 
 @pytest.fixture
@@ -29,10 +35,13 @@ def execute(tmp_path, monkeypatch):
     folder.mkdir()
 
     def run(name, *expressions):
-        notebook = nbformat.read(GALLERY / f"{name}.ipynb", as_version=4)
+        from nbclient import NotebookClient
+        from nbformat.v4 import new_code_cell
+
+        notebook = read(name)
         told = f"import json; print(json.dumps([{','.join(expressions)}]))"
-        end = nbformat.v4.new_code_cell(told)
-        notebook.cells.insert(0, nbformat.v4.new_code_cell(INSTALL))
+        end = new_code_cell(told)
+        notebook.cells.insert(0, new_code_cell(INSTALL))
         notebook.cells.append(end)
         client = NotebookClient(
             notebook,
@@ -58,8 +67,7 @@ def kinds(cells):
 
 def test_notebooks_are_stored_without_outputs():
     for path in GALLERY.glob("*.ipynb"):
-        notebook = nbformat.read(path, as_version=4)
-        nbformat.validate(notebook)
+        notebook = read(path.stem)
         code = [cell for cell in notebook.cells if cell.cell_type == "code"]
         assert not any(cell.outputs or cell.execution_count for cell in code), path
 
@@ -86,7 +94,7 @@ def test_the_code_of_your_own_solver(tmp_path, monkeypatch):
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    notebook = nbformat.read(GALLERY / "own-solver.ipynb", as_version=4)
+    notebook = read("own-solver")
     found = {}
     for cell in notebook.cells:
         magic, _, text = cell.source.partition("\n")

@@ -18,11 +18,6 @@ from reports.document.fields import FieldFigure, FieldPanel, Polygons
 from reports.document.layout import Page, Picture, Section
 from reports.folder import compose
 from reports.render.html_page import html
-
-try:
-    from playwright import sync_api
-except ModuleNotFoundError:
-    sync_api = None
 from tests.support.synthetic_results import records as synthetic
 from tests.support.synthetic_results import write
 
@@ -44,8 +39,12 @@ HOSTILE = (
 
 @pytest.fixture(scope="session")
 def browser():
-    if sync_api is None or CHROMIUM is None:
-        pytest.fail("no playwright or no chromium; make browser installs both")
+    try:
+        from playwright import sync_api
+    except ModuleNotFoundError:
+        pytest.fail("no playwright; make browser installs it")
+    if CHROMIUM is None:
+        pytest.fail("no chromium; make browser installs it")
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=root)

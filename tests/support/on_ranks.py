@@ -104,7 +104,11 @@ def factors(ranks):
             np.abs(whole.backward(a) - y[k]).max(),
             abs(a @ b - s @ y),
             abs(rows.additive(s[k]) @ whole.backward(a) - s @ y),
+            abs(whole.norm(rows.additive(t[k])) ** 2 - t @ y),
         ]
+        changed = np.zeros((own.shape[0],) * 2) if of_border is None else of_border
+        once = local.solved(rows.additive(t[k]), scale, changed)
+        errors.append(np.abs(once - y[k]).max())
     bad = part.toarray()
     if ranks.rank == 0:
         row = np.flatnonzero(~rows.is_shared)[0]

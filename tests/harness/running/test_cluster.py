@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,8 @@ from tests.support import TOY_PROBLEM
 from tests.support.fork_server import INSTALL
 from tests.support.waiting import soon
 
-pytest.importorskip("distributed")
+if find_spec("distributed") is None:
+    pytest.skip("no distributed", allow_module_level=True)
 
 PLUGIN = load_plugin(TOY_PROBLEM)
 SOLVERS = 4  #: measurements of a whole block

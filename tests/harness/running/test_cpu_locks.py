@@ -7,7 +7,12 @@ from contextlib import ExitStack
 import pytest
 
 from harness import InputError
-from harness.running.dask_worker import own_cpu
+
+
+def own_cpu(stack):
+    from harness.running.dask_worker import own_cpu  # late: it takes long
+
+    return own_cpu(stack)
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.special import bdtrc
 
 from harness import Record, Verdict
 from reports.compare.changes import compare
@@ -92,7 +92,7 @@ def test_equal_runs_alarm_at_most_once_in_twenty(changed, draw, shape):
         )
         for _ in range(pairs)
     )
-    assert alarms <= binom.ppf(0.99, pairs, 0.05)
+    assert bdtrc(alarms - 1, pairs, 0.05) > 0.01  # as many, or more, by chance
 
 
 def test_a_solver_that_takes_half_as_long_again_is_found_and_nobody_else(changed):

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_ind
 
 from harness import Record, Verdict
 from harness.results.journal import Journal
@@ -668,6 +667,8 @@ def test_what_a_sequence_took_in_two_sessions_is_paired_with_nothing_else():
 
 def test_an_unpaired_interval_is_welchs():
     """Against scipy's, on samples of different scatter and number."""
+    from scipy.stats import ttest_ind
+
     rng = np.random.default_rng(16180)
     a, b = rng.lognormal(0.2, 0.1, 5), rng.lognormal(0, 0.3, 9)
     expected = ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.9)
