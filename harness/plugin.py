@@ -188,10 +188,11 @@ class Family(ABC):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks], Emitted] | None:
+    ) -> Callable[[Ranks, Reference], Emitted] | None:
         """Say how ranks make their shares of what `build` would emit, complete params.
 
-        All ranks call what is returned. None where that is not built: one process emits
+        All ranks call what is returned, with a reference that solves shares of a QP on
+        all of them together. None where that is not built: one process emits
         the whole then. Neither needs MPI to be there, nor builds anything yet.
         """
         return None
@@ -240,8 +241,9 @@ class _Offered(Family):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks], Emitted] | None:
-        emit: Callable[[Ranks], Emitted] | None = self._own("emission")(form, params)
+    ) -> Callable[[Ranks, Reference], Emitted] | None:
+        emit: Callable[[Ranks, Reference], Emitted] | None
+        emit = self._own("emission")(form, params)
         return emit
 
     def _own(self, method: str) -> Any:

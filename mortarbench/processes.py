@@ -28,11 +28,13 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
     def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted:
+        from solvers.reference.over_ranks import reference_over_ranks
+
         family = registries.families[case["family"]]
         made = family.emission(case["form"], case["params"])
         if made is None:
             raise InputError(f"{family.name}: ranks cannot emit this case")
-        return made(ranks)
+        return made(ranks, reference_over_ranks)
 
     serve(
         solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,

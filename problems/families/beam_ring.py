@@ -95,8 +95,8 @@ class BeamRing(InSubdomains):
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and no load step before this one."""
-        return params["step"] == params["relin"] == 1 and emitted_on_ranks(params)
+        """Whether there are subdomains, and nothing needs a solution of the whole."""
+        return emitted_on_ranks(params)
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""

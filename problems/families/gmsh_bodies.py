@@ -95,14 +95,12 @@ class GmshBodies(InSubdomains):
         check_digest(p["path"], p["sha256"], digest(path, mesh))
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are parts, no load step before, and no law of Coulomb's."""
+        """Whether there are parts, and nothing needs a solution of the whole."""
         if not params["parts"] or params["kinematics"] == "finite":
             return False
         from problems.models.gmsh_bodies import laws_of
 
-        return params["step"] == params["relin"] == 1 and not any(
-            law.mu for law in laws_of(params)
-        )
+        return not any(law.mu for law in laws_of(params))
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness import Family
 
 if TYPE_CHECKING:
-    from harness import Value
+    from harness import Reference, Value
     from harness.distributed.vectors import Emitted, Ranks
     from problems.feti.emission import ProblemInParts
 
@@ -27,14 +27,14 @@ class InSubdomains(Family):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks], Emitted] | None:
+    ) -> Callable[[Ranks, Reference], Emitted] | None:
         """Return what has each rank make its share; None where one process must."""
         if form != "dual" or not self.is_emitted_by_ranks(params):
             return None
 
-        def emit(ranks: Ranks) -> Emitted:
+        def emit(ranks: Ranks, reference: Reference) -> Emitted:
             from problems.feti.emission import emitted
 
-            return emitted(self.in_subdomains(params), ranks)
+            return emitted(self.in_subdomains(params), ranks, reference)
 
         return emit

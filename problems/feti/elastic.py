@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -128,6 +128,53 @@ def torn(
     )  # fmt: skip
 
 
+class Displaced(NamedTuple):
+    """Where contact is linearised: components of `side_nodes` (w,), dimensionless."""
+
+    u: Vector  #: (w,)
+    before: Vector  #: (w,) where the slip begins
+
+
+def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
+    """List the nodes of all sides that may touch."""
+    return np.unique(np.concatenate([side for pair in pairs for side in pair]))
+
+
+def load_path(
+    posed: Callable[[int, Displaced | None], ProblemInParts],
+    pairs: Sequence[ContactPair],
+    steps: Sequence[int],
+    *,
+    quasi_static: bool,
+) -> ProblemInParts:
+    """Chain problems, each linearised at the solution of the one before.
+
+    As `problems.duality.stepping.LoadPath` does, without Coulomb's law.
+
+    Parameters
+    ----------
+    posed : the problem of a load step, linearised somewhere
+    steps : ascending; a step that is there several times is linearised anew
+    quasi_static : whether slip is that of the step
+
+    """
+    components = dofs_of(side_nodes(pairs))
+    nothing = np.zeros(components.size)
+
+    def problem(i: int, at: Displaced) -> ProblemInParts:
+        found = posed(steps[i], at)
+        return (
+            replace(found, then=partial(after, i, at)) if i + 1 < len(steps) else found
+        )
+
+    def after(i: int, at: Displaced, found: OwnSolution) -> ProblemInParts:
+        u = found.at(components)
+        ends = quasi_static and steps[i + 1] > steps[i]
+        return problem(i + 1, Displaced(u, u if ends else at.before))
+
+    return problem(0, Displaced(nothing, nothing))
+
+
 class AtSides(NamedTuple):
     """What is known along the sides that may touch, as of the bodies themselves."""
 
@@ -152,12 +199,13 @@ def in_parts(
     fixed: Nodes,
     load: tuple[Nodes, Vector],
     pairs: Sequence[ContactPair],
-    linearise: Callable[[ContactSides], ContactRows],
+    linearise: Callable[[ContactSides, Vector], ContactRows],
     laws: Sequence[FrictionLaw] = (),
     glue: str,
+    displaced: Displaced | None = None,
     results: Callable[[OwnSolution, AtSides], Mapping[str, Any]] = nothing_more,
 ) -> ProblemInParts:
-    """Describe elastic bodies in contact, linearised at rest, before they are torn.
+    """Describe elastic bodies in contact, linearised, before they are torn.
 
     It is the problem of `problems.contact.bodies.assemble` and `torn`, of which every
     rank can emit its share (`problems.feti.emission`).
@@ -166,8 +214,9 @@ def in_parts(
     ----------
     materials, plane, units, names, fixed, pairs : as of `assemble`
     load : components with a force, and the forces, N/m; each component once
-    linearise : takes the rows at rest from the nodes of the sides alone
+    linearise : takes the rows at a displacement, m, from the nodes of the sides alone
     laws : of friction with a given bound, one per pair
+    displaced : where contact is linearised; None: at rest
     results : reports more of what ranks have found than of all elastic bodies; called
         by all ranks
 
@@ -176,7 +225,7 @@ def in_parts(
     D = elasticity_matrices(materials, plane) * (length / force)
     E = np.array([m.E for m in materials]) * (length / force)
     share = longitudinal_share(D)
-    sides = _sides_at_rest(layout, pairs, names, units, linearise, laws)
+    sides = _linearised(layout, pairs, names, units, linearise, laws, displaced)
 
     def reported(found: OwnSolution) -> dict[str, Any]:
         own = found.subdomains
@@ -215,18 +264,16 @@ def forces_at(component: Nodes, force: Vector) -> Callable[[Nodes], Vector]:
     return of
 
 
-def at_rest(
+def linearised_by(
     contact: str, basis: Any, laws: Sequence[FrictionLaw] = ()
-) -> Callable[[ContactSides], ContactRows]:
-    """Make what linearises contact of sides at rest, see `linearisation`."""
-    return lambda sides: linearisation(sides, contact, basis, laws)(
-        np.zeros(sides.mesh.dofs)
-    )
+) -> Callable[[ContactSides, Vector], ContactRows]:
+    """Make what linearises contact of sides, see `linearisation`."""
+    return lambda sides, u: linearisation(sides, contact, basis, laws)(u)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _SidesAtRest:
-    """Contact linearised at rest from the nodes of the sides alone, not dimensional."""
+class _LinearisedSides:
+    """Contact linearised from the nodes of the sides alone, without dimensions."""
 
     bodies: ContactSides  #: of N nodes
     node: Nodes  #: (N,) their numbers in the whole
@@ -260,17 +307,20 @@ class _SidesAtRest:
         return AtSides(self.bodies, primal, s, self.friction)
 
 
-def _sides_at_rest(
+def _linearised(
     layout: Subdivision,
     pairs: Sequence[ContactPair],
     names: tuple[str, ...],
     units: tuple[float, float],
-    linearise: Callable[[ContactSides], ContactRows],
+    linearise: Callable[[ContactSides, Vector], ContactRows],
     laws: Sequence[FrictionLaw],
-) -> _SidesAtRest:
-    """Linearise contact at rest."""
+    displaced: Displaced | None,
+) -> _LinearisedSides:
+    """Linearise contact, as of `in_parts`."""
     length, force = units
-    node = np.unique(np.concatenate([side for pair in pairs for side in pair]))
+    node = side_nodes(pairs)
+    nothing = np.zeros(2 * node.size)
+    u, before = displaced or Displaced(nothing, nothing)
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
         body_of_node=np.asarray(layout.body[layout.holder(node)]), names=names,
@@ -280,12 +330,11 @@ def _sides_at_rest(
         ),
         length=length, force=force,
     )  # fmt: skip
-    rows = linearise(bodies)
+    rows = linearise(bodies, u * length)
     pressed = np.zeros(sum(pair.slave.size for pair in pairs))
-    at_rest = np.zeros(bodies.mesh.dofs)
-    return _SidesAtRest(
+    return _LinearisedSides(
         bodies=bodies, node=node, B=csr_array(rows.B), c=rows.c / length,
-        friction=friction_of(bodies, rows, laws, at_rest, pressed),
+        friction=friction_of(bodies, rows, laws, before, pressed),
     )  # fmt: skip
 
 

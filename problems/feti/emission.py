@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from harness import QP, InputError, Vector, no_rows
+from harness import QP, InputError, Reference, Vector, no_rows
 from harness.digest import hex_digest
 from harness.distributed.vectors import (
     EMITTED,
@@ -39,6 +39,7 @@ from harness.distributed.vectors import (
 )
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import (
+    Halo,
     RankOperator,
     balanced,
     gathered_on_one,
@@ -52,7 +53,13 @@ from problems.feti.operators import (
     explicit_kinds,
     touched,
 )
-from problems.feti.own_bodies import Results, answers
+from problems.feti.own_bodies import (
+    OwnSolution,
+    Results,
+    answers,
+    holds_all,
+    own_solution,
+)
 from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
 from problems.feti.tearing import ALIKE, Part, classify, images, spread_of
 from problems.feti.torn import Kind, Subdomains
@@ -84,6 +91,8 @@ class ProblemInParts:
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
     #: what an answer means physically; None where only the whole tells
     results: Results | None = None
+    #: what follows once this is solved, and is emitted in its place; None where this is
+    then: Callable[[OwnSolution], ProblemInParts] | None = None
 
 
 class Entries(NamedTuple):
@@ -263,17 +272,59 @@ class _Rows(NamedTuple):
     total: int  #: rows of the whole
 
 
-def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
+def emitted(problem: ProblemInParts, ranks: Ranks, reference: Reference) -> Emitted:
     """Make this rank's share of the dual; called by all ranks.
+
+    The digest of a problem that others come before is that of the first of these, with
+    their number: what was solved differs by rounding where ranks are more or less.
+
+    Parameters
+    ----------
+    reference : solves what comes before, a share of it on each rank
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks, or ranks know different ones.
+        Where there are fewer subdomains than ranks, ranks know different ones, or
+        something comes before and supports do not hold all bodies.
 
     """
-    own = OwnSubdomains(problem, ranks, _agreed(problem, ranks))
-    rows, domains = own.rows, own.domains
+    rank = _agreed(problem, ranks)
+    dual, before = _dual(OwnSubdomains(problem, ranks, rank)), list[str]()
+    while (then := dual.own.problem.then) is not None:
+        if not holds_all(dual.own.problem):
+            raise InputError(
+                "the supports leave a rigid motion of some body, which load steps and "
+                "re-linearisations do not allow; expected steps=1 and relin=1"
+            )
+        before.append(before[0] if before else _digest(dual.own))
+        found = own_solution(dual.own, dual.at, dual.scale, reference(dual.share().qp))
+        dual = _dual(OwnSubdomains(then(found), ranks, rank))
+    own, q = dual.own, dual.share().qp
+
+    def digest() -> str:
+        return EMITTED + hex_digest(map(str.encode, before or [_digest(own)]), 16)
+
+    return Emitted(
+        variables=own.rows.total, equality_rows=own.coarse,
+        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in (q.lb, q.ub)),
+        share=dual.share, digest=digest,
+        answer=answers(own, dual.at, dual.scale, _torn(own, dual.explicit)),
+    )  # fmt: skip
+
+
+class _Dual(NamedTuple):
+    """What this rank has made of a problem."""
+
+    own: OwnSubdomains
+    at: Halo
+    scale: Vector  #: (m,) of the rows of contact and friction
+    explicit: NDArray[np.bool_]  #: kinds whose blocks are formed
+    share: Callable[[], Share]
+
+
+def _dual(own: OwnSubdomains) -> _Dual:
+    rows, domains, ranks = own.rows, own.domains, own.ranks
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
     mine = at.own
     q = rows.c[mine] - at.added(rows.B @ domains.inverse(own.f))
@@ -293,13 +344,7 @@ def emitted(problem: ProblemInParts, ranks: Ranks) -> Emitted:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    finite = sum(np.count_nonzero(np.isfinite(v)) for v in (lower, upper))
-    answer = answers(own, at, _contact_scale(problem), _torn(own, explicit))
-    return Emitted(
-        variables=total, equality_rows=b.size,
-        bounds=int(ranks.total(np.array([finite]))[0]), share=share,
-        digest=partial(_digest, own), answer=answer,
-    )  # fmt: skip
+    return _Dual(own, at, _contact_scale(own.problem), explicit, share)
 
 
 def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
@@ -349,7 +394,7 @@ def _digest(own: OwnSubdomains) -> str:
     of_all = sorted(chain.from_iterable(own.ranks.comm.allgather(told)))
     shared = contact.rows.data, contact.c, contact.bound
     content = (*(name.encode() for _, name in of_all), *(v.tobytes() for v in shared))
-    return EMITTED + hex_digest(content, 16)
+    return hex_digest(content, 64)
 
 
 def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:

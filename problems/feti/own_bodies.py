@@ -59,44 +59,57 @@ class OwnSolution:
 Results = Callable[[OwnSolution], Mapping[str, Any]]
 
 
+def own_solution(
+    own: OwnSubdomains, halo: Halo, scale: Vector, s: Solution
+) -> OwnSolution:
+    """Go back from multipliers to displacements, on each rank for its own.
+
+    It is the way of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
+    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks.
+
+    scale : (m,) by which the rows of contact and friction are multiplied
+    """
+    rows = own.rows
+    bodies, times = _bodies(own)
+    T, R = bodies.parts.spread, bodies.parts.kernel
+    touched = halo.gathered(np.asarray(s.x))
+    v = own.domains.inverse(own.f - rows.B.T @ touched)
+    v -= R @ np.asarray(s.y)[bodies.coarse]
+    u = bodies.among.completed(T.T @ v) / times
+    owned = rows.number[halo.own]
+    is_contact = owned >= rows.equalities
+    z = np.zeros(scale.size)
+    z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
+    z = scale * own.ranks.total(z)
+    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+
+
 def answers(
     own: OwnSubdomains, halo: Halo, scale: Vector, torn: Mapping[str, Any]
 ) -> Callable[[Solution], Answered]:
-    """Make the way back from multipliers to displacements, on each rank for its own.
+    """Make what says what an answer means, on each rank for its own.
 
-    It is that of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
-    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Where the
-    supports leave a rigid motion of some body, only the whole knows what holds it.
+    Where the supports leave a rigid motion of some body, only the whole knows what
+    holds it.
 
     Parameters
     ----------
-    scale : (m,) by which the rows of contact and friction are multiplied
+    scale : as of `own_solution`
     torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
 
     """
-    problem, domains, rows = own.problem, own.domains, own.rows
-    equalities, is_held = rows.equalities, _is_held(problem)
+    problem, is_held = own.problem, holds_all(own.problem)
 
     def answer(s: Solution) -> Answered:
-        bodies, times = _bodies(own)
-        T, R = bodies.parts.spread, bodies.parts.kernel
-        touched = halo.gathered(np.asarray(s.x))
-        v = domains.inverse(own.f - rows.B.T @ touched)
-        v -= R @ np.asarray(s.y)[bodies.coarse]
-        u = bodies.among.completed(T.T @ v) / times
-        owned = rows.number[halo.own]
-        is_contact = owned >= equalities
-        z = np.zeros(scale.size)
-        z[owned[is_contact] - equalities] = np.asarray(s.x)[is_contact]
-        z = scale * own.ranks.total(z)
-        found, results = OwnSolution(subdomains=own, bodies=bodies, u=u, z=z), None
+        found, results = own_solution(own, halo, scale, s), None
         if (reported := problem.results) is not None:
 
             def results() -> Mapping[str, Any]:
                 return {**reported(found), **torn}
 
         return Answered(
-            (bodies, u, z[_carrying(problem)]) if is_held else None, results
+            (found.bodies, found.u, found.z[_carrying(problem)]) if is_held else None,
+            results,
         )
 
     return answer
@@ -149,7 +162,7 @@ def _carrying(problem: ProblemInParts) -> Nodes:
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
-def _is_held(problem: ProblemInParts) -> bool:
+def holds_all(problem: ProblemInParts) -> bool:
     """Whether the supports leave no rigid motion of any body."""
     of, d = problem.layout, problem.components
     node, k = np.divmod(problem.held, d)

@@ -39,9 +39,11 @@ from problems.fem.mesh import (
     rectangle_grid,
 )
 from problems.feti.elastic import (
+    Displaced,
     SubdividedBodies,
-    at_rest,
     in_parts,
+    linearised_by,
+    load_path,
     posed_on,
     subdivide,
 )
@@ -106,19 +108,25 @@ def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
 
 
 def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the first linear load step, which is linearised at rest."""
+    """Describe a load step, and before it the first one and those between."""
     p: Any = params
     grids, laws = _grids(p["Nr"], p["Nh"], p["radial"]), (law_of(params),)
-    sides = joined_sides(grids)
-    tip = _tip(sides)
-    return in_parts(
-        Layout.of(grids, p["feti"]), materials=(BEAM, RING), plane=p["plane"],
-        units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
-        load=(tip[1:], np.array([-LOAD / p["steps"]])),
-        pairs=(_pair(sides),),
-        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
-        results=lambda found, _: {"tip": (found.at(tip) * LENGTH).tolist()},
-    )  # fmt: skip
+    sides, layout = joined_sides(grids), Layout.of(grids, p["feti"])
+    tip, pairs = _tip(sides), (_pair(sides),)
+
+    def posed(step: int, displaced: Displaced | None) -> ProblemInParts:
+        return in_parts(
+            layout, materials=(BEAM, RING), plane=p["plane"],
+            units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
+            load=(tip[1:], np.array([-LOAD * (step / p["steps"])])), pairs=pairs,
+            linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
+            glue=p["glue"], displaced=displaced,
+            results=lambda found, _: {"tip": (found.at(tip) * LENGTH).tolist()},
+        )  # fmt: skip
+
+    steps = np.repeat(np.arange(1, p["step"] + 1), p["relin"]).tolist()
+    quasi_static = p["loading"] == "quasi-static"
+    return load_path(posed, pairs, steps, quasi_static=quasi_static)
 
 
 def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGrid]:

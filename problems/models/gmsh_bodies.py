@@ -33,9 +33,11 @@ from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, single_load
 from problems.fem.inverse import GeneralisedInverse
 from problems.feti.elastic import (
+    Displaced,
     SubdividedBodies,
-    at_rest,
     in_parts,
+    linearised_by,
+    load_path,
     subdivide,
     torn,
 )
@@ -120,23 +122,34 @@ def _posed(
 
 
 def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the first load step in parts; the mesh is read and cut as a whole."""
+    """Describe a load step in parts, and before it the first one and those between.
+
+    The mesh is read and cut as a whole.
+    """
     p: Any = params
     bodies, laws = described_bodies(Path(p["path"]), p["plane"]), laws_of(params)
     mesh, method = bodies.mesh, (p["contact"], p["basis"])
     with located(p["path"]):
-        rows = linearisation(bodies, *method, laws)(np.zeros(mesh.dofs))
-        check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+        if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
+            rows = linearisation(bodies, *method, laws)(np.zeros(mesh.dofs))
+            check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
         label = graph_partition(mesh.points, mesh.cells, bodies.body, p["parts"])
     fixed, loaded = bodies.B_D.indices, np.flatnonzero(bodies.f)
     named = np.concatenate([fixed, bodies.interface]) // 2
-    return in_parts(
-        mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
-        plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
-        fixed=fixed,
-        load=(loaded, bodies.f[loaded] * (bodies.force / p["steps"])),
-        pairs=bodies.pairs, linearise=at_rest(*method, laws), laws=laws, glue=p["glue"],
-    )  # fmt: skip
+    layout, pairs = mesh_in_parts(mesh, label, bodies.body, named), bodies.pairs
+
+    def posed(step: int, displaced: Displaced | None) -> ProblemInParts:
+        force = bodies.f[loaded] * (bodies.force * (step / p["steps"]))
+        return in_parts(
+            layout, materials=bodies.materials, plane=bodies.plane,
+            units=(bodies.length, bodies.force), names=bodies.names, fixed=fixed,
+            load=(loaded, force), pairs=pairs, linearise=linearised_by(*method, laws),
+            laws=laws, glue=p["glue"], displaced=displaced,
+        )  # fmt: skip
+
+    steps = np.repeat(np.arange(1, p["step"] + 1), p["relin"]).tolist()
+    quasi_static = p["loading"] == "quasi-static"
+    return load_path(posed, pairs, steps, quasi_static=quasi_static)
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:

@@ -67,8 +67,8 @@ from problems.fem.mesh import HalfDisc, Mesh, Nodes, join, joined_sides, nodal_l
 from problems.feti.elastic import (
     AtSides,
     SubdividedBodies,
-    at_rest,
     in_parts,
+    linearised_by,
     posed_on,
     subdivide,
 )
@@ -171,7 +171,7 @@ def on_plane_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         names=ALONE, fixed=2 * _on_axis(sides),
         load=_pressed(halves.discs, "flat", halves.exact.P),
         pairs=(_on_rigid(sides),),
-        linearise=lambda arc: above_plane(arc.mesh, arc.pairs[0].slave),
+        linearise=lambda arc, _: above_plane(arc.mesh, arc.pairs[0].slave),
         glue=p["glue"], results=halves.results,
     )  # fmt: skip
 
@@ -274,7 +274,8 @@ def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         names=NAMES, fixed=_guided(sides),
         load=_pressed(halves.discs, "upper_flat", halves.exact.P),
         pairs=(_pair(params, sides),),
-        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
+        glue=p["glue"],
         results=halves.results,
     )  # fmt: skip
 

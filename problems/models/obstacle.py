@@ -57,6 +57,7 @@ from problems.fem.laplacian import grid_stiffness
 from problems.fem.mesh import Nodes, StructuredGrid
 from problems.feti.emission import Contact, ProblemInParts
 from problems.feti.gluing import glue
+from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
@@ -132,6 +133,29 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
         load=partial(_load, grid, shape), held=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
+        results=partial(_found_by_ranks, grid, shape),
+    )  # fmt: skip
+
+
+def _found_by_ranks(
+    grid: StructuredGrid, shape: str, found: OwnSolution
+) -> Mapping[str, Any]:
+    """Report what ranks have found, as `obstacle_quantities`; called by all of them.
+
+    The energy of the lift is that of `Problem.energy` for v = 0: qᵀw − ½wᵀKw.
+    """
+    held = np.unique(np.concatenate([*grid.sides.values()]))
+    n = grid.divisions[0]
+    w, q = exact_height(grid.position(held), shape), -_load(grid, shape, held)
+    load = LOAD[shape] * _shares(n, 2 * HALF[shape] / n, held)
+    node = found.bodies.components
+    x, here = grid.position(node), np.isin(node, held)
+    u = np.where(here, exact_height(x, shape), found.u)
+    error = float(np.abs(u - exact_height(x, shape)).max())
+    return _reported(
+        shape, (2, grid.nodes, n**2, held.size), found.z,
+        found.energy + float(w @ (q + load) / 2),
+        found.bodies.ranks.extreme(error, np.max),
     )  # fmt: skip
 
 
@@ -151,18 +175,15 @@ def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
     K of a square is the sum of Kronecker products of the stiffness and the mass of
     lines of linear elements; only next to the boundary, w is felt.
     """
-    n, h = grid.columns.size - 1, 2 * HALF[shape] / (grid.columns.size - 1)
-    i, j = np.divmod(node, n + 1)
-
-    def ends(k: Nodes) -> Vector:
-        return np.where((k == 0) | (k == n), 1.0, 2.0)
+    n = grid.divisions[0]
+    h, (i, j) = 2 * HALF[shape] / n, np.divmod(node, n + 1)
 
     def along(k: Nodes, step: int) -> tuple[Vector, Vector]:
         one = np.ones(k.size)
-        stiff, mass = (-one, one) if step else (ends(k), 2 * ends(k))
+        stiff, mass = (-one, one) if step else (_cells_at(k, n), 2 * _cells_at(k, n))
         return stiff / h, mass * (h / 6)
 
-    f = -LOAD[shape] * (h / 2) ** 2 * ends(i) * ends(j)
+    f = -LOAD[shape] * _shares(n, h, node)
     for a, b in np.ndindex(3, 3):
         beside = np.stack([i + a - 1, j + b - 1])
         at_boundary = ((beside == 0) | (beside == n)).any(axis=0)
@@ -171,6 +192,17 @@ def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
         w = exact_height(grid.position(beside[0, of] * (n + 1) + beside[1, of]), shape)
         f[of] -= (K_i * M_j + M_i * K_j) * w
     return np.asarray(f)
+
+
+def _cells_at(line: Nodes, n: int) -> Vector:
+    """Count the cells beside some of n + 1 points on a line, (k,)."""
+    return np.where((line == 0) | (line == n), 1.0, 2.0)
+
+
+def _shares(n: int, h: float, node: Nodes) -> Vector:
+    """Return ∫N of some nodes (k,) of a square of n × n cells."""
+    i, j = np.divmod(node, n + 1)
+    return np.asarray((h / 2) ** 2 * _cells_at(i, n) * _cells_at(j, n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,21 +360,33 @@ def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
     max_error: largest error of u at a node, m.
     """
     N, dim = problem.x.shape
-    shape = problem.shape
-    energy, force = problem.energy(s.x), float(s.z.sum())
-    error = problem.lift + s.x - exact_height(problem.x, shape)
+    error = problem.lift + s.x - exact_height(problem.x, problem.shape)
+    return _reported(
+        problem.shape, (dim, N, problem.cells, problem.qp.b.size), s.z,
+        problem.energy(s.x), float(np.abs(error).max()),
+    )  # fmt: skip
+
+
+def _reported(
+    shape: str, sizes: tuple[int, int, int, int], z: Vector, energy: float, error: float
+) -> dict[str, Any]:
+    """Put together what `obstacle_quantities` tells.
+
+    sizes : dimensions, nodes, cells, and nodes at the boundary
+    """
+    (dim, N, elements, held), force = sizes, float(z.sum())
     flat = LOAD["flat"] * (2.0 if dim == 1 else np.pi)
     exact_force = flat if shape == "flat" else 2 * np.pi * SLOPE
     return {
         "nodes": N,
-        "elements": problem.cells,
+        "elements": elements,
         "dofs": N,
-        "equality_rows": problem.qp.b.size,
-        "contact_rows": problem.qp.h.size,
-        "active": int((s.z > ACTIVE * s.z.max(initial=0.0)).sum()),
+        "equality_rows": held,
+        "contact_rows": z.size,
+        "active": int((z > ACTIVE * z.max(initial=0.0)).sum()),
         "energy": energy,
         "energy_error": energy / exact_energy(dim, shape) - 1,
         "obstacle_force": force,
         "force_error": force / exact_force - 1,
-        "max_error": float(np.abs(error).max()),
+        "max_error": error,
     }

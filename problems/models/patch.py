@@ -65,8 +65,8 @@ from problems.fem.stress import gauss_stress
 from problems.feti.elastic import (
     AtSides,
     SubdividedBodies,
-    at_rest,
     in_parts,
+    linearised_by,
     own_meshes,
     posed_on,
     subdivide,
@@ -282,7 +282,8 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     return in_parts(
         layout, materials=materials, plane=p["plane"], units=UNITS, names=NAMES,
         fixed=_rollers(sides), load=_pressure(grids), pairs=(_pair(params, sides),),
-        linearise=at_rest(p["contact"], p["basis"], laws), laws=laws, glue=p["glue"],
+        linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
+        glue=p["glue"],
         results=error,
     )  # fmt: skip
 

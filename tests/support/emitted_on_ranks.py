@@ -13,15 +13,15 @@ from scipy.sparse import csr_array
 
 import mortarbench as mb
 from harness.distributed.vectors import Ranks
-from problems.feti.emission import OwnSubdomains, emitted, subdomains_of
+from problems.feti.emission import OwnSubdomains, subdomains_of
+from solvers.reference.over_ranks import reference_over_ranks
 
 
 def compared(name, ranks):
     """Tell how far the shares are from the QP of one process, part by part."""
     case = mb.build(name)
-    assert case.id.family.is_emitted_by_ranks(case.params)
+    made = case.id.family.emission("dual", case.params)(ranks, reference_over_ranks)
     problem = case.id.family.in_subdomains(case.params)
-    made = emitted(problem, ranks)
     share, qp = made.share().qp, case.qp
     whole, rows = qp.P.build(), share.P.halo.rows
     own = rows[share.P.halo.own]

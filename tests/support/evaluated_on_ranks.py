@@ -17,6 +17,7 @@ from harness.verify.certificate import UncertifiableError
 from harness.verify.kkt import kkt_residuals
 from harness.verify.verdicts import evaluated_by_ranks, plain
 from problems import PROBLEMS
+from solvers.reference.over_ranks import reference_over_ranks
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
@@ -27,11 +28,10 @@ WRONG = ((1e-4, 1.0), (1e-6, 1.0), (1e-6, 1.01))
 def evaluated(name, ranks):
     """Evaluate answers by all ranks, and what they are together by one process."""
     case_id = parse(name, PROBLEMS)
-    emitted = case_id.family.emission(case_id.form, case_id.params)(ranks)
+    emit = case_id.family.emission(case_id.form, case_id.params)
+    emitted = emit(ranks, reference_over_ranks)
     digest = emitted.digest()
-    alone = case_id.family.emission(case_id.form, case_id.params)(
-        Ranks(MPI.COMM_SELF)
-    ).digest()
+    alone = emit(Ranks(MPI.COMM_SELF), reference_over_ranks).digest()
     found = []
     for tol, wrong in WRONG:
         share = emitted.share()

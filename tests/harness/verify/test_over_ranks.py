@@ -21,6 +21,7 @@ HELD = (
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 PATCH = "contact-patch/feti=3/dual"
+HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
 #: of a bound; K is the sum over subdomains on ranks, and the stored one elsewhere
 ROUNDING = 1e-4
 
@@ -34,7 +35,8 @@ def found(request):
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "evaluated_on_ranks.py"), *HELD, HELD_BY_CONTACT, PATCH,
+            str(SUPPORT / "evaluated_on_ranks.py"),
+            *HELD, HELD_BY_CONTACT, PATCH, HERTZ,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
@@ -42,7 +44,7 @@ def found(request):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, HERTZ])
 def test_residuals_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         one = answer["by_one"]["values"]
@@ -77,7 +79,7 @@ def test_what_contact_alone_holds_is_certified_by_the_whole(found):
         assert answer["by_one"]["bound"] < 1
 
 
-@pytest.mark.parametrize("case", [*HELD[:2], HELD_BY_CONTACT, PATCH])
+@pytest.mark.parametrize("case", [*HELD[:2], HELD[3], HELD_BY_CONTACT, PATCH, HERTZ])
 def test_quantities_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         by_ranks, by_one = (
@@ -109,7 +111,7 @@ def test_an_exact_solution_is_recovered_across_subdomains(found):
         assert largest == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH, HERTZ])
 def test_sizes_are_those_of_the_whole(found, case):
     for answer in found[case]:
         assert answer["sizes"][0] == answer["sizes"][1]
