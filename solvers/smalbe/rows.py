@@ -637,7 +637,7 @@ def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
         return DenseRows(
             none, none, 0.0, 1.0, np.zeros(n), True, _themselves, np.zeros((0, 0))
         )
-    found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e))
+    found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))
     dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
     multipliers = partial(compiled.multipliers, e.size, *triangle)
     return DenseRows(
