@@ -24,7 +24,7 @@ from cpython.buffer cimport (
 )
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
-from libc.stdlib cimport calloc, free as give_back
+from libc.stdlib cimport calloc, free as give_back, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
@@ -76,7 +76,7 @@ cdef extern from "vectors.h" nogil:
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
-    void add_gram(double s, const double *v, double *S, Py_ssize_t k)
+    void add_gram(const double *s, const double *V, double *S, Py_ssize_t k)
     int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
@@ -284,20 +284,24 @@ def orthonormal(G, e):
 cdef double RANK = 1e-13  # pivots of the normalised rows below this are rounding errors
 
 
-def multipliers(Py_ssize_t m, const double[:, ::1] R, const int[::1] kept,
-                const double[::1] size, const double[::1] a):
-    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows."""
-    cdef Py_ssize_t i, j
+def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
+    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
+
+    triangle, rows_kept, sizes, told_a : R (r, r), the rows kept (r,), their sizes (m,), a
+    """
+    cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
     result = np.zeros(m)
-    if not m:
-        return result
-    cdef double[::1] y = result
-    for i in range(R.shape[0] - 1, -1, -1):  # Rz = a, y = z/size
+    cdef double *y = numbers(result)
+    cdef const double *R = numbers(triangle)
+    cdef const double *size = numbers(sizes)
+    cdef const double *a = numbers(told_a)
+    cdef const int[::1] kept = rows_kept
+    for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
-        for j in range(i + 1, R.shape[0]):
-            s -= R[i, j] * y[kept[j]] * size[kept[j]]
-        y[kept[i]] = s / (R[i, i] * size[kept[i]])
+        for j in range(i + 1, r):
+            s -= R[i * r + j] * y[kept[j]] * size[kept[j]]
+        y[kept[i]] = s / (R[i * r + i] * size[kept[i]])
     return result
 
 
@@ -416,6 +420,7 @@ cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
 cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
 
 cdef enum:
+    KEPT = 200  # directions of CG on a face
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
     MOST_IDLE = 2
@@ -432,14 +437,17 @@ cdef struct Until:
 
 
 cdef class Gram:
-    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last."""
+    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last.
+
+    Its upper triangle.
+    """
 
     cdef Py_ssize_t n, k, stride, flips
     cdef const double *U
     cdef Room holder, room  # of U, and of all others
     cdef int *where
     cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *column
+    cdef double *columns  # (4, stride)
     cdef double *held
 
     @staticmethod
@@ -447,10 +455,10 @@ cdef class Gram:
         cdef Gram made = Gram.__new__(Gram)
         made.U, made.holder, made.k, made.n = B.U, B.holder, B.k, B.n
         made.stride, made.flips = (B.k + 3) & ~3, B.n + 1
-        made.room = Room(made.stride * (made.stride + 1) + 2 * B.n)
+        made.room = Room(made.stride * (made.stride + 4) + 2 * B.n)
         made.values = made.room.at
-        made.column = made.values + made.stride * made.stride
-        made.held = made.column + made.stride
+        made.columns = made.values + made.stride * made.stride
+        made.held = made.columns + 4 * made.stride
         made.where = <int *> (made.held + B.n)
         return made
 
@@ -458,21 +466,33 @@ cdef class Gram:
         """Have it be that of the face where `piece` is zero.
 
         The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew.
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
         """
-        cdef Py_ssize_t i, j, c, k = self.k, stride = self.stride
+        cdef Py_ssize_t i, j, c, q, count, k = self.k, stride = self.stride
+        cdef double sign[4]
+        cdef bint is_held
         if self.flips > self.n:
-            self.flips = 0
+            self.flips = count = 0
+            for i in range(self.n):
+                count += piece[i] != 0
+            is_held = 2 * count > self.n
             memset(self.values, 0, stride * stride * sizeof(double))
             for i in range(k):
-                self.values[i * stride + i] = 1.0
-            memset(self.held, 0, self.n * sizeof(double))
-        for c in range(changed(piece, self.held, self.n, self.where)):
-            i = self.where[c]
-            for j in range(k):
-                self.column[j] = self.U[j * self.n + i]
-            add_gram(1 - 2 * self.held[i], self.column, self.values, stride)
-            self.flips += 1
+                self.values[i * stride + i] = not is_held
+            for i in range(self.n):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.n, self.where)
+        self.flips += count
+        for c in range(0, count, 4):
+            for q in range(4):
+                sign[q] = 0.0
+                if c + q < count:
+                    i = self.where[c + q]
+                    sign[q] = 1 - 2 * self.held[i]
+                    for j in range(k):
+                        self.columns[q * stride + j] = self.U[j * self.n + i]
+            add_gram(sign, self.columns, self.values, stride)
 
 
 cdef class Model:
@@ -538,6 +558,85 @@ cdef class Model:
         return 0
 
 
+cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
+    """Make room for so many numbers, and keep those that are there."""
+    held = <double *> realloc(held, max(size, 1) * sizeof(double))
+    if not held:
+        raise MemoryError
+    return held
+
+
+cdef class Directions:
+    """The last conjugate directions of CG on a face, as `solvers.smalbe.mprgp` has them.
+
+    free : the face, 1 where a component is off its bounds (n,)
+    """
+
+    cdef Py_ssize_t n, count, most, oldest, room
+    cdef double *p  # (room, n)
+    cdef double *Hp
+    cdef double *share
+    cdef double *free
+
+    def __cinit__(self, Py_ssize_t n, Py_ssize_t most):
+        self.n, self.most = n, most
+        self.share = <double *> calloc(max(most + n, 1), sizeof(double))
+        if not self.share:
+            raise MemoryError
+        self.free = self.share + most
+
+    def __dealloc__(self):
+        give_back(self.p)
+        give_back(self.Hp)
+        give_back(self.share)
+
+    cdef void begin(self, const double *free) noexcept:
+        """Forget all, on another face."""
+        self.count = self.oldest = 0
+        if self.n:
+            memcpy(self.free, free, self.n * sizeof(double))
+
+    cdef bint is_on(self, const double *free) noexcept:
+        """Whether they are directions on that face."""
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            if self.free[i] != free[i]:
+                return False
+        return True
+
+    cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
+        """Add one with pᵀHp, in place of the oldest where there are too many."""
+        cdef Py_ssize_t at = self.count
+        if not self.most:
+            return 0
+        if at == self.most:
+            at, self.oldest = self.oldest, (self.oldest + 1) % self.most
+        elif at == self.room:
+            self.room = min(max(16, 2 * self.room), self.most)
+            self.p = enlarged(self.p, self.room * self.n)
+            self.Hp = enlarged(self.Hp, self.room * self.n)
+        memcpy(self.p + at * self.n, p, self.n * sizeof(double))
+        memcpy(self.Hp + at * self.n, Hp, self.n * sizeof(double))
+        scale(1 / sqrt(curvature), self.p + at * self.n, self.n)
+        scale(1 / sqrt(curvature), self.Hp + at * self.n, self.n)
+        self.count = min(self.count + 1, self.most)
+        return 0
+
+    cdef void conjugate(self, double *p) noexcept:
+        """Take from p its part along them."""
+        if self.count:
+            rows_times(self.Hp, p, self.share, self.count, self.n)
+            add_combination(-1.0, self.p, self.share, p, self.count, self.n)
+
+    cdef void minimise(self, const double *g, double *s, double *Hs) noexcept:
+        """Find s and Hs, for which x − s minimises the cost along all of them."""
+        rows_times(self.p, g, self.share, self.count, self.n)
+        memset(s, 0, self.n * sizeof(double))
+        memset(Hs, 0, self.n * sizeof(double))
+        add_combination(1.0, self.p, self.share, s, self.count, self.n)
+        add_combination(1.0, self.Hp, self.share, Hs, self.count, self.n)
+
+
 cdef class Solver:
     """One projected problem, the rules of its solution, and room for the vectors.
 
@@ -594,6 +693,7 @@ cdef class Solver:
     cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
+    cdef Directions directions
     cdef double known_rho
     cdef long most_products  # where the energy error may still cost something
 
@@ -626,6 +726,8 @@ cdef class Solver:
         self.newton_proportions = options.proportioning == "model"
         self.plain = options.expansion != "model"
         self.preconditioned = preconditioned
+        kept = KEPT if options.recycle and not issparse(F.matrix) else 0
+        self.directions = Directions(self.n, kept)
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
@@ -1069,9 +1171,11 @@ cdef class Solver:
         cdef double chopped = INFINITY
         cdef double weight, began
         self.split()
+        self.minimise_along_directions()
         self.enter_face()
         began = self.phi_square
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        self.directions.conjugate(self.p)
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
             if self.precise(until, tol, energy, b_size):
@@ -1090,7 +1194,9 @@ cdef class Solver:
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
+                    self.directions.add(self.p, self.Hp, self.told[3])
                     self.minimise_along_p()
+                    self.directions.conjugate(self.p)
                     self.tell(b"c", trace, note)
                     inside += 1
                     continue
@@ -1102,10 +1208,24 @@ cdef class Solver:
             if not letter:
                 return 0
             self.split()
+            self.directions.begin(self.free)
             self.enter_face()
             inside, began = 0, self.phi_square
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
             self.tell(letter, trace, note)
+
+    cdef int minimise_along_directions(self) except -1:
+        """Minimise along the directions known on this face, as far as is feasible."""
+        cdef double *s = self.s
+        cdef double *Hs = self.Hs
+        if self.directions.count and self.directions.is_on(self.free):
+            self.directions.minimise(self.g, s, Hs)
+            lengths(self.x, self.g, s, Hs, self.lower, self.upper, self.n, self.told)
+            self.to(fmin(1.0, self.told[1]), s, Hs)
+            self.split()
+        if not self.directions.is_on(self.free):
+            self.directions.begin(self.free)
+        return 0
 
     cdef int tell(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
@@ -1221,6 +1341,8 @@ cdef class Solver:
         cdef Until until
         memcpy(self.x, numbers(at.nu), n * sizeof(double))
         memcpy(self.g, numbers(at.g), n * sizeof(double))
+        if at.rho != self.rho or not at.outer:
+            self.directions.begin(self.free)
         self.rho, self.most_products = at.rho, 0
         multipliers = np.array(at.mu)
         cdef double *mu = numbers(multipliers)
@@ -1296,6 +1418,7 @@ cdef class Solver:
         for i in range(self.r):
             add((rho - self.rho) * self.Cv[i], self.C + i * self.n, self.g, self.n)
         self.rho = rho
+        self.directions.begin(self.free)  # of another H
 
     # back to the problem as given
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import issparse
 
 from harness import QP, Solution, Status, Vector, kkt_residuals
 from harness.distributed.vectors import DistributedVector
@@ -48,6 +49,7 @@ RHO = 1e4  #: penalty where none is given
 #: where P offers a preconditioner: the face preconditioner knows what ρ does there, and
 #: fewer outer iterations interrupt CG
 TORN_RHO = 1e6
+KEPT = 200  #: directions of CG on a face
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -65,8 +67,7 @@ class Carry(NamedTuple):
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Task:
+class _Task(NamedTuple):
     qp: QP
     inner: QP  #: without the variables that were eliminated
     eliminated: Eliminated | None
@@ -212,7 +213,7 @@ def outer_loop(
         return partial(_compiled_loop, solver, problem, options, watch), solver
     rules = Rules(
         options.Gamma, options.expansion, options.proportioning, options.reduced,
-        options.alpha,
+        options.alpha, kept=_kept(options, qp),
     )  # fmt: skip
     constants = Constants(
         options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
@@ -228,6 +229,11 @@ def outer_loop(
     return partial(smalbe, problem, constants, inner), None
 
 
+def _kept(options: Options, qp: QP) -> int:
+    """Say how many directions of CG to keep: none where a product costs less."""
+    return KEPT if options.recycle and not issparse(qp.P) else 0
+
+
 def _compiled_loop(
     solver: compiled.Solver,
     problem: Projected,
@@ -240,7 +246,7 @@ def _compiled_loop(
         options, tol, at, partial(infeasible, problem.rows, problem.bounds),
         watch and partial(_observer, watch, problem),
     )  # fmt: skip
-    outer = (*at.outer, *(OuterIteration(*fields) for fields in done))
+    outer = at.outer + tuple(map(OuterIteration._make, done))
     return Iterate(nu, g, mu, M, rho, outer, Status(status))
 
 
@@ -264,7 +270,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
             return Solution.without_point(task.qp, at.status, message), _nothing
-        if not np.isfinite(at.nu).all():
+        if not at.nu @ at.nu < np.inf:
             message = "the iterates diverged"
             return Solution.without_point(task.qp, Status.FAILED, message), _nothing
         point, Fx = _point(task, at)
@@ -288,7 +294,8 @@ def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
     """Compute the gradient anew, which the steps only carried along; one product."""
     x = problem.rows.x_tilde + at.nu
     fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
-    return fresh._replace(outer=at.outer)
+    same = fresh.rho == at.rho
+    return fresh._replace(outer=at.outer, directions=at.directions if same else None)
 
 
 def _nothing() -> None:
@@ -315,14 +322,15 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     qp, problem = task.inner, task.problem
     found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
     x, a, z_box, Fx = found or recovered(problem, qp, at)
+    if not (Fx + qp.q).any():  # a minimum of the cost without any constraint
+        a, z_box = np.zeros_like(a), np.zeros_like(z_box)
     letters = at.steps
-    taken = ((name, letters.count(letter)) for letter, name in STEPS.items())
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
         z_box=z_box, iterations=len(letters),
         counts={
             "P_products": problem.F.count, **problem.counts, "outer": len(at.outer),
-            **{name: count for name, count in taken if count},
+            **{STEPS[x]: letters.count(x) for x in STEPS if x in letters},
         },
         message="converged", history=task.history.columns if task.history else {},
     )  # fmt: skip

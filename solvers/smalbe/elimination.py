@@ -94,7 +94,8 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     block = _factorised(_block(qp.P, free, free), known)
     if block is None or not rows.consistent:
         return None
-    left, size, _ = np.linalg.svd(rows.C[:, free], full_matrices=False)
+    C_E = rows.C[:, free]
+    left, size, _ = np.linalg.svd(C_E, full_matrices=C_E.shape[0] > C_E.shape[1])
     if ((size > ZERO) & (size < GOOD)).any():
         return None
     rank = int((size >= GOOD).sum())

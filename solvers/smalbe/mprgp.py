@@ -5,7 +5,8 @@ Dostál and Schöberl 2005). With the gradient g = Hx − b, the free gradient �
 is off its bounds), the chopped gradient β (the part of g on the bounds that leads
 inside) and the projected gradient g^P = φ + β, each step is one of
 
-* c, conjugate gradient: minimise along p on the face, if that stays feasible
+* c, conjugate gradient: minimise along p on the face, if that stays feasible; p is made
+  conjugate to all `Directions` taken on the face, not to the last alone
 * b, beyond: conjugate gradients on the face as if it had no bounds, for the expansion
 * e, expansion of the active set, by one of the `EXPANSIONS`
 * f, fallback: an expansion that gained too little, done anew in the safe way
@@ -30,6 +31,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from harness import Vector
+from harness.distributed.vectors import inner_products
 from solvers.smalbe import kernels
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel
@@ -61,6 +63,7 @@ class Rules:
     proportioning: Proportioning = "model"
     reduced: bool = True  #: compare β with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
     relaxation: float = 1.9  #: of expansions by the model, ᾱ‖H‖ of gradient projection
+    kept: int = 0  #: most directions of CG that are kept on a face
 
 
 class Point(NamedTuple):
@@ -85,6 +88,47 @@ class Face(NamedTuple):
         return math.sqrt(self.phi_square + self.beta_square)
 
 
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """The last conjugate directions that CG took on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
+
+    In exact arithmetic CG is conjugate to all k of them through the last. Rounding
+    undoes that after some dozens of steps, and a new right-hand side on the same face
+    (a multiplier step's) at once. With all of them at hand neither does, for two passes
+    over k vectors a step (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech. Engrg.
+    117, 1994, 195-209).
+    """
+
+    free: Mask
+    p: tuple[Vector, ...] = ()
+    Hp: tuple[Vector, ...] = ()
+
+    def and_(self, p: Vector, Hp: Vector, most: int) -> Directions:
+        """Add one, and leave out the first where they are more than `most`."""
+        if not most:
+            return self
+        (square,) = inner_products((p, Hp))
+        scale = 1 / math.sqrt(square)
+        return Directions(
+            self.free, (*self.p, scale * p)[-most:], (*self.Hp, scale * Hp)[-most:]
+        )
+
+    def conjugate(self, p: Vector) -> Vector:
+        """Return p without its part along them."""
+        along = inner_products(*((p, Hq) for Hq in self.Hp)) if self.p else ()
+        for share, q in zip(along, self.p, strict=True):
+            p = p - share * q
+        return p
+
+    def minimising(self, g: Vector) -> tuple[Vector, Vector]:
+        """Return s and Hs, for which x − s minimises the cost along all of them."""
+        shares = inner_products(*((g, q) for q in self.p))
+        s, Hs = np.zeros_like(g), np.zeros_like(g)
+        for share, q, Hq in zip(shares, self.p, self.Hp, strict=True):
+            s, Hs = s + share * q, Hs + share * Hq
+        return s, Hs
+
+
 class Minimum(NamedTuple):
     """Where MPRGP stopped."""
 
@@ -93,6 +137,7 @@ class Minimum(NamedTuple):
     face: Face
     stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
     trace: str  #: one letter per step: c, b, e, f, p
+    directions: Directions  #: of the last face
 
 
 #: told after each step but those beyond the box: letter, where
@@ -137,6 +182,7 @@ def mprgp(
     precondition: Precondition | None = None,
     watch: Watch | None = None,
     max_steps: int = 10_000,
+    directions: Directions | None = None,
 ) -> Minimum:
     """Minimise ½xᵀHx − bᵀx over l ≤ x ≤ u.
 
@@ -149,14 +195,16 @@ def mprgp(
     stop : says from the point and its face whether to stop; asked before every step
     precondition : makes the preconditioner of the CG steps in a face
     watch : told the letter of each step, the new point and its face
+    directions : of a run before with the same H: where it ended on the face of the
+        start, the cost is minimised along them first, without a product
 
     """
     task = _Task(H, b, bounds, rules)
     precondition = precondition or _none
-    at, trace = Point(*start), ""
-    face = split(at, bounds)
+    trace = ""
+    at, face, known = _minimised_along(task, Point(*start), directions)
     z_of = precondition(face.free)
-    p, stay = z_of(face.phi), _Stay(0, face.phi_square)
+    p, stay = known.conjugate(z_of(face.phi)), _Stay(0, face.phi_square)
     idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
     while not (done := stop(at, face)) and len(trace) < max_steps:
         if _disproportional(task, at, face, B):
@@ -175,15 +223,34 @@ def mprgp(
         letters, at, B = step
         face = split(at, bounds)
         if letters == "c":
-            p = kernels.conjugate(z_of(face.phi), p, Hp)
+            known = known.and_(p, Hp, rules.kept)
+            p = known.conjugate(kernels.conjugate(z_of(face.phi), p, Hp))
             stay = stay._replace(inside=stay.inside + 1)
         else:
-            z_of = precondition(face.free)
+            z_of, known = precondition(face.free), Directions(face.free)
             p, stay = z_of(face.phi), _Stay(0, face.phi_square)
         trace += letters
         if watch is not None:
             watch(letters[-1], at, face)
-    return Minimum(at.x, at.g, face, done, trace)
+    return Minimum(at.x, at.g, face, done, trace, known)
+
+
+def _minimised_along(
+    task: _Task, at: Point, known: Directions | None
+) -> tuple[Point, Face, Directions]:
+    """Minimise along known directions of this face, as far as is feasible.
+
+    Where that leads to a bound, the face is another one, and they are forgotten.
+    """
+    face = split(at, task.bounds)
+    if known is None or not known.p or not (known.free == face.free).all():
+        return at, face, Directions(face.free)
+    s, Hs = known.minimising(at.g)
+    _, feasible = kernels.lengths(*at, s, Hs, *task.bounds)
+    at = _moved(task, at, min(1.0, feasible), s, Hs)
+    face = split(at, task.bounds)
+    same = bool((known.free == face.free).all())
+    return at, face, known if same else Directions(face.free)
 
 
 def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:

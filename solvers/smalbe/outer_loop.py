@@ -7,7 +7,8 @@ Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …
 1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
 2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖² since the
    last k: M ← βM, and ρ ← ρ·growth.
-3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed.
+3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed. H is the
+   same, so that on an unchanged face the directions of CG go on to serve.
 
 until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
 is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
@@ -32,6 +33,7 @@ import numpy as np
 from harness import Status, Vector
 from solvers.smalbe.model import BoxModel
 from solvers.smalbe.mprgp import (
+    Directions,
     Face,
     Minimum,
     Point,
@@ -93,11 +95,12 @@ class Iterate(NamedTuple):
     rho: float
     outer: tuple[OuterIteration, ...] = ()
     status: Status = Status.ITERATION_LIMIT
+    directions: Directions | None = None  #: of CG with this ρ on the last face
 
     @property
     def steps(self) -> str:
         """All inner steps so far, one letter each."""
-        return "".join(o.trace for o in self.outer)
+        return "".join([o.trace for o in self.outer])
 
     @property
     def stalled(self) -> bool:
@@ -146,7 +149,7 @@ def smalbe(
             B=inner.model(at.rho), stop=precise, rules=inner.rules,
             precondition=inner.precondition(at.rho),
             watch=inner.watch and inner.watch(len(at.outer), rhs),
-            max_steps=max(left, 0),
+            max_steps=max(left, 0), directions=at.directions,
         )  # fmt: skip
         left -= len(run.trace) + 1
         at = _updated(problem, constants, at, run, lagrangian)
@@ -214,6 +217,7 @@ def _updated(
         mu=at.mu + rho * Cnu,
         M=at.M if enough else constants.beta * at.M,
         outer=(*at.outer, done),
+        directions=run.directions,
     )
     if enough or constants.rho_growth == 1:
         return new
@@ -240,7 +244,7 @@ def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
 def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:
     """Change ρ; the gradient follows without a product."""
     Qnu = problem.rows.C.T @ (problem.rows.C @ at.nu)
-    return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu)
+    return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu, directions=None)
 
 
 def _norm(v: Vector) -> float:

@@ -169,13 +169,15 @@ def _normalised(
 
 def _diagonal(qp: QP) -> Vector:
     """Copy the diagonal of P; empty where that is an operator that does not tell."""
+    if isinstance(qp.P, np.ndarray):
+        return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()
     return np.zeros(0) if diagonal is None else np.array(diagonal)
 
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
     """Have the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
-    mean = float(diagonal.sum()) / diagonal.size if diagonal.size else 0.0
+    mean = float(np.add.reduce(diagonal)) / max(diagonal.size, 1)
     if spectrum.norm > NOTHING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)

@@ -88,6 +88,7 @@ class SMALBE(Options):
 PERMON = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,
     reduced=False, alpha=2.0, norm="power", eliminate="never", energy=0.0,
+    recycle=False,
 )  # fmt: skip
 
 #: ESPRESO's: projected CG steps with a check of the cost, gradient projection as
@@ -95,12 +96,13 @@ PERMON = SMALBE(
 ESPRESO = SMALBE(
     expansion="mixed", proportioning="model", preconditioner="none", rho=1.0,
     beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never", energy=0.0,
+    recycle=False,
 )  # fmt: skip
 
 #: the textbook's (the paper's reference [3]): Γ = 1, reduced free gradient, fixed ᾱ
 PAPER = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.0,
-    eliminate="never", energy=0.0,
+    eliminate="never", energy=0.0, recycle=False,
 )  # fmt: skip
 
 CONDENSED = SMALBE(eliminate="always")

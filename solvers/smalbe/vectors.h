@@ -561,13 +561,17 @@ TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in fre
     told[1] = phi_Hp;
 }
 
-/* S = S + s vvᵀ (k, k), k a multiple of four. */
-TWICE static void add_gram(double s, in v, out S, Py_ssize_t k)
+/* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, the rows of V (4, k), k a multiple of four; only
+   the upper triangle of S (k, k) means something. */
+TWICE static void add_gram(in s, in V, out S, Py_ssize_t k)
 {
+    in v0 = V, v1 = V + k, v2 = v1 + k, v3 = v2 + k;
     for (Py_ssize_t i = 0; i < k; i++) {
-        four at = EACH(s * v[i]);
-        for (Py_ssize_t j = 0; j < k; j += 4)
-            *(four *) (S + i * k + j) += at * FOUR(v + j);
+        four a0 = EACH(s[0] * v0[i]), a1 = EACH(s[1] * v1[i]), a2 = EACH(s[2] * v2[i]);
+        four a3 = EACH(s[3] * v3[i]);
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < k; j += 4)
+            *(four *) (S + i * k + j) += a0 * FOUR(v0 + j) + a1 * FOUR(v1 + j)
+                                         + a2 * FOUR(v2 + j) + a3 * FOUR(v3 + j);
     }
 }
 

@@ -46,6 +46,16 @@ def test_the_way_back_leads_to_a_kkt_point(dual, seed, r, apart):
     assert kkt_residuals(qp, solution).worst <= 1e-9
 
 
+def test_more_rows_than_free_variables_leave_rows(dual):
+    """14 rows determine the 12 free ones; two combinations of them are left."""
+    qp = dual(271828, r=14)
+    small = eliminate_free(qp)
+    solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
+
+    assert small.qp.sizes["equalities"] == 2
+    assert kkt_residuals(qp, solution).worst <= 1e-9
+
+
 def test_the_reduced_matrix_is_the_hessian_along_optimal_free_variables(dual):
     """½vᵀP̂v + q̂ᵀv differs from the minimum over x_E of the whole cost by a constant."""
     qp = dual(271828)

@@ -55,10 +55,10 @@ def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("solver", ["smalbe", "smalbe-permon"])
 def test_compiled_and_written_steps_are_the_same(name, solver, monkeypatch):
-    """In the first 25, before rounding tells."""
+    """In the first 18, before rounding tells."""
     qp, runs = emitted(name), []
     for compiled in (True, False):
-        options = replace(SOLVERS[solver], max_steps=25, history=True)
+        options = replace(SOLVERS[solver], max_steps=18, history=True)
         if not compiled:
             written = partial(outer_loop, is_compiled=False)
             monkeypatch.setattr(driver, "outer_loop", written)

@@ -1,5 +1,7 @@
 """A search for QPs on which SMALBE claims what it has not, or gives up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,23 @@ def test_nothing_is_claimed_wrongly(name):
 
     assert wrong == []
     assert given_up <= 0.02 * runs
+
+
+@pytest.mark.parametrize("seed", [343, *range(8)])
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-direct", "smalbe-condensed"])
+def test_without_a_cost_any_feasible_point_is_found_optimal(name, seed):
+    """No multiplier has a size then, not even one that rounding makes of nothing."""
+    qp = hostile(seed)
+    qp = replace(qp, P=0 * qp.P, q=0 * qp.q)
+    for tol in TOLERANCES:
+        s = SOLVERS[name].prepare(qp, tol)()
+
+        assert s.status is Status.SOLVED
+        assert not s.y.any()
+        assert not s.z_box.any()
+        assert (qp.lb <= s.x).all()
+        assert (s.x <= qp.ub).all()
+        assert kkt_residuals(qp, s).worst <= 10 * tol
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 from solvers.smalbe import kernels
 from solvers.smalbe.model import Model
-from solvers.smalbe.mprgp import EXPANSIONS, Point, Rules, mprgp, split
+from solvers.smalbe.mprgp import EXPANSIONS, Directions, Point, Rules, mprgp, split
 from solvers.smalbe.spectrum import power_method
 
 MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
@@ -474,3 +474,65 @@ def test_each_step_gains_what_the_rate_of_the_book_needs():
         assert (above <= above[0] * rate + 1e-10 * above[0]).all()
 
     assert min(letters[letter] for letter in "cbefp") >= 5
+
+
+def ill_conditioned(n):
+    """Draw a matrix of condition 10⁸ whose eigenvalues all differ, and two vectors."""
+    rng = np.random.default_rng(314159)
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    A = (Q * np.logspace(0, -8, n)) @ Q.T
+    return (A + A.T) / 2, *rng.standard_normal((2, n))
+
+
+def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns():
+    """Conjugate to the last alone, rounding costs it twice as many."""
+    n = 40
+    A, x, _ = ill_conditioned(n)
+    b, free = A @ x, np.full(n, -np.inf)
+    kept, _ = minimise(A, b, free, rules=Rules(kept=n))
+    last, _ = minimise(A, b, free, rules=Rules())
+
+    assert set(kept.trace) == {"c"}
+    assert len(kept.trace) <= n
+    assert len(last.trace) > 2 * n
+
+
+def test_directions_are_conjugate_and_the_last_ones_are_kept():
+    A, _, b = ill_conditioned(30)
+    run, _ = minimise(A, b, np.full(30, -np.inf), rules=Rules(kept=12), max_steps=20)
+    P, HP = np.array(run.directions.p), np.array(run.directions.Hp)
+
+    assert P.shape == (12, 30)
+    assert pytest.approx(np.eye(12), abs=1e-8) == P @ HP.T
+    assert pytest.approx(P @ A, abs=1e-8 * abs(HP).max()) == HP
+    assert run.g @ P.T == pytest.approx(np.zeros(12), abs=1e-8 * np.linalg.norm(b))
+
+
+def test_directions_that_span_the_face_solve_for_another_right_hand_side():
+    """Without a product; where a bound is in the way, they end there."""
+    a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
+    p = np.diag(1 / np.sqrt(a))
+    known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))
+    whole, products = minimise(np.diag(a), b, np.full(12, -9.0), directions=known)
+    lower = np.where(np.arange(12) == 11, -0.1, -9.0)
+    cut, also = minimise(np.diag(a), b, lower, directions=known)
+
+    assert (whole.trace, products) == ("", 0)
+    assert whole.x == pytest.approx(b / a)
+    assert also > 0
+    assert cut.x == pytest.approx(np.maximum(b / a, lower))
+    assert not cut.directions.free[11]
+
+
+def test_directions_of_another_face_are_forgotten():
+    A, x, b = ill_conditioned(20)
+    lower = np.where(np.arange(20) < 5, 0.0, -np.inf)
+    start = np.where(np.arange(20) < 5, 0.0, x)
+    elsewhere = Directions(np.ones(20, dtype=bool), (x,), (A @ x,))
+    with_them, without = (
+        minimise(A, b, lower, x=start, rules=Rules(kept=20), directions=d, tol=1e-6)[0]
+        for d in (elsewhere, None)
+    )
+
+    assert with_them.trace == without.trace
+    assert (with_them.x == without.x).all()

@@ -116,12 +116,8 @@ def boxed(P, q, lb, ub):
 )
 @pytest.mark.parametrize("draw", [laplacian, dense])
 def test_a_search_finds_no_problem_on_which_it_needs_twice_as_many(draw, seeds):
-    """Beyond the twelve products of Lanczos, which a short run does not repay."""
     for seed in seeds:
-        qp = draw(seed)
-        better = min(products(p, qp, 1e-6) for p in PRESETS)
-
-        assert products("smalbe", qp, 1e-6) <= max(2 * better, better + 12), seed
+        assert ratio(draw(seed), 1e-6) <= 2, seed
 
 
 def test_bodies_of_all_kinds_are_solved():
@@ -131,6 +127,16 @@ def test_bodies_of_all_kinds_are_solved():
 
         assert s.status is Status.SOLVED, seed
         assert kkt_residuals(qp, s).worst <= 1e-7, seed
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-8])
+@pytest.mark.parametrize("seed", [76, 106])
+def test_where_rounding_undoes_conjugacy_it_needs_no_more_than_the_presets(seed, tol):
+    """Bodies of which nothing is known but stiffnesses six orders apart: n = 148, 125.
+
+    With directions conjugate to the last one alone, 147 and 111 products for 72 and 69.
+    """
+    assert ratio(generated_case(seed).qp, tol) <= 1.2
 
 
 def test_rows_that_no_free_component_sees_get_no_multiplier_from_rounding():
