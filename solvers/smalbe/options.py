@@ -29,9 +29,8 @@ class Options:
     beta: float = 0.5  #: factor of M where the Lagrangian grew too little
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
-    #: make CG conjugate to all its directions on a face, after multiplier steps, too;
-    #: not where P is sparse: there a product costs less
-    recycle: bool = True
+    # after multiplier steps, too; where P is sparse, a product costs less
+    recycle: bool = True  #: CG conjugate to all its directions on a face; P not sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖

@@ -275,3 +275,20 @@ def test_no_point_has_residuals_above_the_bound(seed):
         )
 
         assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-permon"])
+@pytest.mark.parametrize("stored", ["integers", "with gaps"])
+def test_any_storage_of_vectors_is_taken(name, stored):
+    """The minimum of Σ i xᵢ² + qᵀx over Σ xᵢ = 2, 0 ≤ x ≤ 5."""
+    P, q, A = 2 * np.diag([1, 2, 3, 4]), np.array([-1, -2, 3, -4]), np.ones((1, 4), int)
+    b, lb, ub = np.array([2]), np.zeros(4, int), np.full(4, 5)
+    if stored == "with gaps":
+        P = np.repeat(np.repeat(P, 2, 0), 2, 1)[::2, ::2].astype(float)
+        q, lb, ub = (np.repeat(v, 2)[::2].astype(float) for v in (q, lb, ub))
+    qp = QP(P=P, q=q, A=A, b=b, G=no_rows(4), h=np.zeros(0), lb=lb, ub=ub)
+
+    s = SOLVERS[name].prepare(qp, 1e-8)()
+    y = -4 / 7  # 2i xᵢ + qᵢ + y = 0 for i = 1, 2, 4: 3/2 − 7y/8 = 2
+    assert s.y == pytest.approx(y, abs=1e-7)
+    assert s.x == pytest.approx([(1 - y) / 2, (2 - y) / 4, 0, (4 - y) / 8], abs=1e-7)
