@@ -158,6 +158,7 @@ def follow(
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
             elif "evaluate" in order and emitted and solution:
+                run = share = None  # what the solver has made makes room
                 limit(None)
                 evaluated_by_ranks(emitted, solution, ranks)
             elif run is not None and share is not None:

@@ -228,10 +228,13 @@ def in_parts(
     sides = _linearised(layout, pairs, names, units, linearise, laws, displaced)
 
     def reported(found: OwnSolution) -> dict[str, Any]:
-        largest, elements = _largest_von_mises(layout, found, length, materials, plane)
+        own = found.subdomains
+        cells = sum(len(layout.cells(int(s))) for s in own.number)
         inside = Inside(
-            nodes=layout.nodes, elements=elements, supports=fixed.size,
-            energy=found.energy * force * length, max_von_mises=largest,
+            nodes=layout.nodes, supports=fixed.size,
+            elements=int(own.ranks.total(np.array([float(cells)]))[0]),
+            energy=found.energy * force * length,
+            max_von_mises=_largest_von_mises(layout, found, length, materials, plane),
         )  # fmt: skip
         at = sides.found(found)
         known = results_of(inside, at.bodies, at.primal, at.solution, at.friction)
@@ -342,7 +345,6 @@ class OwnMesh(NamedTuple):
     mesh: Mesh  #: N nodes
     inner: NDArray[np.bool_]  #: (N,) those of the subdomains
     u: Vector  #: (2N,) m
-    elements: int  #: cells of the subdomains
 
 
 BATCH = 2**15  #: nodes of subdomains that are evaluated at once
@@ -376,10 +378,8 @@ def own_meshes(
         for batch, part in zip(batches, around, strict=True):
             at = np.searchsorted(node, part.node)
             mesh = Mesh(layout.position(part.node), part.cells, {})
-            yield OwnMesh(
-                int(layout.body[batch[0]]), mesh, part.inner, u[at].ravel() * length,
-                part.elements,
-            )  # fmt: skip
+            body = int(layout.body[batch[0]])
+            yield OwnMesh(body, mesh, part.inner, u[at].ravel() * length)
 
     return meshes()
 
@@ -403,35 +403,37 @@ class _Around(NamedTuple):
     node: Nodes  #: (N,) in the whole
     cells: Nodes  #: (E, 4) of these nodes
     inner: NDArray[np.bool_]  #: (N,) those of the subdomains
-    elements: int  #: cells of the subdomains
 
 
 def _around(layout: Subdivision, subdomains: Nodes, reach: int) -> _Around:
     """Take subdomains of one body and so many layers of cells around them."""
-    taken, (nodes, cells) = subdomains, _cells_of(layout, subdomains)
-    reached, elements = nodes, len(cells)
-    own, kept = nodes, np.ones(elements, dtype=bool)
+    own = np.unique(layout.torn_nodes(subdomains).number)
+    taken = np.union1d(subdomains, _holders(layout, own)) if reach else subdomains
+    nodes, cells = _cells_of(layout, taken)
+    reached, kept = own, np.ones(len(cells), dtype=bool)
     for _ in range(reach):
         more = np.setdiff1d(_holders(layout, reached), taken)
         if more.size:
             taken = np.concatenate([taken, more])
             nodes, cells = _cells_of(layout, taken)
         kept = np.asarray(np.isin(nodes, reached)[cells].any(axis=1))
-        reached = nodes[np.unique(cells[kept])]
-    used, corner = np.unique(cells[kept], return_inverse=True)
-    inner = np.isin(nodes[used], own)
-    return _Around(nodes[used], corner.reshape(-1, 4), inner, elements)
+        used = np.zeros(nodes.size, dtype=bool)
+        used[cells[kept]] = True
+        reached = nodes[used]
+    place = np.searchsorted(reached, nodes)
+    inner = np.isin(reached, own, assume_unique=True)
+    return _Around(reached, place[cells[kept]], inner)
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
     """Return the nodes of subdomains, and their cells (E, 4) as places in these."""
     torn = layout.torn_nodes(subdomains)
+    nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [
-        torn.number[begin:end][layout.cells(int(s))]
-        for s, begin, end in zip(subdomains, torn.start, torn.start[1:], strict=False)
+        place[begin + layout.cells(int(s))]
+        for s, begin in zip(subdomains, torn.start, strict=False)
     ]
-    nodes, corner = np.unique(np.concatenate(cells), return_inverse=True)
-    return nodes, corner.reshape(-1, 4)
+    return nodes, np.concatenate(cells)
 
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
@@ -449,15 +451,13 @@ def _largest_von_mises(
     length: float,
     materials: tuple[Material, ...],
     plane: Plane,
-) -> tuple[list[float], int]:
-    """Return the largest von Mises stress at nodes of each body, Pa; and all cells."""
+) -> list[float]:
+    """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
     D = elasticity_matrices(materials, plane)
-    largest, elements = np.zeros(len(materials)), 0
-    for b, mesh, inner, u, own in own_meshes(layout, found, length, REACH):
+    largest = np.zeros(len(materials))
+    for b, mesh, inner, u in own_meshes(layout, found, length, REACH):
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
         most = von_mises(stress, materials[b].nu, plane).max()
         largest[b] = max(largest[b], most)
-        elements += own
-    everyones = found.bodies.ranks.everyones(np.append(largest, elements))
-    most_of_all = everyones[:, :-1].max(axis=0)
-    return [float(most) for most in most_of_all], int(everyones[:, -1].sum())
+    everyones = found.bodies.ranks.everyones(largest)
+    return [float(most) for most in everyones.max(axis=0)]

@@ -1,6 +1,9 @@
 """What becomes of a measurement where one of its ranks fails, stage by stage."""
 
 import os
+import subprocess
+import sys
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
@@ -8,7 +11,7 @@ import pytest
 
 import mortarbench as mb
 from harness.processes import supervisor
-from tests.support import SUPPORT
+from tests.support import ROOT, SUPPORT
 from tests.support.waiting import soon
 
 pytestmark = pytest.mark.together
@@ -150,6 +153,53 @@ def test_quantities_that_fail_on_a_rank_cost_neither_verdict_nor_bound(measured)
     assert record.verdict == "verified"
     assert f"no quantities: RankFailedError: {RAISED}" in record.message
     assert record.energy_bound < 1e-5
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
+    suite, out = tmp_path / "ranks.toml", tmp_path / "out"
+    text = SUITE.format(limit=60).replace("repeats = 1", "repeats = 3")
+    suite.write_text(text)
+    command = [
+        sys.executable,
+        "-m",
+        "mortarbench",
+        "run",
+        str(suite),
+        "--out",
+        str(out),
+    ]
+    environment = os.environ | {"FAULT": str(tmp_path)}
+    run = subprocess.Popen(
+        command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert soon(lambda: lines(out))
+    assert soon(lambda: any(is_rank(pid) for pid in left(tmp_path)))
+    run.kill()
+    run.wait()
+    assert soon(lambda: not left(tmp_path))
+    before = lines(out)
+
+    results = mb.run(suite, out=out)
+
+    assert lines(out)[: len(before)] == before
+    assert sorted(r.repeat for r in results.records) == [0, 1, 2]
+    assert {r.verdict for r in results.records} == {"verified"}
+    assert len({r.qp for r in results.records}) == 1
+
+
+def lines(folder):
+    """The lines of a journal."""
+    files = sorted((folder / "journal").glob("*.jsonl"))
+    return [line for file in files for line in file.read_text().splitlines()]
+
+
+def is_rank(process):
+    with suppress(OSError):
+        environment = (Path("/proc") / str(process) / "environ").read_bytes()
+        return b"PMI_RANK=" in environment
+    return False
 
 
 def named(message, stage):

@@ -13,6 +13,7 @@ import pytest
 
 import mortarbench as mb
 from harness.distributed import mpi
+from harness.distributed.vectors import EMITTED
 from harness.errors import InputError
 from harness.record import Record
 from mortarbench.cli.main import main
@@ -199,11 +200,37 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_pat
         "smalbe copies=2": (2, "copies"),
     }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
+    assert found["smalbe ranks=2"].qp.startswith(EMITTED)
     # a copy does what one process alone does, to the last bit
     assert found["smalbe copies=2"].verdict == "verified"
     alone, copies = found["smalbe"], found["smalbe copies=2"]
     assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
     assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
+
+
+def test_ranks_tell_all_of_an_answer_and_nobody_builds_the_case(tmp_path, monkeypatch):
+    """In suites and alone; processes of ranks have the family as it is."""
+    suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
+    suite.write_text(
+        SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
+        .replace("S = 2, n = 4", "Nr = 4, Nh = 3, steps = 1, feti = 4")
+        .replace('["smalbe", "clarabel"]', '["smalbe"]')
+    )  # fmt: skip
+    known = mb.build(case)
+    monkeypatch.setattr(type(known.id.family), "build", None)
+
+    alone = mb.solve(case, "smalbe", tol=1e-6, ranks=2)
+    (record,) = mb.run(suite, out=tmp_path / "out").records
+
+    for found in (alone.record, record):
+        assert found.verdict == "verified"
+        assert found.sizes == known.qp.sizes
+        assert found.energy_bound < 1e-5
+        assert found.quantities["dofs"] == 848
+        assert found.build_seconds > 0
+    assert not list((tmp_path / "out" / "cases").glob("*.npz"))
+    quantities = known.quantities(alone.solution)
+    assert alone.quantities["tip"] == pytest.approx(quantities["tip"], rel=1e-9)
 
 
 @pytest.mark.parametrize(
