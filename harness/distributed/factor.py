@@ -108,19 +108,19 @@ class LocalFactor:
         T[np.arange(self.changing, len(T)), np.arange(self.changing, len(T))] -= 1
         return T
 
-    def eliminated(self, t: Dense) -> tuple[Dense, Dense]:
-        """Return L⁻¹ of an additive t (k,), inner rows and border (b,) apart."""
+    def reduced(self, t: Dense) -> tuple[Dense, Dense]:
+        """Eliminate in an additive t (k,): L_aa⁻¹t_a, and what is left of t_b."""
         if self.factor is None:
             return np.zeros(0), np.zeros(0)
         u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
         first = u.size - len(self.L_bb)
-        return u[:first], u[first:]
+        return u[:first], self.L_bb @ u[first:]
 
-    def extended(self, u: Dense, v: Dense) -> Dense:
-        """Return L⁻ᵀ (k,) of u on inner rows and v (b,) on the border."""
+    def extended(self, u: Dense, x_b: Dense) -> Dense:
+        """Return the x (k,) with  L_aaᵀx_a + L_baᵀx_b = u  and x_b on the border."""
         y = np.empty(self.order.size)
         if self.factor is not None:
-            u = np.concatenate([u, v])
+            u = np.concatenate([u, self.L_bb.T @ x_b])
             y[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
         return y
 
@@ -135,52 +135,25 @@ class LocalFactor:
             Where that is not positive definite.
 
         """
-        return self._completed(scale, less, np.zeros(len(self.L_bb)))[0]
-
-    def solved(self, t: Dense, scale: float, less: Dense) -> DistributedVector:
-        """Factorise as `completed`, and solve for one additive t (k,).
-
-        In one reduction.
-        """
-        u, u_b = self.eliminated(np.asarray(t))
-        factor, z_c, r_s = self._completed(scale, less, u_b)
-        return factor.substituted(u, z_c, r_s)
-
-    def _completed(
-        self, scale: float, less: Dense | None, u_b: Dense
-    ) -> tuple[SummedFactor, Dense, Dense]:
-        """Factorise, and eliminate in what `eliminated` has left on the border (b,).
-
-        Returns the factor, and what that elimination gives of the changing rows (c,)
-        and leaves of the shared rows of all ranks (s,).
-        """
         ranks, c, place = self.at.ranks, self.changing, self.at.place
         T = scale * self.complement if less is None else scale * self.complement - less
         s = self.at.shared.size
-        S, r, z_c, fails = np.zeros((s, s)), np.zeros(s), np.zeros(0), 0.0
-        L_cc, to_border = np.zeros((0, 0)), self.L_bb
+        S = np.zeros((s, s))
         try:
-            if c:
-                L_cc = _cholesky(T[:c, :c])
-                beside = np.hstack([T[:c, c:], self.L_bb[:c]])
-                over = blas.dtrsm(1.0, L_cc, beside, lower=1)
-                L_sc, first = over[:, : place.size].T, over[:, place.size :]
-                to_border = np.vstack([first, self.L_bb[c:] - L_sc @ first])
-                S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
-            else:
-                S[place[:, None], place] = T
-            z_c, r[place] = np.split(to_border @ u_b, [c])
+            L_cc = _cholesky(T[:c, :c])
+            L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
+            S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
+            fails = 0.0
         except np.linalg.LinAlgError:  # to be said by all ranks alike
             fails = 1.0
-        told = ranks.total(np.concatenate([S.ravel(), r, [fails]]))
+        told = ranks.total(np.append(S.ravel(), fails))
         try:
             if told[-1]:
                 raise np.linalg.LinAlgError
-            L_ss = _cholesky(told[: s**2].reshape(s, s))
+            L_ss = _cholesky(told[:-1].reshape(s, s))
         except np.linalg.LinAlgError:
             raise DependentRowsError("the rows depend on each other") from None
-        factor = SummedFactor(self, float(np.sqrt(scale)), L_cc, L_ss, to_border)
-        return factor, z_c, told[s**2 : -1]
+        return SummedFactor(self, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,10 +163,8 @@ class SummedFactor:
     local: LocalFactor
     root: float  #: √scale
     L_cc: Dense  #: (c, c) of the changing rows of this rank
+    L_sc: Dense  #: (s_p, c) of its shared rows
     L_ss: Dense  #: (s, s) of the shared rows of all, the same on all ranks
-    #: (b, b) takes what the local factor leaves on the border to what this factor gives
-    #: of changing rows, and leaves of shared ones; its transpose leads back
-    to_border: Dense
 
     @property
     def least_pivot(self) -> float:
@@ -209,7 +180,8 @@ class SummedFactor:
         """Take an additive t (k,) to L⁻¹t (k - s_p + s,), orthonormal."""
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
-            u, z_c, r_s = self._eliminated(t)
+            u, r = self.local.reduced(np.asarray(t))
+            z_c, r_s = self._changing(r)
             z_s = _solved(self.L_ss, self._gathered(r_s))
             z_s /= np.sqrt(ranks.size)
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
@@ -217,7 +189,8 @@ class SummedFactor:
     def norm(self, t: Dense) -> float:
         """Return ‖L⁻¹t‖ of an additive t (k,), in one reduction."""
         with self.local.at.ranks.clocked("coarse"):
-            u, z_c, r_s = self._eliminated(t)
+            u, r = self.local.reduced(np.asarray(t))
+            z_c, r_s = self._changing(r)
             inner = float(u @ u) / self.root**2 + float(z_c @ z_c)
             told = self._gathered(r_s, inner)
             z_s = _solved(self.L_ss, told[:-1])
@@ -229,35 +202,29 @@ class SummedFactor:
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)
             u, z_c, z_s = np.split(a, [a.size - c - s, a.size - s])
-            return self._extended(u / self.root, z_c, np.sqrt(ranks.size) * z_s)
+            x_s = _solved(self.L_ss, np.sqrt(ranks.size) * z_s, transposed=True)
+            x_s = x_s[self.local.at.place]
+            x_c = _solved(self.L_cc, z_c - self.L_sc.T @ x_s, transposed=True)
+            y = self.local.extended(u / self.root, np.concatenate([x_c, x_s]))
+            return distributed(y, ranks)
 
     def __call__(self, t: Dense) -> DistributedVector:
         """Solve for the consistent y (k,) of an additive t (k,)."""
-        with self.local.at.ranks.clocked("coarse"):
-            u, z_c, r_s = self._eliminated(t)
-            return self.substituted(u, z_c, self._gathered(r_s))
-
-    def substituted(self, u: Dense, z_c: Dense, r_s: Dense) -> DistributedVector:
-        """Solve for y (k,) where t was eliminated.
-
-        u : what the local factor gives of inner rows
-        z_c : (c,) what this one gives of changing rows
-        r_s : (s,) what is left of t on shared rows, summed over the ranks
-        """
-        return self._extended(u / self.root**2, z_c, _solved(self.L_ss, r_s))
-
-    def _eliminated(self, t: Dense) -> tuple[Dense, Dense, Dense]:
-        """Do as `LocalFactor.eliminated`, and split the border: (c,), (s_p,)."""
-        u, u_b = self.local.eliminated(np.asarray(t))
-        r, c = self.to_border @ u_b, len(self.L_cc)
-        return u, r[:c], r[c:]
-
-    def _extended(self, u: Dense, z_c: Dense, z_s: Dense) -> DistributedVector:
-        """Substitute back from L_ss (s,) on."""
         local = self.local
-        x_s = _solved(self.L_ss, z_s, transposed=True)[local.at.place]
-        v = np.concatenate([z_c, x_s]) @ self.to_border
-        return distributed(local.extended(u, v), local.at.ranks)
+        with local.at.ranks.clocked("coarse"):
+            u, r = local.reduced(np.asarray(t))
+            z_c, r_s = self._changing(r)
+            z_s = _solved(self.L_ss, self._gathered(r_s))
+            x_s = _solved(self.L_ss, z_s, transposed=True)[local.at.place]
+            x_c = _solved(self.L_cc, z_c - x_s @ self.L_sc, transposed=True)
+            y = local.extended(u / self.root**2, np.concatenate([x_c, x_s]))
+            return distributed(y, local.at.ranks)
+
+    def _changing(self, r: Dense) -> tuple[Dense, Dense]:
+        """Eliminate changing rows of a border (c + s_p,); and what the others keep."""
+        c = len(self.L_cc)
+        z_c = _solved(self.L_cc, r[:c])
+        return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense, *more: float) -> Dense:
         """Add what all ranks have for shared rows (s_p,), and more: (s + more,)."""

@@ -119,7 +119,10 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     """Gather what this rank has, and count the copies (n,) of its components."""
     problem, domains, rows = own.problem, own.domains, own.rows
     d, contact, kept = problem.components, problem.contact, _carrying(problem)
-    components, place = np.unique(own.component, return_inverse=True)
+    nodes, of_node = np.unique(own.nodes.number, return_inverse=True)
+    components, place = (
+        (d * at[:, None] + np.arange(d)).ravel() for at in (nodes, of_node)
+    )
     times = np.empty(components.size)
     times[place] = own.times
     T = _spread(own, place, components.size)

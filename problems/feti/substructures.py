@@ -79,8 +79,10 @@ class LocalProblems:
         Coefficients Rᵀv are needed to the digits of doubles only: a rigid motion that
         is left is as small beside v as KR is beside K.
         """
-        found = np.empty_like(v)
-        for kind, place in self._kinds():
+        found, domains = np.zeros_like(v), self.torn.domains
+        acting = np.logical_or.reduceat(v != 0, domains.start[:-1])
+        for (kind, place), members in zip(self._kinds(), domains.members, strict=True):
+            place = place[:, acting[members]]  # 0 of the others is 0
             own, R = v[place], kind.R
             own -= R.astype(v.dtype) @ (R.T @ own.astype(np.float64))
             image = apply(kind, own)

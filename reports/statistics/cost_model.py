@@ -4,12 +4,16 @@
 
 W is the work that ranks share, in seconds of one rank, and C what each of them does
 alike or waits for (Amdahl [1]_). s says how much slower a rank works while the others
-do, too: copies of the job on one rank, run together, over the job alone. The rest is
-communication [2]_: R reductions over all ranks, M messages and b bytes to neighbours,
-with the latencies α_R and α of a reduction and of a message, and β seconds for a byte.
+do, too: copies of the job on one rank, run together, over the job alone. A rank of a
+shared job touches less memory than a copy, and may disturb the others less: so s is no
+more than leaves C ≥ 0, and no less than 1. The rest is communication [2]_: R reductions
+over all ranks, M messages and b bytes to neighbours, with the latencies α_R and α of a
+reduction and of a message, and β seconds for a byte.
 
 W and C are fitted to measured times, s and the latencies are measured, R, M and b are
-counted, all on the ranks that there were. Beyond these, the model goes on:
+counted, all on the ranks that there were. Ranks that are faster than their number even
+with s = 1 are not fitted, and the misfit says so. Beyond the measured ranks, the model
+goes on:
 
 - s stays: further ranks bring memory of their own, as those measured do;
 - α_R grows with ⌈log₂N⌉, the depth of a tree of ranks;
@@ -29,7 +33,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -93,16 +97,16 @@ class CostModel:
     draws: Array
     samples: int  #: fewest repeats
 
-    def seconds(self, ranks: int) -> Interval:
-        """Predict the time on more ranks than were measured, with its 95 % interval.
+    def speed_up(self, ranks: int) -> Interval:
+        """Predict t(1)/t(N) on more ranks than were measured, with its 95 % interval.
 
         The interval is of the fit. It says nothing on whether the model holds there.
         """
-        return self._predicted(lambda draws: self._seconds(ranks, draws))
-
-    def speed_up(self, ranks: int) -> Interval:
-        """Predict t(1)/t(N), with its 95 % interval."""
-        return self._predicted(lambda draws: self._speed_up(ranks, draws))
+        value = float(self._speed_up(ranks, self._own)[0])
+        if not len(self.draws):
+            return Interval(value, value, value, COVERAGE, 1)
+        low, high = limits(self._speed_up(ranks, self.draws), self.samples)
+        return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def ranks_at(self, efficiency: float) -> int:
         """Find the most ranks, a power of two, whose speed-up is so many times N."""
@@ -114,13 +118,6 @@ class CostModel:
     @property
     def _own(self) -> Array:
         return np.array([[self.work, self.alike, self.slowdown, *self.communication]])
-
-    def _predicted(self, of: Callable[[Array], Array]) -> Interval:
-        value = float(of(self._own)[0])
-        if not len(self.draws):
-            return Interval(value, value, value, COVERAGE, 1)
-        low, high = limits(of(self.draws), self.samples)
-        return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def _seconds(self, ranks: int, draws: Array) -> Array:
         W, C, s = draws.T[:3]
@@ -145,8 +142,8 @@ def cost_model(
     Parameters
     ----------
     seconds : of every repeat, by ranks; one and others
-    copies : of so many copies of the job on one rank, run together, likewise; where
-        there are none, s = 1
+    copies : of so many copies of the job on one rank, run together, likewise: no less
+        than s; where there are none, s = 1
     communication : of every repeat on the most ranks
 
     Raises
@@ -172,6 +169,8 @@ def cost_model(
     spent = np.stack([c.seconds for c in communication])
     parts = np.stack([_geometric(of, rng, count) for of in spent.T], axis=1)
     sent = parts @ growth(N, ranks[-1]).T
+    with_none_alike = N * np.maximum(t - sent, 0.0) / t[:, :1]
+    slow = np.where(slow > with_none_alike, np.maximum(with_none_alike, 1.0), slow)
     work, alike = _fitted(N, np.maximum(t - sent, 0.0) / slow, t / slow)
     found = slow * (work[:, None] / N + alike[:, None]) + sent
     return CostModel(

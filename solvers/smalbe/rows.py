@@ -174,8 +174,8 @@ class SparseRows(Rows):
         return PenaltyModel(tau, self, rho - tau)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        t = self.unit @ np.where(free, r, 0.0)
-        y = -self.gram.solved_in_face(free, FREE_RANK, t)
+        solve = self.gram.in_face(free, FREE_RANK)
+        y = -solve(self.unit @ np.where(free, r, 0.0))
         return self.gram.forward(self.gram.product(y))
 
 
@@ -196,9 +196,6 @@ class GramFactor(Protocol):
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         """Return solves with G_F G_Fᵀ + shift·GGᵀ."""
-
-    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
-        """Do one of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,9 +227,6 @@ class _Whole:
         held = _gram(self.unit, ~free)
         factor = self.factor.cholesky(with_int32((1 + shift) * self.matrix - held))
         return lambda t: np.asarray(factor(t))
-
-    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
-        return self.in_face(free, shift)(t)
 
 
 class OuterProducts(NamedTuple):
@@ -294,11 +288,6 @@ class _OverRanks:
         with self.local.at.ranks.clocked("coarse"):
             held = self.bounded.summed(~np.asarray(free))
             return self.local.completed(1 + shift, held)
-
-    def solved_in_face(self, free: Mask, shift: float, t: Vector) -> Vector:
-        with self.local.at.ranks.clocked("coarse"):
-            held = self.bounded.summed(~np.asarray(free))
-            return self.local.solved(t, 1 + shift, held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,7 +412,7 @@ class PenaltyModel:
         def newton(slope: Vector, free: Mask) -> Vector:
             of_all = np.ones(x.size, dtype=bool)
             of_all[b] = free
-            return tau * gram.solved_in_face(of_all, tau / w, slope)
+            return tau * gram.in_face(of_all, tau / w)(slope)
 
         found = minimised(at, newton, rows.unit.shape[0])
         if found is None:

@@ -83,7 +83,7 @@ def test_equal_times_have_no_interval_and_scattered_ones_hold_the_truth(strong):
 def test_one_run_has_a_value_and_no_interval():
     (series,) = strong_series(evidence(rank_records(sizes=[DOFS], repeats=1)))
     assert series.speed_up(2, "solve").samples == 1
-    assert series.model.seconds(8).samples == 1
+    assert series.model.speed_up(8).samples == 1
 
 
 def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
@@ -94,7 +94,9 @@ def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
     on_four = 2 * REDUCTIONS * REDUCTION, 3 * MESSAGES * MESSAGE, BYTES * BYTE
     assert model.communication == pytest.approx(on_four)
     assert model.misfit < 1e-9
-    assert model.seconds(64).value == pytest.approx(solve_seconds(DOFS, 64))
+    assert model.speed_up(64).value == pytest.approx(
+        solve_seconds(DOFS, 1) / solve_seconds(DOFS, 64)
+    )
 
 
 def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
@@ -105,7 +107,9 @@ def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
     (series,) = strong_series(evidence(slow, cpus=2))
     assert series.crowded(4)
     assert series.model.measured == (1, 2)
-    assert series.model.seconds(64).value == pytest.approx(solve_seconds(DOFS, 64))
+    assert series.model.speed_up(64).value == pytest.approx(
+        solve_seconds(DOFS, 1) / solve_seconds(DOFS, 64)
+    )
 
 
 def test_records_that_do_not_say_what_was_sent_have_no_model():

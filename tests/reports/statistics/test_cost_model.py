@@ -34,7 +34,6 @@ def test_known_work_is_recovered_and_predicted_beyond(ranks):
     assert found.work == pytest.approx(2.0)
     assert found.alike == pytest.approx(0.1)
     assert found.misfit < 1e-12
-    assert found.seconds(64).value == pytest.approx(modelled(64))
     assert found.speed_up(64).value == pytest.approx(2.1 / modelled(64))
 
 
@@ -44,7 +43,17 @@ def test_ranks_that_slow_one_another_down_are_told_by_copies():
     found = cost_model(times, copies, [sent_on(4)])
     assert (found.work, found.alike) == pytest.approx((2.0, 0.1))
     assert found.slowdown == pytest.approx(1.25)
-    assert found.seconds(16).value == pytest.approx(modelled(16, slowdown=1.25))
+    assert found.speed_up(16).value == pytest.approx(2.1 / modelled(16, slowdown=1.25))
+
+
+@pytest.mark.parametrize("copies", [1.3, 1.6, 4.0])
+def test_copies_that_disturb_one_another_more_than_ranks_do_are_no_measure(copies):
+    """Ranks that slow each other down by 1.25, C = 0: no larger s leaves C ≥ 0."""
+    times = {N: [modelled(N, alike=0.0, slowdown=1.25)] * 3 for N in (1, 2)}
+    found = cost_model(times, {2: [copies * 2.0] * 3}, [SENT])
+    assert (found.slowdown, found.work) == pytest.approx((1.25, 2.0))
+    assert found.alike == pytest.approx(0.0, abs=1e-12)
+    assert found.misfit < 1e-12
 
 
 def test_communication_is_what_was_counted_times_what_it_takes():
@@ -58,7 +67,7 @@ def test_communication_is_what_was_counted_times_what_it_takes():
 def test_a_network_whose_speed_is_not_known_widens_the_band():
     slow = replace(SENT, reduction_seconds=5e-3)
     times = {N: [modelled(N)] * 4 for N in (1, 2)}
-    at = cost_model(times, {}, [SENT, slow, SENT, slow]).seconds(16)
+    at = cost_model(times, {}, [SENT, slow, SENT, slow]).speed_up(16)
     assert at.high > 1.2 * at.low
 
 
@@ -70,6 +79,7 @@ def test_what_was_sent_on_other_ranks_is_no_basis():
 def test_better_than_shared_work_is_never_negative_work():
     faster = cost_model({1: [1.0] * 2, 2: [0.3] * 2}, {}, [SENT])  # super-linear
     assert faster.alike == 0
+    assert faster.misfit > 0.2  # so it is not asked about more ranks
     slower = cost_model({1: [1.0] * 2, 2: [3.0] * 2}, {}, [SENT])
     assert slower.work == 0
     assert slower.speed_up(16).value < 1
@@ -80,14 +90,14 @@ def test_the_band_of_equal_times_holds_the_fit_and_of_noisy_ones_the_truth():
     held = 0
     for _ in range(100):
         times = {N: modelled(N) * rng.lognormal(0, 0.02, 5) for N in (1, 2, 4)}
-        at = cost_model(times, {}, [sent_on(4)]).seconds(16)
+        at = cost_model(times, {}, [sent_on(4)]).speed_up(16)
         assert at.low <= at.value <= at.high
-        held += at.low <= modelled(16) <= at.high
+        held += at.low <= 2.1 / modelled(16) <= at.high
     assert held >= 85  # 95 % of a hundred
 
 
 def test_one_run_each_has_no_band():
-    found = cost_model({1: [2.0], 2: [1.2]}, {}, [SENT]).seconds(8)
+    found = cost_model({1: [2.0], 2: [1.2]}, {}, [SENT]).speed_up(8)
     assert found.low == found.value == found.high
     assert found.samples == 1
 
