@@ -8,10 +8,10 @@ import sys
 import pytest
 
 from harness.limits import ONE_THREAD, VARIABLE
+from harness.names import CaseId
 from harness.processes.case_folder import user_key
 from harness.processes.reaper import MARK, lives
 from harness.processes.supervisor import WorkerProcess
-from mortarbench import case
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
@@ -187,7 +187,7 @@ def test_a_fork_ends_when_its_parent_is_killed(results):
 def test_the_command_forks_before_it_builds_and_before_it_reads_a_key(
     monkeypatch, capsys
 ):
-    events, build = [], case.built_case
+    events, build = [], CaseId.build
 
     def fork(worker, serve):
         events.append(("fork", user_key.cache_info().currsize))
@@ -197,7 +197,7 @@ def test_the_command_forks_before_it_builds_and_before_it_reads_a_key(
         return build(*arguments)
 
     monkeypatch.setattr(WorkerProcess, "fork", fork)
-    monkeypatch.setattr(case, "built_case", built)
+    monkeypatch.setattr(CaseId, "build", built)
     user_key.cache_clear()
     code = main(Registries(), ["solve", "string/n=10/primal", "--solver", "smalbe"])
 
