@@ -327,16 +327,13 @@ def _emitted(
         On all ranks; the first as the family raises it.
 
     """
-
-    def emitted() -> tuple[Emitted, dict[str, Any]]:
-        start = time.perf_counter()
-        made = emit(case, ranks)
-        slowest = ranks.extreme(time.perf_counter() - start, np.max)
-        told = {"sizes": made.sizes, "digest": made.digest(), "build_seconds": slowest}
-        return made, told
-
+    start = time.perf_counter()
     try:
-        return agreed(ranks, emitted)
+        made = agreed(ranks, lambda: emit(case, ranks))  # by then the slowest is done
+        seconds = time.perf_counter() - start
+        digest = agreed(ranks, made.digest)
+        told = {"sizes": made.sizes, "digest": digest, "build_seconds": seconds}
+        return made, told
     except InputError:
         raise
     except Exception as e:
