@@ -9,6 +9,7 @@ end of all processes ends that (`abort`).
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 import traceback
@@ -71,9 +72,15 @@ def agreed(ranks: Ranks, work: Callable[[], T]) -> T:
 def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
     """Say on stderr which rank failed and how, and end all ranks."""
     traceback.print_exception(failure)
-    print(_named(ranks.rank, ranks, in_a_line(failure)), file=sys.stderr, flush=True)
+    say(_named(ranks.rank, ranks, in_a_line(failure)))
     ranks.comm.Abort(1)
     raise SystemExit(1)
+
+
+def say(line: str) -> None:
+    """Write a line to stderr at once, so that lines of several ranks do not mix."""
+    sys.stderr.flush()
+    os.write(sys.stderr.fileno(), f"{line}\n".encode())
 
 
 def in_a_line(failure: BaseException) -> str:

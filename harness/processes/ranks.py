@@ -38,6 +38,7 @@ from harness.distributed.failures import (
     abort,
     agreed,
     in_a_line,
+    say,
 )
 from harness.distributed.mpi import MISSING, mpiexec
 from harness.distributed.network import network
@@ -117,7 +118,7 @@ def this_rank() -> Ranks:
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
     ranks = Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
-    print(f"rank {ranks.rank} is process {os.getpid()}", file=sys.stderr, flush=True)
+    say(f"rank {ranks.rank} is process {os.getpid()}")
     return ranks
 
 

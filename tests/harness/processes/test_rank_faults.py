@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import mortarbench as mb
+from harness.distributed import failures
 from harness.processes import supervisor
 from tests.support import ROOT, SUPPORT
 from tests.support.waiting import soon
@@ -71,6 +72,14 @@ def left(mark):
         if f"FAULT={mark}".encode() in environment and int(entry.name) != os.getpid():
             found.append(int(entry.name))
     return found
+
+
+def test_lines_of_ranks_do_not_mix(monkeypatch):
+    written = []
+    monkeypatch.setattr(os, "write", lambda _, data: written.append(data))
+    failures.say("rank 1 is process 2")
+
+    assert written == [b"rank 1 is process 2\n"]
 
 
 def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):

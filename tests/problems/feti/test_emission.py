@@ -146,7 +146,7 @@ def generated(rng, count=8):
             f"obstacle/n={n[4] + 6}/shape={rng.choice(['flat', 'hemisphere'])}/"
             f"feti={n[5] % 3 + 2}/glue={glue}/dual"
         )
-        yield f"hertz-plane/n={n[0] % 3 + 1}/feti={n[1] + 2}/glue={glue}/dual"
+        yield f"hertz-plane/n={n[0] % 3 + 1}/feti={n[1] % 4 + 2}/glue={glue}/dual"
         yield (
             f"hertz-cylinder/n={n[2] % 3 + 1}/m={n[3] % 3 + 1}/feti={n[4] + 3}/"
             f"ratio={n[5]}/slave={rng.choice(['upper', 'lower'])}/{method}"
