@@ -19,7 +19,7 @@ class InSubdomains(Family):
 
     @abstractmethod
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and the dual needs no solution before it."""
+        """Whether the dual has subdomains, and ranks can make all that it needs."""
 
     @abstractmethod
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
