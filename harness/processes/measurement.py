@@ -445,10 +445,15 @@ def scratch_folder() -> Iterator[Path]:
                     shutil.rmtree(stale)
                 finally:
                     os.close(lock)
-    with TemporaryDirectory(prefix=_SCRATCH) as name:
-        lock = os.open(Path(name) / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield Path(name)
-        finally:
-            os.close(lock)
+    is_ours = False
+    while not is_ours:  # until we lock it, somebody may take it for stale
+        with TemporaryDirectory(prefix=_SCRATCH) as name:
+            path = Path(name) / _LOCK
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX)
+                is_ours = path.exists()
+                if is_ours:
+                    yield Path(name)
+            finally:
+                os.close(lock)

@@ -1,9 +1,11 @@
 """Solvers that attack the run: what it makes of them, and that neighbours are safe."""
 
+import fcntl
 import itertools
 import os
 import re
 import secrets
+import shutil
 import signal
 import subprocess
 import sys
@@ -545,5 +547,24 @@ def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatc
     with scratch_folder() as used, scratch_folder():
         assert sorted(tmp_path.iterdir()).count(used) == 1
         assert not stale.exists()
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scratch_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    gone = []
+
+    def taken_for_stale(lock, how):
+        if not gone:
+            gone.extend(tmp_path.iterdir())
+            shutil.rmtree(gone[0])
+        return flock(lock, how)
+
+    flock = fcntl.flock
+    monkeypatch.setattr(fcntl, "flock", taken_for_stale)
+    with scratch_folder() as used:
+        assert used.is_dir()
+        assert [used] != gone
 
     assert list(tmp_path.iterdir()) == []
