@@ -53,12 +53,19 @@ def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("solver", ["smalbe", "smalbe-permon"])
-def test_compiled_and_written_steps_are_the_same(name, solver, monkeypatch):
-    """In the first 18, before rounding tells."""
+@pytest.mark.parametrize(
+    ("solver", "recycle", "steps"),
+    [("smalbe", False, 25), ("smalbe", True, 18), ("smalbe-permon", False, 25)],
+)
+def test_compiled_and_written_steps_are_the_same(
+    name, solver, recycle, steps, monkeypatch
+):
+    """In the first ones, before rounding tells: sooner where directions are kept."""
     qp, runs = emitted(name), []
     for compiled in (True, False):
-        options = replace(SOLVERS[solver], max_steps=18, history=True)
+        options = replace(
+            SOLVERS[solver], recycle=recycle, max_steps=steps, history=True
+        )
         if not compiled:
             written = partial(outer_loop, is_compiled=False)
             monkeypatch.setattr(driver, "outer_loop", written)
