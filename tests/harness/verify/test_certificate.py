@@ -159,7 +159,7 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 
 def beyond(solver: Solver, qp: QP) -> bool:
     """Whether it is an active set with dense factors that would take many minutes."""
-    return solver in (SOLVERS["highs"], SOLVERS["daqp"]) and qp.P.shape[0] > 1000
+    return solver in (SOLVERS["highs"], SOLVERS["daqp"]) and qp.P.shape[0] > 3000
 
 
 def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
