@@ -236,6 +236,8 @@ def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr
     are (m, k), direction is (m, 2), the result (m, size) without stored zeros.
     """
     m, k = node.shape
+    if not m:
+        return csr_array((0, size))
     columns = np.stack([2 * node, 2 * node + 1], axis=-1)
     values = weight[:, :, None] * direction[:, None, :]
     indptr = 2 * k * np.arange(m + 1)

@@ -81,16 +81,15 @@ def nearest(x: Points, line: Polyline) -> Nearest:
     """
 
     def keep(level: Chords, query: Nodes, node: Nodes) -> NDArray[np.bool_]:
-        distance = _to_chords(x[query], level, node)[1]
-        bound = _least(distance + level.deviation[node], query)
-        kept: NDArray[np.bool_] = (
-            distance - level.deviation[node] <= (1 + ROUNDING) * bound
-        )
+        distance = _to_chords(x.take(query, axis=0), level, node)[1]
+        deviation = level.deviation[node]
+        bound = _least(distance + deviation, query)
+        kept: NDArray[np.bool_] = distance - deviation <= (1 + ROUNDING) * bound
         return kept
 
     levels = _levels(line)
     query, closest = _descend(len(x), levels, keep)
-    segment = closest[np.diff(query, prepend=-1) > 0]
+    segment = closest[_first_of_each(query)]
     return Nearest(segment, _to_chords(x, levels[-1], segment)[0])
 
 
@@ -179,8 +178,8 @@ def _chords(start: Points, end: Points, deviation: Vector) -> Chords:
 
 def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
     """Return place in [0, 1] and distance of the closest point of a chord each."""
-    edge = level.edge[node]
-    offset = x - level.start[node]
+    edge = level.edge.take(node, axis=0)
+    offset = x - level.start.take(node, axis=0)
     xi = np.einsum("px,px->p", offset, edge) * level.inverse[node]
     xi = np.minimum(np.maximum(xi, 0.0), 1.0)
     offset -= xi[:, None] * edge
@@ -189,7 +188,13 @@ def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
 
 def _least(values: Vector, query: Nodes) -> Vector:
     """Return for each pair the least value of its query; queries are sorted."""
-    new = np.diff(query, prepend=-1) > 0
-    least = np.minimum.reduceat(values, np.flatnonzero(new))
-    of_pair: Vector = least[np.cumsum(new) - 1]
-    return of_pair
+    first = _first_of_each(query)
+    pairs = np.diff(first, append=query.size)
+    return np.minimum.reduceat(values, first).repeat(pairs)
+
+
+def _first_of_each(query: Nodes) -> Nodes:
+    """Return the place of the first pair of each query; queries are sorted."""
+    new = np.ones(query.size, dtype=bool)
+    np.not_equal(query[1:], query[:-1], out=new[1:])
+    return np.flatnonzero(new)
