@@ -263,6 +263,8 @@ def _rows_along(
     integrals: Mortar, j: Nodes, normal: Points, sides: tuple[Nodes, Nodes], size: int
 ) -> csr_array:
     """Build n_jᵀ [(D u_s)_j − (M u_m)_j] for the slave nodes j as a matrix on u."""
+    if not j.size:
+        return csr_array((0, size))
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
     row = np.concatenate([D.row, M.row])
     node = np.concatenate([sides[0][D.col], sides[1][M.col]])

@@ -111,11 +111,12 @@ def facing(slave: Polyline, master: Polyline) -> tuple[Nodes, Nodes]:
     j = slave.first
 
     def keep(level: Chords, query: Nodes, node: Nodes) -> NDArray[np.bool_]:
-        start, edge = level.start[node], level.edge[node]
+        start, edge = level.start.take(node, axis=0), level.edge.take(node, axis=0)
 
         def ends(k: Nodes) -> tuple[Vector, Vector]:
-            one = offset[k] + np.einsum("px,px->p", start, across[k])
-            return one, one + np.einsum("px,px->p", edge, across[k])
+            along = across.take(k, axis=0)
+            one = offset[k] + np.einsum("px,px->p", start, along)
+            return one, one + np.einsum("px,px->p", edge, along)
 
         above = np.maximum(*ends(j[query])) >= -level.deviation[node]
         below = np.minimum(*ends(j[query] + 1)) <= level.deviation[node]
