@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,7 @@ FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no fu
 EPS = float(np.finfo(float).eps)
 SPARED = 10.0  #: the objective adds up what residuals say of single rows
 SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
+NEEDLESS = 1e4  #: an optimum whose terms exceed another's by so much tells no rounding
 RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
 
 
@@ -136,8 +137,13 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     size = _size(qp, s)
     if not EPS * size <= EXCUSED * abs(value):
         size = min(size, _size(qp, _least_multipliers(qp, s)))
-    if not doubt <= EXCUSED * abs(value) and (exact := exact_value(qp, s)) is not None:
-        value, doubt = np.longdouble(exact), 0.0
+    if not doubt + EPS * size <= EXCUSED * abs(value):
+        exact = exact_optimum(qp, s)
+        if exact is not None:
+            value, doubt = np.longdouble(exact.value), 0.0
+            shorter = _size(qp, exact.solution)
+            if shorter < size / NEEDLESS:
+                s, size = exact.solution, shorter
     # f* cannot be told more accurately than rounding x moves f
     told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
     if abs(value) > ROUNDING * terms + doubt:
@@ -153,49 +159,71 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     )  # fmt: skip
 
 
-def exact_value(qp: QP, s: Solution) -> Fraction | None:
-    """Find the optimal value in rational arithmetic; None where that is not proven.
+class ExactOptimum(NamedTuple):
+    """An optimum known without rounding."""
+
+    value: Fraction  #: f*
+    solution: Solution  #: rounded to double precision
+
+
+def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
+    """Find an optimum in rational arithmetic; None where none is proven.
 
     The rows that carry a multiplier in `s` are taken as equations. What these leave
-    open is as in `s`. The point that solves them has to satisfy the KKT conditions of
-    all rows exactly.
+    open is zero; where that is no optimum, multipliers are near the least ones
+    (`_least_multipliers`), and where that is none, all is as in `s`. The point that
+    solves them has to satisfy the KKT conditions of all rows exactly.
     """
     below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
     lower, upper = (s.z_box < 0) & below, (s.z_box > 0) & above
-    n, pressed = qp.q.size, s.z > 0
-    box = np.eye(n)[lower | upper]
+    n, pressed, held = qp.q.size, s.z > 0, lower | upper
+    box = np.eye(n)[held]
+    G, lb, ub = _rational(_dense(qp.G)), _rational(qp.lb[below]), qp.ub[above]
     B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], box])
     if n + len(B) > RATIONAL:
         return None
-    c = np.concatenate([
-        qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[lower | upper]
-    ])  # fmt: skip
-    P = _dense(qp.P)
-    equations = np.block([[P, B.T], [B, np.zeros((len(B), len(B)))]])
-    guess = [s.x, s.y, s.z[pressed], s.z_box[lower | upper]]
-    found = _solved(
-        _rational(equations), _rational(np.concatenate([-qp.q, c])),
-        _rational(np.concatenate(guess).astype(float)),
-    )  # fmt: skip
-    if found is None:
+    c = np.concatenate([qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[held]])
+    P, q = _rational(_dense(qp.P)), _rational(qp.q)
+    equations = np.block([[_dense(qp.P), B.T], [B, np.zeros((len(B), len(B)))]])
+    solve = _solutions(_rational(equations), _rational(np.concatenate([-qp.q, c])))
+    if solve is None:
         return None
-    x, _, z, z_box = np.split(found, np.cumsum([n, qp.b.size, int(pressed.sum())]))
-    signs = np.where(upper, 1, -1)[lower | upper]
-    is_optimal = (
-        (_rational(_dense(qp.G)) @ x <= _rational(qp.h)).all()
-        and (x[below] >= _rational(qp.lb[below])).all()
-        and (x[above] <= _rational(qp.ub[above])).all()
-        and (z >= 0).all()
-        and (z_box * signs >= 0).all()
-    )
-    value: Fraction = x @ (_rational(P) @ x) / 2 + _rational(qp.q) @ x
-    return value if is_optimal else None
+    signs = np.where(upper, 1, -1)[held]
+    least = _least_multipliers(qp, s)
+    for x, multipliers in ((0 * s.x, None), (0 * s.x, least), (s.x, s)):
+        guess = np.zeros(n + len(B))
+        guess[:n] = x
+        if multipliers is not None:
+            guess[n:] = np.concatenate([
+                multipliers.y, multipliers.z[pressed], multipliers.z_box[held]
+            ])  # fmt: skip
+        found = solve(_rational(guess))
+        x, y, z, z_box = np.split(found, np.cumsum([n, qp.b.size, int(pressed.sum())]))
+        if (
+            (G @ x <= _rational(qp.h)).all()
+            and (x[below] >= lb).all()
+            and (x[above] <= _rational(ub)).all()
+            and (z >= 0).all()
+            and (z_box * signs >= 0).all()
+        ):
+            rounded = replace(
+                s, x=x.astype(float), y=y.astype(float),
+                z=np.zeros(qp.h.size), z_box=np.zeros(n),
+            )  # fmt: skip
+            rounded.z[pressed], rounded.z_box[held] = z, z_box
+            return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
+    return None
 
 
-def _solved(M: Any, b: Any, guess: Any) -> Any | None:
+def _solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
     """Solve Mx = b by Gauss-Jordan elimination; None where there is no solution.
 
-    M, b, guess : arrays of fractions; unknowns without a pivot are as in `guess`
+    M, b : arrays of fractions
+
+    Returns
+    -------
+    the map from a guess to the solution in which unknowns without a pivot are as there
+
     """
     rows, pivots = np.column_stack([M, b]), list[int]()
     for column in range(M.shape[1]):
@@ -212,9 +240,14 @@ def _solved(M: Any, b: Any, guess: Any) -> Any | None:
     if (rows[len(pivots) :, -1] != 0).any():
         return None
     free = np.setdiff1d(np.arange(M.shape[1]), pivots)
-    x = guess.copy()
-    x[pivots] = rows[: len(pivots), -1] - rows[: len(pivots)][:, free] @ guess[free]
-    return x
+    solved = rows[: len(pivots)]
+
+    def solution(guess: Any) -> Any:
+        x = guess.copy()
+        x[pivots] = solved[:, -1] - solved[:, free] @ guess[free]
+        return x
+
+    return solution
 
 
 def _rational(v: Any) -> Any:

@@ -30,6 +30,8 @@ from solvers.reference.interior import interior_point
 from solvers.reference.polish import polished
 
 ENOUGH = 1e-14  #: KKT residual that is not refined any more
+NEAR = 1e-3  #: KKT residual of a start: from farther off refinement ends, where the
+#: solutions are many, at one that is far off, and other starts are tried
 ACCEPTED = 1e-9  #: KKT residual of what is called a solution
 FAR = 1e4  #: times the median datum of a scaled QP: what is larger is left out at first
 
@@ -57,11 +59,13 @@ def reference_solution(qp: QP) -> Solution:
         raise ValueError("the reference solve needs finite matrices, got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
     for candidates in (_candidates(qp), _tamed_candidates(qp), _weak_candidates(qp)):
+        residuals = list[float]()
         for point in candidates:
-            worst = _residual(qp, point)
+            residuals.append(worst := _residual(qp, point))
             if worst <= least:
                 best, least = point, worst
-        if least <= (ENOUGH if is_small(qp) else ACCEPTED):
+        is_near = residuals[0] <= NEAR
+        if is_near and least <= (ENOUGH if is_small(qp) else ACCEPTED):
             return best
     if least <= ACCEPTED:
         return best

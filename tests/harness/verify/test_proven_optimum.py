@@ -10,7 +10,7 @@ from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdi
 from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
 from harness.verify.kkt import Residuals, rejudged, widths
-from harness.verify.optimum import decided, exact_value, proven_optimum, proves
+from harness.verify.optimum import decided, exact_optimum, proven_optimum, proves
 from harness.verify.verdicts import judged
 from solvers.reference.solve import reference_solution
 
@@ -202,6 +202,7 @@ CANCELLED = (  # f* = 2⁻²⁰ between terms of 50 to 1400; some multipliers ar
     (("cancelled", "fixed", "redundant"), 879083487),
     (("big-M", "cancelled", "fixed"), 878510873),
     (("cancelled", "duplicates", "redundant"), 716254695),
+    (("cancelled", "duplicates", "redundant"), 194299169),
 )
 
 
@@ -210,7 +211,9 @@ def test_what_is_left_when_terms_cancel_is_known_exactly(kinds, number):
     planted = hard(frozenset(kinds), number)
     attack = Attack(planted, np.random.default_rng(1))
 
-    assert exact_value(planted.qp, reference_solution(planted.qp)) == 2.0**-20
+    exact = exact_optimum(planted.qp, reference_solution(planted.qp))
+    assert exact is not None
+    assert exact.value == 2.0**-20
     passed = [s for s in attack.points(100) if attack.verified(s)]
     assert passed
     assert max(attack.error(s) for s in passed) <= 1e-3
@@ -221,8 +224,26 @@ def test_a_point_that_is_no_optimum_has_no_exact_value():
     qp = qp_of(np.eye(2), [-1, -1], A=[[1, 1]], b=[1], ub=[1e7, 1e7])
     right, wrong = at([0.5, 0.5], [0.5]), at([1e7, 0], [0], z_box=[1, 0])
 
-    assert exact_value(qp, right) == Fraction(-3, 4)
-    assert exact_value(qp, wrong) is None  # the bound would pull
+    exact = exact_optimum(qp, right)
+    assert exact is not None
+    assert exact.value == Fraction(-3, 4)
+    assert exact_optimum(qp, wrong) is None  # the bound would pull
+
+
+def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
+    """Terms of 1e24 at a solution 1e10 along the free direction x₁ = −x₃, f* = 2⁻²⁰."""
+    planted = hard(frozenset({"cancelled", "duplicates", "redundant"}), 194299169)
+    qp, s = planted.qp, planted.solution
+    free = np.array([1.0, 0, -1, 0])
+    assert not any((M @ free).any() for M in (qp.P, qp.A, qp.G[:2], qp.q[None]))
+
+    long = replace(s, x=s.x + 2.0**33 * free)
+    optimum = proven_optimum(qp, lambda _: long)
+
+    assert optimum is not None
+    assert optimum.value == 2.0**-20
+    assert optimum.doubt <= 1e-3 * 2.0**-20
+    assert optimum.energy <= 1e4 * 2.0**-20
 
 
 def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
