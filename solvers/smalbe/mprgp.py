@@ -104,7 +104,7 @@ class Directions:
     Hp: tuple[Vector, ...] = ()
 
     def and_(self, p: Vector, Hp: Vector, curvature: float, most: int) -> Directions:
-        """Add one, of that pᵀHp; leave out the first where they are more than `most`."""
+        """Add one, with this pᵀHp; leave out the first if they are more than `most`."""
         if not most:
             return self
         scale = 1 / math.sqrt(curvature)
