@@ -8,9 +8,7 @@ from scipy.sparse import csc_array, csr_array
 from harness.verify.products import projected_products, times_columns, times_rows
 
 BEYOND = np.longdouble(2) ** -60  #: what a double beside one cannot hold
-LAPLACIAN = csc_array(
-    [[1.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]]
-)
+LAPLACIAN = csc_array([[1.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]])
 ONES = np.full((4, 1), 0.5)  #: its kernel, orthonormal
 
 
