@@ -40,6 +40,7 @@ def emitted(name: str = CASE) -> None:
     from harness.distributed.vectors import Ranks
     from problems.feti import emission
     from problems.models import beam_ring, membranes, patch, plate
+    from solvers.reference.over_ranks import reference_over_ranks
     from solvers.smalbe.solver import SMALBE
 
     del emission, beam_ring, membranes, patch, plate
@@ -61,7 +62,7 @@ def emitted(name: str = CASE) -> None:
     emit = case.family.emission(case.form, case.params)
     if emit is None:
         raise SystemExit(f"{name}: ranks cannot emit it")
-    made = emit(ranks)
+    made = emit(ranks, reference_over_ranks)
     if ranks.rank == 0:
         print(f"{name}: {made.variables} multipliers, {ranks.size} ranks")
     told("emit", start)

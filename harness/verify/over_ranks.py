@@ -31,6 +31,7 @@ from harness.verify.certificate import (
     is_sharp,
     torn_certificate,
 )
+from harness.verify.products import times_columns, times_rows
 from harness.verify.substructured import neighbour, scaled_rows
 
 
@@ -234,12 +235,14 @@ def _proof(
     places, here = own.among.places(at)
     feasible = u * found.theta
     feasible[places[here]] = found.u[here]
-    parts, among = own.parts, own.among
-    spread = parts.spread.astype(Real)
-    torn = spread @ feasible
+    parts, among, T = own.parts, own.among, own.parts.spread
+    torn = times_rows(T.data, T.indices, T.indptr, feasible)
     pull = parts.product(torn)
     square = torn @ pull
-    rho = among.completed(spread.T @ (pull - own.f))
+    pull -= own.f
+    rho = among.completed(
+        times_columns(T.data, T.indices, T.indptr, pull, feasible.size)  # Tᵀ by columns
+    )
     rho[places[here]] += (exact.B.T @ lam)[here]
     rho[own.held] = 0
     near = neighbour(

@@ -1,5 +1,5 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Products of stored matrices with vectors in extended precision.
+"""Products of stored matrices with vectors, in extended precision where these are.
 
 Entries are extended one by one: a copy of a stiffness in extended precision would take
 more than twice its memory, and longer than the product. Compiled when the package is
@@ -11,6 +11,13 @@ import numpy as np
 ctypedef fused index:
     int
     long long
+
+ctypedef fused real:
+    double
+    long double
+
+cdef enum:
+    MODES = 6  # of a rigid body in space
 
 
 def times_columns(
@@ -27,3 +34,74 @@ def times_columns(
         for k in range(indptr[j], indptr[j + 1]):
             y[indices[k]] += data[k] * x_j
     return product
+
+
+def times_rows(
+    const double[::1] data, const index[::1] indices, const index[::1] indptr,
+    const long double[::1] x,
+):
+    """Return Mx for M by rows (CSR), its entries doubles, x extended."""
+    product = np.empty(indptr.shape[0] - 1, dtype=np.longdouble)
+    cdef long double[::1] y = product
+    cdef long double y_i
+    cdef Py_ssize_t i, k
+    for i in range(indptr.shape[0] - 1):
+        y_i = 0
+        for k in range(indptr[i], indptr[i + 1]):
+            y_i += data[k] * x[indices[k]]
+        y[i] = y_i
+    return product
+
+
+def projected_products(
+    const double[::1] data, const index[::1] indices, const index[::1] indptr,
+    const double[:, ::1] R, const long long[::1] starts,
+    const real[::1] v, real[::1] found,
+):
+    """Put PMP v_s of parts v_s (n,) of v (N,) into the same places of `found` (N,).
+
+    P = I − RRᵀ; M (n, n) by columns (CSC) and orthonormal R (n, r), r ≤ 6, are doubles.
+    The parts begin at `starts`; where one is zero, `found` stays as it is.
+    Coefficients of R are found to the digits of doubles.
+    """
+    cdef Py_ssize_t n = indptr.shape[0] - 1, s, first, i, j, k
+    part = np.empty(n, dtype=np.double if real is double else np.longdouble)
+    cdef real[::1] own = part
+    cdef real own_j
+    cdef bint acts
+    if R.shape[1] > MODES:
+        raise ValueError(f"{R.shape[1]} columns of R; expected at most {MODES}")
+    for s in range(starts.shape[0]):
+        first, acts = starts[s], False
+        for i in range(n):
+            own[i] = v[first + i]
+            acts = acts or own[i] != 0
+        if not acts:
+            continue
+        project(R, &own[0])
+        for i in range(n):
+            found[first + i] = 0
+        for j in range(n):
+            own_j = own[j]
+            for k in range(indptr[j], indptr[j + 1]):
+                found[first + indices[k]] += data[k] * own_j
+        project(R, &found[first])
+
+
+cdef void project(const double[:, ::1] R, real *v) noexcept nogil:
+    """Apply P = I − RRᵀ to v (n,)."""
+    cdef double[MODES] along
+    cdef Py_ssize_t i, l, r = R.shape[1]
+    cdef double v_i
+    cdef real left
+    for l in range(r):
+        along[l] = 0
+    for i in range(R.shape[0]):
+        v_i = <double> v[i]
+        for l in range(r):
+            along[l] += R[i, l] * v_i
+    for i in range(R.shape[0]):
+        left = v[i]
+        for l in range(r):
+            left -= <real> R[i, l] * along[l]
+        v[i] = left

@@ -94,6 +94,18 @@ class ProblemInParts:
     #: what follows once this is solved, and is emitted in its place; None where this is
     then: Callable[[OwnSolution], ProblemInParts] | None = None
 
+    @cached_property
+    def contact_scale(self) -> Vector:
+        """√(E/‖B_i‖²) of contact rows (m,), E of the softest body they touch."""
+        rows, of = self.contact.rows, self.layout
+        if not rows.shape[0]:
+            return np.zeros(0)
+        node = rows.indices // self.components
+        E = self.E[of.body[of.holder(node)]]
+        norm2 = np.add.reduceat(rows.data**2 / of.times(node), rows.indptr[:-1])
+        softest = np.minimum.reduceat(E, rows.indptr[:-1])
+        return np.asarray(np.sqrt(softest / norm2))
+
 
 class Entries(NamedTuple):
     """Entries of B in own columns, and who else has entries in the same rows."""
@@ -344,7 +356,7 @@ def _dual(own: OwnSubdomains) -> _Dual:
         )  # fmt: skip
         return Share(part, gathered_on_one(at, total))
 
-    return _Dual(own, at, _contact_scale(own.problem), explicit, share)
+    return _Dual(own, at, own.problem.contact_scale, explicit, share)
 
 
 def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
@@ -466,7 +478,7 @@ def _rows(own: OwnSubdomains) -> _Rows:
     )
     reach.sort_indices()
     reach.data[:] = 1
-    contact, scale = problem.contact, _contact_scale(problem)
+    contact, scale = problem.contact, problem.contact_scale
     rubbing = contact.bound.size  # the last rows, of which both bounds are finite
     bound = contact.bound / scale[scale.size - rubbing :]
     below = np.concatenate([np.zeros(scale.size - rubbing), -bound])
@@ -562,7 +574,7 @@ def _contact(own: OwnSubdomains) -> Entries:
     row = _equalities(problem) + entries.row.astype(np.int64)
     reached = np.stack([row[copies.node], copies.rank], axis=1)
     times = problem.layout.times(node)
-    share = _contact_scale(problem)[entries.row] * entries.data / times
+    share = problem.contact_scale[entries.row] * entries.data / times
     of = copies.node[copies.mine]
     return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
 
@@ -594,18 +606,6 @@ def _equalities(problem: ProblemInParts) -> int:
         for m, count in of.having.items()
     )
     return int(times.sum()) + glued
-
-
-def _contact_scale(problem: ProblemInParts) -> Vector:
-    """Return √(E/‖B_i‖²) of contact rows (m,), E of the softest body they touch."""
-    rows, of = problem.contact.rows, problem.layout
-    if not rows.shape[0]:
-        return np.zeros(0)
-    node = rows.indices // problem.components
-    E = problem.E[of.body[of.holder(node)]]
-    norm2 = np.add.reduceat(rows.data**2 / of.times(node), rows.indptr[:-1])
-    softest = np.minimum.reduceat(E, rows.indptr[:-1])
-    return np.asarray(np.sqrt(softest / norm2))
 
 
 def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:

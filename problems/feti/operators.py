@@ -94,8 +94,8 @@ class Packed:
             n = group.touched.size
             begin, end = end, end + n * group.members.size
             x, y = (v[begin:end].reshape(n, -1) for v in (X, Y))
-            if isinstance(block, np.ndarray):
-                np.matmul(block, x, out=y)
+            if isinstance(block, np.ndarray):  # symmetric: yᵀ = xᵀ block, half is read
+                blas.dsymm(1.0, block.T, x.T, side=1, c=y.T, overwrite_c=1)
             else:
                 y[:] = block @ x
         return Y

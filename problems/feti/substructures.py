@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
 from harness import Vector
+from harness.verify.products import projected_products
 from problems.feti.torn import Kind, Torn
-
-Columns = NDArray[Any]  #: (n_k, …) of the subdomains of one kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,29 +62,25 @@ class LocalProblems:
         return np.asarray(T.multiply(K @ T).sum(axis=0))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP in the precision of v; all subdomains of a kind at once."""
-        return self._by_kinds(lambda kind, own: kind.K.astype(v.dtype) @ own, v)
+        """Apply PKP in the precision of v."""
+        found, domains = np.zeros_like(v), self.torn.domains
+        for kind, members in zip(domains.kinds, domains.members, strict=True):
+            K, R = kind.K, np.ascontiguousarray(kind.R)
+            projected_products(
+                K.data, K.indices, K.indptr, R, domains.start[members], v, found
+            )
+        return found
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P with one factor per kind."""
-        return self._by_kinds(Kind.inverse, b)
-
-    def _by_kinds(
-        self, apply: Callable[[Kind, Columns], Columns], v: NDArray[Any]
-    ) -> NDArray[Any]:
-        """Apply a map of each kind between two projections P = I − RRᵀ.
-
-        Coefficients Rᵀv are needed to the digits of doubles only: a rigid motion that
-        is left is as small beside v as KR is beside K.
-        """
-        found, domains = np.zeros_like(v), self.torn.domains
-        acting = np.logical_or.reduceat(v != 0, domains.start[:-1])
+        """Apply PK⁺P with one factor per kind; all subdomains of a kind at once."""
+        found, domains = np.zeros_like(b), self.torn.domains
+        acting = np.logical_or.reduceat(b != 0, domains.start[:-1])
         for (kind, place), members in zip(self._kinds(), domains.members, strict=True):
             place = place[:, acting[members]]  # 0 of the others is 0
-            own, R = v[place], kind.R
-            own -= R.astype(v.dtype) @ (R.T @ own.astype(np.float64))
-            image = apply(kind, own)
-            image -= R @ (R.T @ image.astype(np.float64))
+            own, R = b[place], kind.R
+            own -= R @ (R.T @ own)
+            image = kind.inverse(own)
+            image -= R @ (R.T @ image)
             found[place] = image
         return found
 

@@ -19,11 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csc_matrix, csr_array
-from sksparse.cholmod import Factor, cholesky
+from sksparse.cholmod import Factor, analyze, cholesky
 
 from harness import Vector
+from harness.distributed.factor import with_int32
 from problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
@@ -60,21 +61,34 @@ class Kind:
 
         ::
 
-            (K⁺)_bb = ((S_h + ρR*R*ᵀ)⁻¹)_bb,    S_h = K_hh − K_hi K_ii⁻¹K_ih
+            (K⁺)_bb = (S_ρ⁻¹)_bb,    S_ρ = S_h + ρR*R*ᵀ,   S_h = K_hh − K_hi K_ii⁻¹K_ih
 
-        where h are the boundary, b and the fixing components, and i all others.
+        where h are the boundary, b and the fixing components, and i all others. With h
+        last, S_ρ = LLᵀ is the last block of the Cholesky factor of K_ρ.
         """
         g = np.union1d(self.boundary, b)
         h = np.union1d(g, self.fixing)
-        S, at = self.elimination(h) @ np.eye(h.size), np.searchsorted(h, b)
-        K_rho, fixed = S.copy(), np.searchsorted(h, self.fixing)
-        K_rho[np.ix_(fixed, fixed)] += self._held
-        C = cho_solve(cho_factor(K_rho, lower=True), np.eye(h.size)[:, at])[at]
+        L = self._last_block(h)
+        at, fixed = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
+        C = cho_solve((L, True), np.eye(h.size)[:, at])[at]
+        S = L @ L.T
+        S[np.ix_(fixed, fixed)] -= self._held
         S_bb, inner = S[np.ix_(at, at)], ~np.isin(h, g)
         if inner.any():
             S_ib = S[inner][:, at]
             S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
         return Condensed(_symmetric(C), _symmetric(S_bb))
+
+    def _last_block(self, h: Nodes) -> Dense:
+        """Return the block of h of the Cholesky factor of K_ρ, with h last."""
+        i = np.setdiff1d(np.arange(self.K.shape[0]), h)
+        if i.size:
+            i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
+        order = np.concatenate([i, h])
+        K_rho = with_int32(self._fixed[order][:, order])
+        factor = analyze(K_rho, ordering_method="natural", use_long=False)
+        factor.cholesky_inplace(K_rho)
+        return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def elimination(self, h: Nodes) -> Elimination:
         """Eliminate all components but h; S on these multiplies columns."""
@@ -94,10 +108,15 @@ class Kind:
     @cached_property
     def _factor(self) -> Factor:
         """Factorise K_ρ, where it is first needed."""
+        return cholesky(csc_matrix(self._fixed))
+
+    @property
+    def _fixed(self) -> csc_array:
+        """K_ρ, (n_k, n_k)."""
         p = self.fixing.size
         where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
         held = csc_array((self._held.ravel(), where), shape=self.K.shape)
-        return cholesky(csc_matrix(self.K + held))
+        return csc_array(self.K + held)
 
 
 class Condensed(NamedTuple):

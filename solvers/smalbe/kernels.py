@@ -95,10 +95,10 @@ def reduced(
     return cut
 
 
-def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
-    """Return z − (zᵀHp / pᵀHp) p."""
+def conjugate(z: Vector, p: Vector, Hp: Vector) -> tuple[Vector, float]:
+    """Return z − (zᵀHp / pᵀHp) p, and pᵀHp."""
     along, curvature = inner_products((z, Hp), (p, Hp))
-    return combined(1.0, z, -along / curvature, p)
+    return combined(1.0, z, -along / curvature, p), curvature
 
 
 @on_slices

@@ -103,12 +103,11 @@ class Directions:
     p: tuple[Vector, ...] = ()
     Hp: tuple[Vector, ...] = ()
 
-    def and_(self, p: Vector, Hp: Vector, most: int) -> Directions:
-        """Add one, and leave out the first where they are more than `most`."""
+    def and_(self, p: Vector, Hp: Vector, curvature: float, most: int) -> Directions:
+        """Add one, with this pᵀHp; leave out the first if they are more than `most`."""
         if not most:
             return self
-        (square,) = inner_products((p, Hp))
-        scale = 1 / math.sqrt(square)
+        scale = 1 / math.sqrt(curvature)
         return Directions(
             self.free, (*self.p, scale * p)[-most:], (*self.Hp, scale * Hp)[-most:]
         )
@@ -223,8 +222,9 @@ def mprgp(
         letters, at, B = step
         face = split(at, bounds)
         if letters == "c":
-            known = known.and_(p, Hp, rules.kept)
-            p = known.conjugate(kernels.conjugate(z_of(face.phi), p, Hp))
+            new, curvature = kernels.conjugate(z_of(face.phi), p, Hp)
+            known = known.and_(p, Hp, curvature, rules.kept)
+            p = known.conjugate(new)
             stay = stay._replace(inside=stay.inside + 1)
         else:
             z_of, known = precondition(face.free), Directions(face.free)
@@ -359,16 +359,17 @@ def _model_expansion(
     if half.g @ s >= 0:
         z, s = half, B.step(*half, box)
     new, raised = half, B
-    change = _change(at.g, -p, -Hp, feasible)
+    change = _change(inner_products((at.g, -p), (p, Hp)), feasible)
     if s.any():
         Hs = task.H(s)
         cost, most = kernels.lengths(*half, -s, -Hs, *task.bounds)
         length = min(cost, max(1.0, most))
         if math.isinf(length):
             return None
-        if change + _change(half.g, s, Hs, 1.0) < 0:
+        along = inner_products((half.g, s), (s, Hs))
+        if change + _change(along, 1.0) < 0:
             length = max(length, 1.0)
-        change += _change(half.g, s, Hs, length)
+        change += _change(along, length)
         r, Hr = half.x + s - z.x, half.g + Hs - z.g
         new, raised = _moved(task, half, -length, s, Hs), B.raised(r, float(r @ Hr))
     if not B.has_directions:
@@ -391,7 +392,7 @@ def _beyond(
         phi = np.where(free, z.g, 0.0)
         if phi @ phi <= stay.began:
             break
-        p = kernels.conjugate(phi, p, Hp)
+        p, _ = kernels.conjugate(phi, p, Hp)
         Hp, letters = task.H(p), letters + "b"
         curvature = float(p @ Hp)
         if curvature <= 0:
@@ -417,9 +418,10 @@ def _project_gradient(
     return letters + "f", _moved(task, at, -length, s, Hs), B
 
 
-def _change(g: Vector, s: Vector, Hs: Vector, t: float) -> float:
-    """Return f(x + ts) − f(x)."""
-    return t * float(g @ s) + 0.5 * t**2 * float(s @ Hs)
+def _change(along: tuple[float, ...], t: float) -> float:
+    """Return f(x + ts) − f(x), of gᵀs and sᵀHs."""
+    slope, curvature = along
+    return t * slope + 0.5 * t**2 * curvature
 
 
 def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:

@@ -41,7 +41,12 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
-from harness.distributed.vectors import DistributedColumns, Ranks, distributed
+from harness.distributed.vectors import (
+    DistributedColumns,
+    Ranks,
+    distributed,
+    inner_products,
+)
 from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
@@ -425,9 +430,9 @@ class PenaltyModel:
     def raised(self, s: Vector, sHs: float) -> BoxModel:
         """As `Model.raised`."""
         Cs = self.rows.C @ s
-        part = float(Cs @ Cs)
-        rest = float(s @ s) - part
-        missing = sHs - self.tau * float(s @ s) - self.w * part
+        part, square = inner_products((Cs, Cs), (s, s))
+        rest = square - part
+        missing = sHs - self.tau * square - self.w * part
         tau = self.tau + missing / rest if rest > 0 else np.inf
         tau = min(max(tau, self.tau), 10 * self.tau)
         w = self.w + self.tau - tau
