@@ -217,10 +217,12 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
     gain = np.where(own_r > 0, own_r * step, 0.0)
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    signed = (s.z >= 0).all()  # NaN is not
+    pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
         _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
-        _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S),
+        pulling,
         _ratio(np.minimum(s.z_box, 0)[~lower], S),
         _ratio(np.maximum(s.z_box, 0)[~upper], S),
     )
