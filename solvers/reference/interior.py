@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array, vstack
+from scipy.sparse import csc_array, csr_array, eye_array, vstack
 
 from harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
 from solvers.reference.saddle import Factorise, Solve, saddle
@@ -50,6 +50,7 @@ class _Problem:
     A: Matrix
     b: Vector
     G: csr_array
+    G_T: csc_array
     d: Vector
     fixed: NDArray[np.int64]
     upper: NDArray[np.int64]
@@ -63,7 +64,7 @@ class _Problem:
     def C_T(self, z: Vector) -> Vector:
         """Return Cᵀz."""
         p = self.G.shape[0]
-        return self._box_T(z[p:], start=self.G.T @ z[:p])
+        return self._box_T(z[p:], start=self.G_T @ z[:p])
 
     def _box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
         """Add the multipliers of bounds to a force.
@@ -143,8 +144,9 @@ def _problem(qp: QP) -> _Problem:
     stack = vstack
     if isinstance(qp.P, np.ndarray):
         A, stack = A.toarray(), np.vstack
+    G = csr_array(qp.G)
     return _Problem(
-        qp, A, np.append(qp.b, qp.lb[fixed]), csr_array(qp.G),
+        qp, A, np.append(qp.b, qp.lb[fixed]), G, G.T,
         np.concatenate([qp.h, qp.ub[at[1]], -qp.lb[at[2]]]), *at,
         saddle(qp.P, stack([A, qp.G])),
     )  # fmt: skip

@@ -16,6 +16,8 @@ from solvers.smalbe.driver import outer_loop, recovered
 from solvers.smalbe.outer_loop import first_iterate
 from solvers.smalbe.projected import by_lanczos, prepared_problem, projected_problem
 
+pytestmark = pytest.mark.together
+
 PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
 
