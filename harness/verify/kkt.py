@@ -194,11 +194,11 @@ def _violation(constraints: dict[str, _Constraints], X: Vector) -> float:
 def _violated(error: Vector, rhs: Vector, terms: Vector, known: Vector) -> float:
     """Compare with |bᵢ| + Σ|aᵢⱼ|Xⱼ, and where bᵢ is a size of its own with its row."""
     told = rhs > SMALL * (rhs + known)
+    felt = _excess(error, rhs + terms, rhs + known)
+    if not told.any():
+        return felt
     alone = (rhs + terms)[told]
-    return _largest(
-        _excess(error, rhs + terms, rhs + known),
-        _excess(error[told], alone, alone) / CANCELLED,
-    )
+    return _largest(felt, _excess(error[told], alone, alone) / CANCELLED)
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:

@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import lu_solve
-from scipy.linalg.lapack import dgetrf
+from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -98,7 +97,7 @@ def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
         factor, pivots, info = dgetrf(K)
         if info:
             raise ArithmeticError("the saddle-point matrix is singular")
-        return lambda v: np.asarray(lu_solve((factor, pivots), v, check_finite=False))
+        return lambda v: np.asarray(dgetrs(factor, pivots, v)[0])
     for order in (LEAST_FILL, PIVOTED):
         try:
             lu = splu(K, **order)
