@@ -200,9 +200,9 @@ def sheared_result(form="dual", **given):
 @pytest.mark.parametrize(
     ("Q", "contact"),
     [
-        (0.25, "mortar"),
         (0.5, "nts"),
         (0.9, "mortar"),
+        pytest.param(0.25, "mortar", marks=pytest.mark.slow),
         pytest.param(0.75, "mortar", marks=pytest.mark.slow),
     ],
 )
