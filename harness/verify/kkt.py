@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -164,9 +165,8 @@ def _constraints(
         if told.any():
             at = bound[told]
             found[name] = _Constraints(
-                sign * (x[told] - at), np.abs(at), size[told],
-                lambda X, told=told: X[told],
-            )  # fmt: skip
+                sign * (x[told] - at), np.abs(at), size[told], partial(_where, told)
+            )
     return found
 
 
@@ -471,6 +471,10 @@ def _sup(v: Vector) -> float:
 
 def _finite_sup(v: Vector) -> float:
     return _sup(v[np.isfinite(v)])
+
+
+def _where(mask: NDArray[np.bool_], v: Vector) -> Vector:
+    return v[mask]
 
 
 def _abs(M: Matrix) -> Matrix:

@@ -134,21 +134,23 @@ def interior_point(qp: QP) -> Solution:
 
 
 def _problem(qp: QP) -> _Problem:
-    fixed = qp.lb == qp.ub
-    at = [
+    is_fixed = qp.lb == qp.ub
+    fixed, upper, lower = (
         np.flatnonzero(mask)
-        for mask in (fixed, np.isfinite(qp.ub) & ~fixed, np.isfinite(qp.lb) & ~fixed)
-    ]
+        for mask in (
+            is_fixed, np.isfinite(qp.ub) & ~is_fixed, np.isfinite(qp.lb) & ~is_fixed
+        )
+    )  # fmt: skip
     unit = eye_array(qp.q.size, format="csr")
-    A = csr_array(vstack([csr_array(qp.A), unit[at[0]]]))
+    A: Matrix = csr_array(vstack([csr_array(qp.A), unit[fixed]]))
     stack = vstack
     if isinstance(qp.P, np.ndarray):
         A, stack = A.toarray(), np.vstack
     G = csr_array(qp.G)
     return _Problem(
-        qp, A, np.append(qp.b, qp.lb[fixed]), G, G.T,
-        np.concatenate([qp.h, qp.ub[at[1]], -qp.lb[at[2]]]), *at,
-        saddle(qp.P, stack([A, qp.G])),
+        qp=qp, A=A, b=np.append(qp.b, qp.lb[fixed]), G=G, G_T=G.T,
+        d=np.concatenate([qp.h, qp.ub[upper], -qp.lb[lower]]),
+        fixed=fixed, upper=upper, lower=lower, saddle=saddle(qp.P, stack([A, qp.G])),
     )  # fmt: skip
 
 
