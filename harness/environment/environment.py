@@ -154,7 +154,8 @@ def source(root: Path) -> dict[str, Any] | None:
         return None
     try:
         commit = git("rev-parse", "HEAD").decode().strip()
-        dirty = git("status", "--porcelain", "--", *_CODE) != b""
+        if not git("status", "--porcelain", "--", *_CODE):
+            return {"commit": commit, "dirty": False, "changes": None}
         changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]
         listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
         for name in sorted(listed.split(b"\0")):
@@ -162,8 +163,7 @@ def source(root: Path) -> dict[str, Any] | None:
                 changes += [name, b"\0", (root / os.fsdecode(name)).read_bytes()]
     except (OSError, subprocess.CalledProcessError):
         return None
-    digits = hex_digest(changes) if dirty else None
-    return {"commit": commit, "dirty": dirty, "changes": digits}
+    return {"commit": commit, "dirty": True, "changes": hex_digest(changes)}
 
 
 def mapped_libraries() -> list[str]:

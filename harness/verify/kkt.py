@@ -10,8 +10,9 @@ objective, and what they cannot, is in docs/mathematics.md; where they cannot,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -52,11 +53,21 @@ class Scales(NamedTuple):
     x: Vector  #: Xⱼ (n,), size of each variable
 
 
+class _Constraints(NamedTuple):
+    """Rows of A or G, or the lower or upper bounds that there are, at a point."""
+
+    slack: Vector  #: b − Ax, h − Gx, x − lb or ub − x
+    rhs: Vector  #: |b|, |h|, |lb| or |ub|
+    terms: Vector  #: Σ|aᵢⱼ||xⱼ|
+    sized: Callable[[Vector], Vector]  #: X (n,) ↦ Σ|aᵢⱼ|Xⱼ
+
+
 @dataclass(frozen=True, eq=False)
 class _Terms:
     """Products of the QP with a point, and the sizes of what was summed."""
 
     x: Vector  #: |x|
+    constraints: dict[str, _Constraints]  #: by the name of the QP's field
     Px: Vector
     Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
     curvature: Vector  #: Pᵢᵢ, zero where P does not tell
@@ -92,11 +103,11 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
         of energies forgiven
     """
     t, excused = _terms(qp, s), np.inf if generous else EXCUSED
-    E, X = scales_at(qp, s.x, _energy(qp, t, generous), t.curvature)
+    E, X = _scales(qp, s.x, _energy(qp, t, generous), t.curvature, told=t.told)
     return Residuals(
-        violation(qp, s.x, X),
+        _violation(t.constraints, X),
         _dual(qp, s, t, E, X),
-        _complementarity(qp, s, E, excused),
+        _complementarity(qp, s, t.constraints, E, excused),
         _excess(t.energies.sum(keepdims=True), t.energies_size, E, excused),
     )
 
@@ -105,9 +116,10 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
     x, z_lb, z_ub = np.abs(s.x), np.maximum(-s.z_box, 0), np.maximum(s.z_box, 0)
     d, told = _curvature(qp)
+    root, A_size, G_size = np.sqrt(d), _abs(qp.A), _abs(qp.G)
     Px = qp.P @ s.x
-    Px_size = np.sqrt(d) * (np.sqrt(d) @ x) if told else 0 * x + _sup(Px)
-    rows = qp.A.T @ s.y + qp.G.T @ np.maximum(s.z, 0)
+    Px_size = root * (root @ x) if told else 0 * x + _sup(Px)
+    rows = _combined(qp.A, s.y) + _combined(qp.G, np.maximum(s.z, 0))
     borne = np.where(upper, z_ub, 0) - np.where(lower, z_lb, 0)
     held = qp.b @ s.y + qp.h @ s.z
     held += qp.ub[upper] @ z_ub[upper] - qp.lb[lower] @ z_lb[lower]
@@ -117,9 +129,10 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         np.abs(qp.lb[lower]) @ z_lb[lower],
     )  # fmt: skip
     return _Terms(
-        x=x, Px=Px, Px_size=Px_size, curvature=d, told=told,
-        forces=rows + qp.G.T @ np.minimum(s.z, 0) + s.z_box,
-        forces_size=_abs(qp.A).T @ np.abs(s.y) + _abs(qp.G).T @ np.abs(s.z)
+        x=x, constraints=_constraints(qp, s.x, A_size, G_size),
+        Px=Px, Px_size=Px_size, curvature=d, told=told,
+        forces=rows + _combined(qp.G, np.minimum(s.z, 0)) + s.z_box,
+        forces_size=_combined(A_size, np.abs(s.y)) + _combined(G_size, np.abs(s.z))
         + np.abs(s.z_box),
         residual=Px + qp.q + rows + borne,
         energies=np.array([s.x @ Px, qp.q @ s.x, held]),
@@ -127,36 +140,65 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     )  # fmt: skip
 
 
+def _combined(M: Matrix, z: Vector) -> Vector | float:
+    """Return Mᵀz (n,); 0 without rows."""
+    return M.T @ z if M.shape[0] else 0.0
+
+
+def _constraints(
+    qp: QP, x: Vector, A_size: Matrix, G_size: Matrix
+) -> dict[str, _Constraints]:
+    """Measure the constraints at x (n,), kind by kind, of each kind that there is.
+
+    A_size, G_size : |A| and |G|
+    """
+    size, found = np.abs(x), dict[str, _Constraints]()
+    for name, M, rhs, sizes in (
+        ("A", qp.A, qp.b, A_size), ("G", qp.G, qp.h, G_size),
+    ):  # fmt: skip
+        if M.shape[0]:
+            found[name] = _Constraints(
+                rhs - M @ x, np.abs(rhs), sizes @ size, sizes.__matmul__
+            )
+    for name, bound, sign in (("lb", qp.lb, 1), ("ub", qp.ub, -1)):
+        told = np.isfinite(bound)
+        if told.any():
+            at = bound[told]
+            found[name] = _Constraints(
+                sign * (x[told] - at), np.abs(at), size[told], partial(_where, told)
+            )
+    return found
+
+
 def violation(qp: QP, x: Vector, X: Vector) -> float:
     """Measure the worst violation of a row or bound, as `kkt_residuals` says.
 
     X : (n,) sizes of the variables
     """
-    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    size, box = np.abs(x), (qp.lb[lower], qp.ub[upper])
+    return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X)
+
+
+def _violation(constraints: dict[str, _Constraints], X: Vector) -> float:
     return _largest(
+        0.0,
         *(
-            _violated(error, rhs, terms, known)
-            for error, rhs, terms, known in (
-                (qp.A @ x - qp.b, qp.b, _abs(qp.A) @ size, _abs(qp.A) @ X),
-                (np.maximum(qp.G @ x - qp.h, 0), qp.h, _abs(qp.G) @ size,
-                 _abs(qp.G) @ X),
-                (np.minimum(x[lower] - box[0], 0), box[0], size[lower], X[lower]),
-                (np.minimum(box[1] - x[upper], 0), box[1], size[upper], X[upper]),
+            _violated(
+                c.slack if name == "A" else np.minimum(c.slack, 0),
+                c.rhs, c.terms, c.sized(X),
             )
-        )
+            for name, c in constraints.items()
+        ),
     )  # fmt: skip
 
 
 def _violated(error: Vector, rhs: Vector, terms: Vector, known: Vector) -> float:
     """Compare with |bᵢ| + Σ|aᵢⱼ|Xⱼ, and where bᵢ is a size of its own with its row."""
-    rhs = np.abs(rhs)
     told = rhs > SMALL * (rhs + known)
+    felt = _excess(error, rhs + terms, rhs + known)
+    if not told.any():
+        return felt
     alone = (rhs + terms)[told]
-    return _largest(
-        _excess(error, rhs + terms, rhs + known),
-        _excess(error[told], alone, alone) / CANCELLED,
-    )
+    return _largest(felt, _excess(error[told], alone, alone) / CANCELLED)
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
@@ -175,29 +217,33 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
     gain = np.where(own_r > 0, own_r * step, 0.0)
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    signed = (s.z >= 0).all()  # NaN is not
+    pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
         _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
-        _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S),
+        pulling,
         _ratio(np.minimum(s.z_box, 0)[~lower], S),
         _ratio(np.maximum(s.z_box, 0)[~upper], S),
     )
 
 
-def _complementarity(qp: QP, s: Solution, E: float, excused: float) -> float:
-    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    x, box = np.abs(s.x), (qp.lb[lower], qp.ub[upper])
-    z_lb, z_ub = np.maximum(-s.z_box, 0)[lower], np.maximum(s.z_box, 0)[upper]
-    size = _abs(qp.G) @ x + np.abs(qp.h)
-    return _largest(
-        _excess(s.z * (qp.h - qp.G @ s.x), np.abs(s.z) * size, E, excused),
-        _excess(
-            z_lb * (s.x[lower] - box[0]), z_lb * (x[lower] + np.abs(box[0])), E, excused
-        ),
-        _excess(
-            z_ub * (box[1] - s.x[upper]), z_ub * (x[upper] + np.abs(box[1])), E, excused
-        ),
-    )
+def _complementarity(
+    qp: QP, s: Solution, constraints: dict[str, _Constraints], E: float, excused: float
+) -> float:
+    found = [0.0]
+    for name, c in constraints.items():
+        match name:
+            case "A":
+                continue
+            case "G":
+                z = s.z
+            case "lb":
+                z = np.maximum(-s.z_box, 0)[np.isfinite(qp.lb)]
+            case _:
+                z = np.maximum(s.z_box, 0)[np.isfinite(qp.ub)]
+        found.append(_excess(z * c.slack, np.abs(z) * (c.terms + c.rhs), E, excused))
+    return _largest(*found)
 
 
 def energy_at(qp: QP, s: Solution, *, generous: bool = False) -> float:
@@ -309,7 +355,7 @@ def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
         yield at.row[told], at.col[told], at.data[told], rhs
 
 
-def scales_at(qp: QP, x: Vector, E: float, d: Vector | None = None) -> Scales:
+def scales_at(qp: QP, x: Vector, E: float) -> Scales:
     """Give the sizes of variables that a scale of energy knows of.
 
     The energy changes by E over the length lⱼ, the least of √(E/Pⱼⱼ) and E/|qⱼ|: Xⱼ is
@@ -317,11 +363,14 @@ def scales_at(qp: QP, x: Vector, E: float, d: Vector | None = None) -> Scales:
     an answer could make x as long as it likes. A variable without curvature and cost is
     as long as its active rows know from the others.
     """
-    known, told = _curvature(qp)
-    d = known if d is None else d
+    d, told = _curvature(qp)
+    return _scales(qp, x, E, d, told=told)
+
+
+def _scales(qp: QP, x: Vector, E: float, d: Vector, *, told: bool) -> Scales:
     x, E = x.astype(float), float(E)
     size = np.abs(x)
-    length = np.minimum(np.sqrt(_over(E + 0 * d, d)), _over(E + 0 * d, np.abs(qp.q)))
+    length = np.minimum(np.sqrt(_over(E, d)), _over(E, np.abs(qp.q)))
     felt = np.isfinite(length)
     X = np.where(felt, np.maximum(np.minimum(size, INFLATED * length), length), 0)
     if not told:
@@ -424,11 +473,15 @@ def _finite_sup(v: Vector) -> float:
     return _sup(v[np.isfinite(v)])
 
 
+def _where(mask: NDArray[np.bool_], v: Vector) -> Vector:
+    return v[mask]
+
+
 def _abs(M: Matrix) -> Matrix:
     return abs(M) if M.shape[0] else M
 
 
-def _over(a: Vector, b: Vector) -> Vector:
+def _over(a: Vector | float, b: Vector) -> Vector:
     """Divide, by zero to infinity."""
     return np.where(b > 0, a / np.where(b > 0, b, 1), np.inf)
 
@@ -441,12 +494,13 @@ def _largest(*values: float) -> float:
 def _ratios(error: Vector, scale: Vector | float) -> Vector:
     """|error|/scale, where 0/0 = 0; a scale that overflowed tells nothing."""
     error = np.abs(error)
-    scale = np.broadcast_to(scale, error.shape)
     safe = np.where(error == 0, 1.0, scale)
     return np.where(np.isinf(safe), np.inf, error / safe)
 
 
 def _ratio(error: Vector, scale: Vector | float) -> float:
+    if isinstance(scale, float) and 0 < scale < np.inf:  # rounding is monotonic
+        return float(np.abs(error).max(initial=0.0) / scale)
     return float(_ratios(error, scale).max(initial=0.0))
 
 

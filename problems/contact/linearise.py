@@ -52,16 +52,17 @@ def linearisation(
             rows(bodies.mesh.points, u, *pair, tangential=tangential)
             for rows, pair, tangential in zip(methods, bodies.pairs, rough, strict=True)
         ]
-        B = csr_array(vstack([part.B for part in parts]))
-        if not B.shape[0] and not u.any():
+        if not any(part.c.size for part in parts) and not u.any():
             raise InputError(
                 "no node of a slave side faces its master within reach; expected two "
                 "sides that face each other, each with its body on the left"
             )
+        if len(parts) == 1:
+            return parts[0]
         before = np.cumsum([0, *(part.c.size for part in parts)])
         chains = np.cumsum([0, *(pair.slave.size for pair in bodies.pairs)])
         return ContactRows(
-            B=B,
+            B=csr_array(vstack([part.B for part in parts])),
             c=np.concatenate([part.c for part in parts]),
             T=csr_array(vstack([part.T for part in parts])),
             row=np.concatenate(

@@ -265,10 +265,15 @@ def _rows_along(
     """Build n_jᵀ [(D u_s)_j − (M u_m)_j] for the slave nodes j as a matrix on u."""
     if not j.size:
         return csr_array((0, size))
-    D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
-    row = np.concatenate([D.row, M.row])
+    row_of = np.full(len(sides[0]), -1)
+    row_of[j] = np.arange(j.size)
+    D, M = integrals.D.tocoo(), integrals.M.tocoo()
+    row = row_of[np.concatenate([D.row, M.row])]
     node = np.concatenate([sides[0][D.col], sides[1][M.col]])
-    values = np.concatenate([D.data, -M.data])[:, None] * normal[row]
+    values = np.concatenate([D.data, -M.data])
+    kept = row >= 0
+    row, node = row[kept], node[kept]
+    values = values[kept, None] * normal[row]
     at = (np.repeat(row, 2), np.stack([2 * node, 2 * node + 1], axis=-1).ravel())
     B = csr_array(coo_array((values.ravel(), at), (len(j), size)))
     B.eliminate_zeros()

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import csc_array
 
 from harness import QP, Matrix, Solution, Vector
 
@@ -39,8 +39,8 @@ class Equilibrated:
 
 def equilibrated(qp: QP) -> Equilibrated:
     """Scale a QP with an explicit P; all matrices sparse unless P is dense."""
-    store = np.asarray if isinstance(qp.P, np.ndarray) else csc_array
-    P, A, G = (store(_as(M, store is np.asarray)) for M in (qp.P, qp.A, qp.G))
+    store = _dense if isinstance(qp.P, np.ndarray) else _sparse
+    P, A, G = (store(M) for M in (qp.P, qp.A, qp.G))
     d, e, h = (np.zeros(v.size, dtype=np.int64) for v in (qp.q, qp.b, qp.h))
     for _ in range(ROUNDS):
         P_, A_, G_ = _times(d, P, d), _times(e, A, d), _times(h, G, d)
@@ -59,8 +59,17 @@ def equilibrated(qp: QP) -> Equilibrated:
     return Equilibrated(scaled, D, E, H)
 
 
-def _as(M: Matrix, dense: bool) -> Matrix:
-    return M.toarray() if dense and not isinstance(M, np.ndarray) else M
+def _dense(M: Matrix) -> Matrix:
+    return M if isinstance(M, np.ndarray) else M.toarray()
+
+
+def _sparse(M: Matrix) -> csc_array:
+    """Store by columns, each entry once."""
+    stored = csc_array(M)
+    if not stored.has_canonical_format:
+        stored = stored.copy()
+        stored.sum_duplicates()
+    return stored
 
 
 def _times(left: Exponents, M: Matrix, right: Exponents) -> Matrix:
@@ -68,17 +77,22 @@ def _times(left: Exponents, M: Matrix, right: Exponents) -> Matrix:
     rows, columns = np.ldexp(1.0, left), np.ldexp(1.0, right)
     if isinstance(M, np.ndarray):
         return rows[:, None] * M * columns
-    return csc_array(diags_array(rows) @ M @ diags_array(columns))
+    data = rows[M.indices] * M.data * columns[_columns(M)]
+    return csc_array((data, M.indices, M.indptr), shape=M.shape)
+
+
+def _columns(M: csc_array) -> NDArray[np.int64]:
+    """Give the column of each stored entry."""
+    return np.repeat(np.arange(M.shape[1]), np.diff(M.indptr))
 
 
 def _largest(M: Matrix, axis: int) -> Vector:
     """Largest |entry| per column (axis 0) or row (axis 1)."""
-    if 0 in M.shape:
-        return np.zeros(M.shape[1 - axis])
-    largest = abs(M).max(axis=axis)
-    return np.asarray(
-        largest if isinstance(M, np.ndarray) else largest.toarray()
-    ).ravel()
+    if isinstance(M, np.ndarray):
+        return np.asarray(abs(M).max(axis=axis, initial=0.0))
+    largest = np.zeros(M.shape[1 - axis])
+    np.maximum.at(largest, M.indices if axis else _columns(M), abs(M.data))
+    return largest
 
 
 def _root(largest: Vector) -> Exponents:

@@ -21,10 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array, vstack
+from scipy.sparse import csc_array, csr_array, eye_array, vstack
 
 from harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
-from solvers.reference.saddle import Solve, saddle
+from solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: of a QP whose largest entries are about one
 CLOSE = 1e-11  #: KKT residual that tells the active constraints from the others
@@ -49,31 +49,50 @@ class _Problem:
     qp: QP
     A: Matrix
     b: Vector
-    C: Matrix
+    G: csr_array
+    G_T: csc_array
     d: Vector
     fixed: NDArray[np.int64]
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
+    saddle: Factorise  #: of P, and the rows of A and G
+
+    def C(self, x: Vector) -> Vector:
+        """Return Cx."""
+        return np.concatenate([self.G @ x, x[self.upper], -x[self.lower]])
+
+    def C_T(self, z: Vector) -> Vector:
+        """Return Cᵀz."""
+        p = self.G.shape[0]
+        return self._box_T(z[p:], start=self.G_T @ z[:p])
+
+    def _box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
+        """Add the multipliers of bounds to a force.
+
+        lower : sign of those of lower bounds
+        """
+        start[self.upper] += z[: self.upper.size]
+        start[self.lower] += lower * z[self.upper.size :]
+        return start
 
     def factorised(self, w: Vector) -> Solve:
         """Prepare to solve for (dx, dy, dz) given diag(w) = S/Z.
 
         The rows of bounds are eliminated: they add 1/w to the diagonal of P.
         """
-        qp, m, p = self.qp, self.b.size, self.qp.h.size
-        C_box, w_box = self.C[p:], w[p:]
-        rows = np.vstack if isinstance(qp.P, np.ndarray) else vstack
-        solve = saddle(
-            qp.P,
-            rows([self.A, qp.G]) if m + p else self.A,
-            DELTA + abs(C_box).T @ (1 / w_box),
+        n, m, p = self.qp.q.size, self.b.size, self.qp.h.size
+        w_box = w[p:]
+        solve = self.saddle(
+            self._box_T(1 / w_box, start=np.full(n, DELTA), lower=1.0),
             np.append(np.full(m, DELTA), w[:p]),
         )
 
         def whole(r: Vector, t: Vector) -> tuple[Vector, Vector]:
             t_box = t[m + p :]
-            dx, rest = solve(r + C_box.T @ (t_box / w_box), t[: m + p])
-            return dx, np.append(rest, (C_box @ dx - t_box) / w_box)
+            r = self._box_T(t_box / w_box, start=r.copy())
+            dx, rest = solve(r, t[: m + p])
+            box = np.append(dx[self.upper], -dx[self.lower])
+            return dx, np.append(rest, (box - t_box) / w_box)
 
         return whole
 
@@ -115,18 +134,23 @@ def interior_point(qp: QP) -> Solution:
 
 
 def _problem(qp: QP) -> _Problem:
-    fixed = qp.lb == qp.ub
-    at = [
+    is_fixed = qp.lb == qp.ub
+    fixed, upper, lower = (
         np.flatnonzero(mask)
-        for mask in (fixed, np.isfinite(qp.ub) & ~fixed, np.isfinite(qp.lb) & ~fixed)
-    ]
+        for mask in (
+            is_fixed, np.isfinite(qp.ub) & ~is_fixed, np.isfinite(qp.lb) & ~is_fixed
+        )
+    )  # fmt: skip
     unit = eye_array(qp.q.size, format="csr")
-    C = csr_array(vstack([csr_array(qp.G), unit[at[1]], -unit[at[2]]]))
-    A = csr_array(vstack([csr_array(qp.A), unit[at[0]]]))
+    A: Matrix = csr_array(vstack([csr_array(qp.A), unit[fixed]]))
+    stack = vstack
+    if isinstance(qp.P, np.ndarray):
+        A, stack = A.toarray(), np.vstack
+    G = csr_array(qp.G)
     return _Problem(
-        qp, A.toarray() if isinstance(qp.P, np.ndarray) else A,
-        np.append(qp.b, qp.lb[fixed]),
-        C, np.concatenate([qp.h, qp.ub[at[1]], -qp.lb[at[2]]]), *at,
+        qp=qp, A=A, b=np.append(qp.b, qp.lb[fixed]), G=G, G_T=G.T,
+        d=np.concatenate([qp.h, qp.ub[upper], -qp.lb[lower]]),
+        fixed=fixed, upper=upper, lower=lower, saddle=saddle(qp.P, stack([A, qp.G])),
     )  # fmt: skip
 
 
@@ -148,13 +172,13 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
     """Predict, centre and correct."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
-    r_d = qp.P @ x + qp.q + A.T @ y + C.T @ z
-    r_p, r_c = A @ x - problem.b, C @ x + s - problem.d
+    r_d = qp.P @ x + qp.q + A.T @ y + problem.C_T(z)
+    r_p, r_c = A @ x - problem.b, C(x) + s - problem.d
     solve = problem.factorised(s / z)
 
     def direction(r_sz: Vector) -> Iterate:
         dx, rest = solve(-r_d, np.append(-r_p, r_sz / z - r_c))
-        return Iterate(dx, rest[:m], rest[m:], -r_c - C @ dx)
+        return Iterate(dx, rest[:m], rest[m:], -r_c - C(dx))
 
     step = direction(s * z)
     if z.size:

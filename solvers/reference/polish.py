@@ -98,7 +98,7 @@ def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _P
     y, z = at.y.copy(), np.where(active.rows, at.z, 0)
     P, A, G = qp.P[free][:, free], qp.A[:, free], qp.G[rows][:, free]
     B = np.vstack([A, G]) if isinstance(P, np.ndarray) else vstack([A, G])
-    solve = saddle(P, B, np.full(free.size, delta), np.full(B.shape[0], delta))
+    solve = saddle(P, B)(np.full(free.size, delta), np.full(B.shape[0], delta))
     size = np.inf
     for _ in range(STEPS):
         r = problem.gradient(_Point(x, y, z))[free]

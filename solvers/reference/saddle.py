@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import lu_solve
-from scipy.linalg.lapack import dgetrf
+from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -26,50 +25,69 @@ PIVOTED = dict(permc_spec="COLAMD", diag_pivot_thresh=1.0)
 GOOD = 1e-6  #: residual of a solve that refinement soon makes as small as rounding
 
 Solve = Callable[[Vector, Vector], tuple[Vector, Vector]]
+Factorise = Callable[[Vector, Vector], Solve]
 
 
-def saddle(P: Matrix, B: Matrix, D: Vector, W: Vector) -> Solve:
-    """Factorise; give what solves for (u, v) with (r, t) on the right.
+def saddle(P: Matrix, B: Matrix) -> Factorise:
+    """Give what factorises [P + D Bᵀ; B −W] for D (n,) and W (r,), both positive.
 
-    Parameters
-    ----------
+    What that returns solves for (u, v) with (r, t) on the right. It raises
+    ArithmeticError where an entry is not finite, or a pivot vanishes.
+
     P : (n, n), and B : (r, n), both dense or both sparse
-    D : (n,) and W : (r,), positive
-
-    Raises
-    ------
-    ArithmeticError
-        When an entry is not finite, or a pivot vanishes.
-
     """
-    if not (np.isfinite(D).all() and np.isfinite(W).all()):
-        raise ArithmeticError("the saddle-point matrix holds numbers beyond all bounds")
-    K = _dense(P, B, D, W) if isinstance(P, np.ndarray) else _sparse(P, B, D, W)
-    once = _factorised(K)
-    n = D.size
+    n = P.shape[0]
+    with_diagonal = _dense(P, B) if isinstance(P, np.ndarray) else _sparse(P, B)
 
-    def solve(r: Vector, t: Vector) -> tuple[Vector, Vector]:
-        right = np.concatenate([r, t])
-        w = once(right)
-        w += once(right - K @ w)
-        return w[:n], w[n:]
+    def factorised(D: Vector, W: Vector) -> Solve:
+        if not (np.isfinite(D).all() and np.isfinite(W).all()):
+            raise ArithmeticError(
+                "the saddle-point matrix holds numbers beyond all bounds"
+            )
+        K = with_diagonal(np.append(D, -W))
+        once = _factorised(K)
 
-    return solve
+        def solve(r: Vector, t: Vector) -> tuple[Vector, Vector]:
+            right = np.concatenate([r, t])
+            w = once(right)
+            w += once(right - K @ w)
+            return w[:n], w[n:]
 
+        return solve
 
-def _dense(P: Matrix, B: Matrix, D: Vector, W: Vector) -> Matrix:
-    n, r = D.size, W.size
-    K = np.empty((n + r, n + r))
-    K[:n, :n], K[:n, n:], K[n:, :n], K[n:, n:] = P, B.T, B, 0.0
-    K[np.arange(n), np.arange(n)] += D
-    K[n + np.arange(r), n + np.arange(r)] = -W
-    return K
+    return factorised
 
 
-def _sparse(P: Matrix, B: Matrix, D: Vector, W: Vector) -> Matrix:
-    if not W.size:
-        return csc_array(P + diags_array(D))
-    return csc_array(block_array([[P + diags_array(D), B.T], [B, diags_array(-W)]]))
+def _dense(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
+    """Give the map from d (n + r,) to [P Bᵀ; B 0] + diag(d)."""
+    n, r = P.shape[0], B.shape[0]
+    base, every = np.zeros((n + r, n + r)), np.arange(n + r)
+    base[:n, :n], base[:n, n:], base[n:, :n] = P, B.T, B
+
+    def plus(d: Vector) -> Matrix:
+        K = base.copy()
+        K[every, every] += d
+        return K
+
+    return plus
+
+
+def _sparse(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
+    """Do so for sparse matrices, whose diagonal is stored."""
+    size = P.shape[0] + B.shape[0]
+    base = csc_array(block_array([[P, B.T], [B, None]])) if B.shape[0] else P
+    values = base.diagonal()
+    base = csc_array(base + diags_array(np.where(values == 0, 1.0, values)))
+    base.sort_indices()
+    columns = np.repeat(np.arange(size), np.diff(base.indptr))
+    diagonal = np.flatnonzero(base.indices == columns)
+
+    def plus(d: Vector) -> Matrix:
+        data = base.data.copy()
+        data[diagonal] = values + d
+        return csc_array((data, base.indices, base.indptr), shape=base.shape)
+
+    return plus
 
 
 def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
@@ -79,7 +97,7 @@ def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
         factor, pivots, info = dgetrf(K)
         if info:
             raise ArithmeticError("the saddle-point matrix is singular")
-        return lambda v: np.asarray(lu_solve((factor, pivots), v, check_finite=False))
+        return lambda v: np.asarray(dgetrs(factor, pivots, v)[0])
     for order in (LEAST_FILL, PIVOTED):
         try:
             lu = splu(K, **order)

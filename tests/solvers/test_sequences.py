@@ -11,6 +11,8 @@ from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
+pytestmark = pytest.mark.together
+
 WARM = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
 

@@ -20,6 +20,8 @@ from solvers.common.libraries import PACKAGES
 from solvers.common.sequence import only_vectors_differ
 from solvers.reference.solve import reference_solution
 
+pytestmark = pytest.mark.together
+
 
 def _module(name):
     about = SOLVERS[name].about

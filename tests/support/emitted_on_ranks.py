@@ -6,43 +6,50 @@ ranks emit are put together here, and compared with the QP that one process emit
 
 import json
 import sys
+import time
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-import mortarbench as mb
 from harness.distributed.vectors import Ranks
+from harness.names import parse
+from problems import PROBLEMS
 from problems.feti.emission import OwnSubdomains, subdomains_of
 from solvers.reference.over_ranks import reference_over_ranks
+from solvers.reference.solve import reference_solution
 
 
-def compared(name, ranks):
-    """Tell how far the shares are from the QP of one process, part by part."""
-    case = mb.build(name)
-    made = case.id.family.emission("dual", case.params)(ranks, reference_over_ranks)
-    problem = case.id.family.in_subdomains(case.params)
-    share, qp = made.share().qp, case.qp
-    whole, rows = qp.P.build(), share.P.halo.rows
+def probe(n):
+    """Make a vector (n,) to multiply with."""
+    return np.random.default_rng(3).standard_normal(n)
+
+
+def told(name, ranks):
+    """Emit by all ranks; tell the first one what each has."""
+    case = parse(name, PROBLEMS)
+    made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
+    problem = case.family.in_subdomains(case.params)
+    share = made.share().qp
+    rows = share.P.halo.rows
     own = rows[share.P.halo.own]
-
     mine = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
-    number = mine.number
-    columns = np.concatenate(
-        [np.arange(*whole.domains.start[[s, s + 1]]) for s in number]
-    )
-    B, x = share.P.local.B.tocoo(), np.random.default_rng(3).standard_normal(qp.q.size)
-    told = {
-        "B": (rows[B.row], columns[B.col], B.data),
-        "own": own,
+    B = share.P.local.B.tocoo()
+    return ranks.comm.gather({
+        "sizes": [made.variables, made.equality_rows],
+        "B": (rows[B.row], B.col, B.data),
+        "number": mine.number, "own": own,
         **{key: np.asarray(getattr(share, key)) for key in ("q", "lb", "ub")},
         "A": share.A.part, "b": share.b,
-        "Fx": np.asarray(share.P @ x[own]),
+        "Fx": np.asarray(share.P @ probe(made.variables)[own]),
         "component": mine.component,
-    }  # fmt: skip
-    everyone = ranks.comm.gather(told)
-    if everyone is None:
-        return None
+    })  # fmt: skip
+
+
+def compared(name, everyone):
+    """Tell how far the shares are from the QP of one process, part by part."""
+    qp = parse(name, PROBLEMS).build(reference_solution).qp
+    whole = qp.P.build()
 
     def joined(key, size):
         found = np.full(size, np.nan)
@@ -50,13 +57,25 @@ def compared(name, ranks):
             found[one["own"]] = one[key]
         return found
 
+    def columns(number):
+        starts = whole.domains.start
+        return np.concatenate([np.arange(*starts[[s, s + 1]]) for s in number])
+
     row, column, value = map(
-        np.concatenate, zip(*(e["B"] for e in everyone), strict=True)
+        np.concatenate,
+        zip(
+            *(
+                (i, columns(e["number"])[j], v)
+                for e in everyone
+                for i, j, v in [e["B"]]
+            ),
+            strict=True,
+        ),
     )
     B_whole = csr_array((value, (row, column)), shape=whole.B.shape)
     m, A = qp.q.size, csr_array(qp.A)
     return {
-        "sizes": [[made.variables, made.equality_rows], [m, qp.b.size]],
+        "sizes": [everyone[0]["sizes"], [m, qp.b.size]],
         "owners": np.bincount(np.concatenate([e["own"] for e in everyone])).tolist(),
         "entries": [int(column.size), int(whole.B.nnz)],
         "torn": sum(e["component"].size for e in everyone) - int(whole.B.shape[1]),
@@ -67,7 +86,7 @@ def compared(name, ranks):
         "errors": {
             "B": float(abs(B_whole - whole.B).max() / abs(whole.B).max()),
             "q": _off(joined("q", m), qp.q),
-            "Fx": _off(joined("Fx", m), whole(x)),
+            "Fx": _off(joined("Fx", m), whole(probe(m))),
             "A": max(float(abs(e["A"] - A[:, e["own"]]).max()) for e in everyone)
             / float(abs(A).max()),
             "b": max(_off(e["b"], qp.b) for e in everyone),
@@ -81,9 +100,12 @@ def _off(found, known):
 
 def main():
     ranks = Ranks(MPI.COMM_WORLD)
-    found = {name: compared(name, ranks) for name in sys.argv[1:]}
+    shares = {name: told(name, ranks) for name in sys.argv[1:]}
     if ranks.rank == 0:
-        print(json.dumps(found))
+        print(json.dumps({name: compared(name, s) for name, s in shares.items()}))
+    done = ranks.comm.Ibarrier()
+    while not done.Test():  # others wait asleep, which MPI itself does not
+        time.sleep(0.01)
 
 
 if __name__ == "__main__":

@@ -39,20 +39,19 @@ METHODS = {
     "dual": mortar,
     "standard": lambda *side: mortar(*side, basis="standard"),
 }
-every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 
 
-@every_method
 @quick
 @given(side=sides())
-def test_rows_are_blind_to_translations(method, side):
-    B, c, *_ = method(*side)
-    forces = B.toarray().reshape(len(c), len(side[0]), 2)
+def test_rows_are_blind_to_translations(side):
+    for name, method in METHODS.items():
+        B, c, *_ = method(*side)
+        forces = B.toarray().reshape(len(c), len(side[0]), 2)
 
-    assert np.isfinite(c).all()
-    # a sliver of cover extrapolates with large entries that cancel
-    size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
-    assert forces.sum(axis=1) / size == pytest.approx(0, abs=1e-14)
+        assert np.isfinite(c).all(), name
+        # a sliver of cover extrapolates with large entries that cancel
+        size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
+        assert (abs(forces.sum(axis=1) / size) <= 1e-14).all(), name
 
 
 @quick
@@ -69,36 +68,37 @@ def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     assert moment[inside] == pytest.approx(0, abs=1e-14)
 
 
-@every_method
 @quick
 @given(side=sides(), seed=st.integers(10, 10**6))
-def test_the_dual_hessian_is_symmetric_positive_semidefinite(method, side, seed):
+def test_the_dual_hessian_is_symmetric_positive_semidefinite(side, seed):
     points = side[0]
     root = np.random.default_rng(seed).standard_normal((points.size, points.size))
     compliance = root @ root.T / points.size + 0.1 * np.eye(points.size)
-    B, c, *_ = method(*side)
-    F = B @ compliance @ B.T.toarray()
+    for name, method in METHODS.items():
+        B, c, *_ = method(*side)
+        F = B @ compliance @ B.T.toarray()
 
-    scale = 1 + np.abs(F).max(initial=0.0)
-    assert pytest.approx(F.T, abs=1e-13 * scale) == F
-    if len(c):
-        assert np.linalg.eigvalsh(F).min() > -1e-12 * scale
+        scale = 1 + np.abs(F).max(initial=0.0)
+        assert (abs(F - F.T) <= 1e-13 * scale).all(), name
+        if len(c):
+            assert np.linalg.eigvalsh(F).min() > -1e-12 * scale, name
 
 
-@every_method
 @quick
 @given(side=sides(), seed=st.integers(10, 10**6))
-def test_numbering_of_the_nodes_does_not_matter(method, side, seed):
+def test_numbering_of_the_nodes_does_not_matter(side, seed):
     points, u, slave, master = side
     number = np.random.default_rng(seed).permutation(len(points))
     renamed, v = np.empty_like(points), np.empty_like(points)
     renamed[number], v[number] = points, u.reshape(-1, 2)
-    B, c, *_ = method(*side)
-    B_renamed, c_renamed, *_ = method(renamed, v.ravel(), number[slave], number[master])
-
     columns = (2 * number[:, None] + [0, 1]).ravel()
-    assert c_renamed == pytest.approx(c, rel=1e-12, abs=1e-13)
-    assert (B_renamed[:, columns] - B).toarray() == pytest.approx(0, abs=1e-14)
+    other = renamed, v.ravel(), number[slave], number[master]
+    for name, method in METHODS.items():
+        B, c, *_ = method(*side)
+        B_renamed, c_renamed, *_ = method(*other)
+
+        assert (abs(c_renamed - c) <= np.maximum(1e-12 * abs(c), 1e-13)).all(), name
+        assert (abs(B_renamed.toarray()[:, columns] - B.toarray()) <= 1e-14).all(), name
 
 
 @pytest.mark.parametrize("normals", ["segment", "averaged"])

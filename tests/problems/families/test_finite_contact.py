@@ -21,6 +21,8 @@ from solvers.adapters.piqp_ import PIQP
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
+pytestmark = pytest.mark.together
+
 RING = {"Nr": 2, "Nh": 2, "steps": 2, "contact_stiffness": "geometric"}
 CASES = {
     "beam-ring": (BeamRing(), RING),

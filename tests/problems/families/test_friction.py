@@ -21,6 +21,8 @@ from problems.models.patch import model
 from solvers.reference.solve import reference_solution
 from tests.support.incline import WEIGHT, block_on_incline, incline
 
+pytestmark = pytest.mark.together
+
 SMALL = "beam-ring/Nr=3/Nh=2/steps=1"
 
 

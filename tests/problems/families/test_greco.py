@@ -13,6 +13,8 @@ from problems.models.greco import PUBLISHED
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
+pytestmark = pytest.mark.together
+
 FAMILY = Greco()
 
 #: cells a side: u_x at 0, 1.25, 5, 7.5 and 11.25 mm, normal force at 38.75 mm

@@ -1,6 +1,7 @@
 """Pressures between cylinders against Hertz."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from solvers.adapters.clarabel_ import Clarabel
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
 
+pytestmark = pytest.mark.together
+
 PLANE, CYLINDER = HertzPlane(), HertzCylinder()
 SOLVERS = {"dual": SMALBE(), "primal": Clarabel()}
 TOL = 1e-11
@@ -23,6 +26,7 @@ BENCHMARK = LineContact(P=1e7, R=8e-3, E_star=200e9 / 0.91)
 PAIRINGS = [("mortar", "dual"), ("mortar", "standard"), ("nts", "dual")]
 
 
+@cache
 def solved(family, form="dual", **given):
     """The case and its verified solution."""
     case = family.build(form, {**family.defaults, **given}, reference_solution)
@@ -31,6 +35,7 @@ def solved(family, form="dual", **given):
     return case, s
 
 
+@cache
 def result(family, form="dual", **given):
     case, s = solved(family, form, **given)
     return case.quantities(s)
@@ -182,6 +187,7 @@ def test_values_out_of_range_are_refused(family, bad, told):
 COULOMB = dict(n=20, m=20, friction="coulomb", mu=0.3)
 
 
+@cache
 def sheared_result(form="dual", **given):
     case = CYLINDER.build(
         form, CYLINDER.complete({**COULOMB, **given}), reference_solution
@@ -194,9 +200,9 @@ def sheared_result(form="dual", **given):
 @pytest.mark.parametrize(
     ("Q", "contact"),
     [
-        (0.25, "mortar"),
         (0.5, "nts"),
         (0.9, "mortar"),
+        pytest.param(0.25, "mortar", marks=pytest.mark.slow),
         pytest.param(0.75, "mortar", marks=pytest.mark.slow),
     ],
 )

@@ -14,6 +14,8 @@ from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support.press import described
 
+pytestmark = pytest.mark.together
+
 TOL = 1e-8
 GLUES = ("orthonormal", "chain", "redundant")
 COULOMB = "friction=coulomb/mu=0.3"

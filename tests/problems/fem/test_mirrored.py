@@ -1,7 +1,10 @@
 """The generator on the same bodies, seen in a mirror or measured in other units."""
 
+from functools import cache
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.sparse import diags_array
 
 from problems.contact.bodies import ContactPair, assemble, clamped, floating
@@ -12,6 +15,8 @@ from problems.duality.stepping import LoadPath
 from problems.models.beam_ring import model
 from solvers.reference.solve import reference_solution
 from solvers.smalbe.solver import SMALBE
+
+pytestmark = pytest.mark.together
 
 METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
 STEPS = 3
@@ -29,6 +34,7 @@ def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
     )  # fmt: skip
 
 
+@cache
 def mirrored(bodies, about):
     """Reflect about the line x = `about`, m.
 
@@ -48,6 +54,7 @@ def sign(bodies):
     return np.tile([-1.0, 1.0], len(bodies.mesh.points))
 
 
+@cache
 def path_of(bodies, contact, basis, relin=1):
     return LoadPath(
         bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
@@ -55,8 +62,10 @@ def path_of(bodies, contact, basis, relin=1):
     )  # fmt: skip
 
 
-def results(bodies, primal, form):
-    """Solve the emitted QP in `form`: u in m, and what it means in SI."""
+@cache
+def results(bodies, contact, basis, form):
+    """Solve the QP of the last step in `form`: u in m, and what it means in SI."""
+    primal = path_of(bodies, contact, basis).primal(STEPS)
     case = contact_case(
         bodies, primal, form, floating=lambda: floating(bodies),
         clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
@@ -74,7 +83,7 @@ def results(bodies, primal, form):
     return case.recover(s), found
 
 
-@pytest.fixture(params=["strain", "stress"])
+@pytest.fixture(scope="module", params=["strain", "stress"])
 def bodies(request):
     return model(4, 3, 4, request.param)
 
@@ -120,20 +129,17 @@ def test_the_mirrored_path_is_the_mirror_of_the_path(bodies, contact, basis, rel
 
     for k in range(1, STEPS + 1):
         u, v = here.solution(k), other.solution(k)
-        assert v == pytest.approx(sign(bodies) * u, abs=1e-10 * abs(u).max())
+        assert_allclose(v, sign(bodies) * u, rtol=0, atol=1e-10 * abs(u).max())
 
 
 @every_method
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, form):
-    there = mirrored(bodies, 1.0)
-    primals = [path_of(b, contact, basis).primal(STEPS) for b in (bodies, there)]
     (u, here), (v, other) = (
-        results(b, primal, form)
-        for b, primal in zip((bodies, there), primals, strict=True)
+        results(b, contact, basis, form) for b in (bodies, mirrored(bodies, 1.0))
     )
 
-    assert v == pytest.approx(sign(bodies) * u, abs=1e-8 * abs(u).max())
+    assert_allclose(v, sign(bodies) * u, rtol=0, atol=1e-8 * abs(u).max())
     assert other == pytest.approx(here, rel=1e-8)
     assert here["energy"] == pytest.approx(here["objective"], rel=1e-9)
     assert here["up"] > bodies.force  # the ring holds the beam
@@ -143,19 +149,20 @@ def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, for
 UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
 
 
+@cache
+def measured(units=None):
+    """The same bodies, with other units in their QPs if asked for."""
+    return again(measured(), units=units) if units else model(4, 3, 4, "strain")
+
+
 @every_method
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 @pytest.mark.parametrize("units", UNITS, ids=str)
 def test_units_of_the_qp_change_no_physical_result(contact, basis, form, units):
-    bodies = model(4, 3, 4, "strain")
-    other = again(bodies, units=units)
-    primals = [path_of(b, contact, basis).primal(STEPS) for b in (bodies, other)]
-    (u, here), (v, there) = (
-        results(b, primal, form)
-        for b, primal in zip((bodies, other), primals, strict=True)
-    )
+    bodies, other = measured(), measured(units)
+    (u, here), (v, there) = (results(b, contact, basis, form) for b in (bodies, other))
 
     factor = (bodies.force / bodies.length) / (units[1] / units[0])
     assert abs(other.K - factor * bodies.K).max() <= 1e-14 * abs(other.K).max()
-    assert v == pytest.approx(u, abs=1e-9 * abs(u).max())
+    assert_allclose(v, u, rtol=0, atol=1e-9 * abs(u).max())
     assert there == pytest.approx(here, rel=1e-8)

@@ -58,15 +58,6 @@ def described(tmp_path_factory):
     }
 
 
-def test_ranks_assemble_their_parts_of_a_mesh_that_all_read(described):
-    for case in emitted(2, [described["first"], described["friction"]]).values():
-        assert case["sizes"][0] == case["sizes"][1]
-        assert case["entries"][0] == case["entries"][1]
-        assert max(*case["errors"].values(), *case["bounds"]) < ROUNDING
-        assert set(case["owners"]) == {1}
-        assert case["torn"] == 0
-
-
 @pytest.mark.parametrize("what", ["coulomb", "whole"])
 def test_of_a_description_one_process_emits_what_needs_more(described, what):
     case = parse(described[what], PROBLEMS)
@@ -78,9 +69,20 @@ def test_of_a_description_one_process_emits_what_needs_more(described, what):
     scope="module",
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
-def found(request):
+def found(request, described):
     """What the shares of several ranks are together."""
-    return emitted(request.param, CASES)
+    bodies = described["first"], described["friction"]
+    return emitted(request.param, [*CASES, *bodies])
+
+
+@pytest.mark.parametrize("what", ["first", "friction"])
+def test_ranks_assemble_their_parts_of_a_mesh_that_all_read(found, described, what):
+    of = found[described[what]]
+    assert of["sizes"][0] == of["sizes"][1]
+    assert of["entries"][0] == of["entries"][1]
+    assert max(*of["errors"].values(), *of["bounds"]) < ROUNDING
+    assert set(of["owners"]) == {1}
+    assert of["torn"] == 0
 
 
 @pytest.mark.parametrize("case", CASES)

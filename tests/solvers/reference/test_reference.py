@@ -183,8 +183,8 @@ CASES = [
     ("contact-patch", dict(contact="nts"), ("dual", "primal"), 1e-14),
     ("contact-patch", dict(ratio=1e-3), ("dual", "primal"), 1e-11),
     ("hertz-plane", dict(n=5), ("dual", "primal"), 1e-12),
-    ("hertz-cylinder", dict(n=3, m=3, contact="nts"), ("dual", "primal"), 1e-12),
-    ("hertz-cylinder", dict(n=3, m=3), ("dual", "primal"), 1e-12),
+    ("hertz-cylinder", dict(n=2, m=2, contact="nts"), ("dual", "primal"), 1e-12),
+    ("hertz-cylinder", dict(n=2, m=2), ("dual", "primal"), 1e-12),
     ("obstacle", dict(dim=1, n=200), ("dual-bounds", "primal"), 1e-13),
     ("obstacle", dict(dim=2, n=20), ("dual-bounds", "primal"), 1e-13),
 ]
@@ -238,17 +238,16 @@ def test_energies_known_by_hand_are_reached(name, given, form, energy):
 
 
 @pytest.mark.parametrize(
-    ("steps", "tip", "force"),
-    [
-        pytest.param(1, -0.303750, 0.0, marks=pytest.mark.slow),
-        (10, -0.297282, -2.840e7),
-    ],
+    "form", ["dual-bounds", pytest.param("primal", marks=pytest.mark.slow)]
 )
-def test_the_beam_sinks_by_what_a_prototype_found(steps, tip, force):
+@pytest.mark.parametrize(
+    ("steps", "tip", "force"), [(1, -0.303750, 0.0), (10, -0.297282, -2.840e7)]
+)
+def test_the_beam_sinks_by_what_a_prototype_found(form, steps, tip, force):
     """Nr = 20, Nh = 10; the load in one or ten linearisations; 11 844 displacements."""
     family = PROBLEMS["beam-ring"]
     given = completed(family, dict(Nr=20, Nh=10, steps=steps))
-    case = family.build("primal", given, reference_solution)
+    case = family.build(form, given, reference_solution)
     s = reference_solution(case.qp)
     got = case.quantities(s)
 

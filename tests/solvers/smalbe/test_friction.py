@@ -15,6 +15,8 @@ from solvers.reference.solve import reference_solution
 from solvers.smalbe import driver
 from solvers.smalbe.driver import outer_loop
 
+pytestmark = pytest.mark.together
+
 TOL = 1e-8
 PRESETS = ("smalbe-permon", "smalbe-espreso")
 COULOMB = "friction=coulomb/mu=0.3"
