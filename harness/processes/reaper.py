@@ -61,8 +61,9 @@ def marked(mark: str) -> list[int]:
         with suppress(OSError):  # ended meanwhile, or somebody else's
             if name.isdigit():
                 with open(f"/proc/{name}/environ", "rb") as file:
-                    if wanted in file.read().split(b"\0") and lives(int(name)):
-                        found.append(int(name))
+                    data = file.read()
+                if wanted in data and wanted in data.split(b"\0") and lives(int(name)):
+                    found.append(int(name))
     return found
 
 

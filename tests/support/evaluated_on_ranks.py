@@ -5,6 +5,7 @@ Run as ``mpiexec -n N python -m mpi4py evaluated_on_ranks.py CASE…``.
 
 import json
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ WRONG = ((1e-4, 1.0), (1e-6, 1.0), (1e-6, 1.01))
 
 
 def evaluated(name, ranks):
-    """Evaluate answers by all ranks, and what they are together by one process."""
+    """Evaluate answers by all ranks; on the first, return the answers, too."""
     case_id = parse(name, PROBLEMS)
     emit = case_id.family.emission(case_id.form, case_id.params)
     emitted = emit(ranks, reference_over_ranks)
@@ -40,10 +41,18 @@ def evaluated(name, ranks):
         by_ranks = evaluated_by_ranks(emitted, s, ranks)
         bounds = by_ranks["bounds"] or {}
         same = ranks.comm.allgather(bounds.get("energy_bound"))
-        whole = share.whole(s)
-        if whole is None:
-            continue
-        case = case_id.build(reference_solution)
+        told = {
+            "by_ranks": by_ranks, "same": len(set(same)) == 1,
+            "digests": [digest, alone], "sizes": emitted.sizes,
+        }  # fmt: skip
+        found.append((told, share.whole(s)))
+    return found
+
+
+def beside_one_process(name, found):
+    """Say of answers what one process that has built the case finds."""
+    case = parse(name, PROBLEMS).build(reference_solution)
+    for told, whole in found:
         one = {"objective": case.qp.objective(whole.x)}
         one |= kkt_residuals(case.qp, whole)._asdict()
         try:
@@ -51,22 +60,22 @@ def evaluated(name, ranks):
             bound, parts = certificate.bound, certificate.parts
         except UncertifiableError:
             bound, parts = np.nan, {}
-        found.append({
-            "by_ranks": by_ranks, "same": len(set(same)) == 1,
-            "by_one": {
-                "values": one, "bound": bound, "parts": parts,
-                "quantities": plain(case.quantities(whole)),
-            },
-            "digests": [digest, alone], "sizes": [emitted.sizes, case.qp.sizes],
-        })  # fmt: skip
-    return found
+        by_one = {
+            "values": one, "bound": bound, "parts": parts,
+            "quantities": plain(case.quantities(whole)),
+        }  # fmt: skip
+        yield told | {"by_one": by_one, "sizes": [told["sizes"], case.qp.sizes]}
 
 
 def main():
     ranks = Ranks(MPI.COMM_WORLD)
     found = {name: evaluated(name, ranks) for name in sys.argv[1:]}
     if ranks.rank == 0:
-        print(json.dumps(found, default=float))
+        compared = {name: [*beside_one_process(name, f)] for name, f in found.items()}
+        print(json.dumps(compared, default=float))
+    done = ranks.comm.Ibarrier()
+    while not done.Test():  # others wait asleep, which MPI itself does not
+        time.sleep(0.01)
 
 
 if __name__ == "__main__":

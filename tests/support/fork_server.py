@@ -23,10 +23,13 @@ import subprocess
 import sys
 import time
 import traceback
+from contextlib import suppress
 from ctypes import CDLL, memmove, memset
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from threading import Lock
+from types import ModuleType
 
 from harness.limits import ONE_THREAD
 from harness.processes import reaper
@@ -44,6 +47,12 @@ OURS = (
     *PLUGINS, "solvers.smalbe.solver", "problems.fem.kernels", "sksparse.cholmod",
 )  # fmt: skip
 
+#: what is loaded for ``python -P -m dask``, the processes of a cluster
+CLUSTER = (
+    *PLUGINS, "dask.__main__", "distributed.cli.dask_scheduler",
+    "distributed.cli.dask_worker", "harness.running.dask_worker",
+)  # fmt: skip
+
 #: has a program of its own, such as a notebook's kernel, start its workers as forks
 INSTALL = (
     f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
@@ -58,9 +67,9 @@ class Forks:
     PIPE = subprocess.PIPE
     TimeoutExpired = subprocess.TimeoutExpired
 
-    def __init__(self):
+    def __init__(self, servers=()):
         self._env = os.environ | ONE_THREAD | {"ROOM": ROOM}
-        self._servers = {}
+        self._servers = dict(servers)
         self._lock = Lock()
 
     def Popen(self, args, **how):
@@ -69,10 +78,25 @@ class Forks:
         if args[:4] != own or args[7:9] != [sys.executable, "-P"] or args[9] == "-c":
             return subprocess.Popen(args, **how)
         modules = OURS if args[9] == "-m" else PLUGINS
+        return Forked(self._server(modules), args[4:], **how)
+
+    def dask(self, arguments, env, serves):
+        """Start ``python -m dask``; silent, and with input from nowhere.
+
+        serves : whether workers that it starts are forks, too
+        """
+        request = {
+            "program": [sys.executable, "-P", "-m", "dask", *arguments],
+            "serves": serves, "env": dict(env),
+        }  # fmt: skip
+        with open(os.devnull, "r+b") as null:
+            return Program(self._server(CLUSTER).start(request, 3 * [null.fileno()]))
+
+    def _server(self, modules):
         with self._lock:
             if modules not in self._servers:
-                self._servers[modules] = Server(modules, self._env)
-            return Forked(self._servers[modules], args[4:], **how)
+                self._servers[modules] = Server.of_its_own(modules, self._env)
+            return self._servers[modules]
 
     def close(self):
         for server in self._servers.values():
@@ -80,27 +104,39 @@ class Forks:
 
 
 class Server:
-    """The parent's side of an interpreter that has loaded some modules."""
+    """The parent's side of a process that has loaded some modules."""
 
-    def __init__(self, modules, env):
-        self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    def __init__(self, ours, process):
+        self._ours = ours
+        self._process = process
+
+    @classmethod
+    def of_its_own(cls, modules, env):
+        """Start an interpreter that loads these modules."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             fd = theirs.fileno()
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", __file__, str(fd), ROOM, *modules],
-                pass_fds=[fd],
-                env=env,
-            )
+            command = [sys.executable, "-P", __file__, str(fd), ROOM, *modules]
+            return cls(ours, subprocess.Popen(command, pass_fds=[fd], env=env))
+
+    @classmethod
+    def as_fork(cls):
+        """Fork this process, which has loaded what is needed, and one thread."""
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        if (process := os.fork()) == 0:
+            ours.close()
+            serve(theirs)
+            os._exit(0)
+        theirs.close()
+        return cls(ours, Program(process))
 
     def close(self):
         self._ours.close()
         self._process.wait()
 
-    def start(self, arguments, env, fds):
-        """Have a sub-reaper forked, and be its parent; returns its number."""
-        request = {
-            "arguments": arguments,
-            "env": env,
+    def start(self, request, fds):
+        """Have a process forked, and be its parent; returns its number."""
+        request |= {
             "cwd": os.getcwd(),
             "cpus": sorted(os.sched_getaffinity(0)),
             "limits": [resource.getrlimit(limit) for limit in LIMITS],
@@ -113,8 +149,35 @@ class Server:
             adopt(False)
 
 
-class Forked:
-    """What the supervisor uses of a `subprocess.Popen`."""
+class Program:
+    """What is used of a `subprocess.Popen`."""
+
+    def __init__(self, pid):
+        self.pid = pid
+        self.returncode = None
+
+    def poll(self):
+        if self.returncode is None:
+            ended, status = os.waitpid(self.pid, os.WNOHANG)
+            if ended:
+                self.returncode = os.waitstatus_to_exitcode(status)
+        return self.returncode
+
+    def wait(self, timeout=float("inf")):
+        deadline = time.monotonic() + timeout
+        while self.poll() is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("a fork", timeout)
+            time.sleep(0.001)
+        return self.returncode
+
+    def kill(self):
+        if self.returncode is None:
+            os.kill(self.pid, 9)
+
+
+class Forked(Program):
+    """A worker below its sub-reaper, as the supervisor starts it."""
 
     def __init__(self, server, arguments, *, env, stdin, stdout, stderr, **how):
         assert stdin == subprocess.PIPE
@@ -124,20 +187,11 @@ class Forked:
         theirs, ours = os.pipe()
         try:
             fds = [theirs, stdout.fileno(), stderr.fileno(), *how["pass_fds"]]
-            self.pid = server.start(arguments, dict(env), fds)
+            request = {"arguments": arguments, "env": dict(env)}
+            super().__init__(server.start(request, fds))
         finally:
             os.close(theirs)
         self.stdin = open(ours, "wb")  # noqa: SIM115
-
-    def wait(self, timeout=float("inf")):
-        deadline = time.monotonic() + timeout
-        while os.waitpid(self.pid, os.WNOHANG) == (0, 0):
-            if time.monotonic() > deadline:
-                raise subprocess.TimeoutExpired("a fork", timeout)
-            time.sleep(0.001)
-
-    def kill(self):
-        os.kill(self.pid, 9)
 
 
 def adopt(orphans):
@@ -151,6 +205,11 @@ def serve(asked):
         message, fds, _, _ = socket.recv_fds(asked, LONGEST, 5)
         if not message:
             return
+        request = json.loads(message)
+        _, *program = request.get("program") or request["arguments"][3:]
+        if program[1] != "-m":
+            with suppress(OSError, SyntaxError, ValueError):  # which it will tell
+                code_of(program[1])
         told, tells = os.pipe()
         if (between := os.fork()) == 0:
             if child := os.fork():
@@ -158,7 +217,7 @@ def serve(asked):
                 os._exit(0)
             for fd in (told, tells, asked.detach()):
                 os.close(fd)
-            become(json.loads(message), fds)
+            become(request, fds)
         os.waitpid(between, 0)  # from here on the child is an orphan
         asked.send(os.read(told, 20))
         for fd in (told, tells, *fds):
@@ -166,7 +225,7 @@ def serve(asked):
 
 
 def become(request, fds):
-    """Be the sub-reaper that was asked for; below it, the program."""
+    """Be the program that was asked for, or the sub-reaper above it."""
     os.setsid()
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -178,6 +237,12 @@ def become(request, fds):
     for fd, at in zip(fds[:3], (0, 1, 2), strict=True):
         os.dup2(fd, at)
         os.close(fd)
+    if "program" in request:
+        sys.modules["dask"].config.refresh()  # by this environment
+        if request["serves"]:
+            supervisor = sys.modules["harness.processes.supervisor"]
+            supervisor.subprocess = Forks({PLUGINS: Server.as_fork()})
+        run(None, request["program"])
     cpu, _, _, *command = request["arguments"]
     arguments = [cpu, *map(str, fds[3:]), *command]
     show(ARGUMENTS, [sys.executable, "-I", "-S", reaper.__file__, *arguments])
@@ -204,7 +269,7 @@ def run(_, command):
             sys.argv = sys.argv[1:]
             runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
         else:
-            runpy.run_path(sys.argv[0], run_name="__main__")
+            run_file(sys.argv[0])
     except OSError:  # would be taken for one of execvp
         traceback.print_exc()
         sys.exit(1)
@@ -212,6 +277,25 @@ def run(_, command):
         if end.code:
             raise
     end_well()
+
+
+def run_file(path):
+    """Be the program in a file, as `runpy.run_path` makes it, compiled once."""
+    main = ModuleType("__main__")
+    main.__file__, main.__cached__ = path, None
+    sys.modules["__main__"] = main
+    exec(code_of(path), vars(main))
+
+
+def code_of(path):
+    """Compile a file, unless that is as it was when it was last compiled."""
+    status = os.stat(path)
+    return compiled(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
+@cache
+def compiled(path, *_):
+    return compile(Path(path).read_bytes(), path, "exec")
 
 
 def end_well():

@@ -24,7 +24,6 @@ from harness.results.journal import read_journal
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
-from tests.support.fork_server import INSTALL
 from tests.support.waiting import soon
 
 if find_spec("distributed") is None:
@@ -44,27 +43,24 @@ forms = ["dual"]
 """
 
 
-def started(*arguments, env):
-    command = [sys.executable, "-m", "dask", *arguments]
-    return subprocess.Popen(
-        command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-
-
 class Cluster:
     """A scheduler, and workers that can be killed."""
 
-    def __init__(self, folder, *options):
+    def __init__(self, folder, forks, *options):
         self.folder = folder
+        self._forks = forks
         self.starts = folder / "starts"
         self.starts.touch()
         locks = folder / "locks"  # of CPUs: another cluster of tests has its own
         locks.mkdir(exist_ok=True)
-        self._env = os.environ | {"STARTS": str(self.starts), "TMPDIR": str(locks)}
+        self._env = os.environ | {
+            "STARTS": str(self.starts), "TMPDIR": str(locks),
+            "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+        }  # fmt: skip
         self._file = folder / "scheduler.json"
-        self.scheduler = started(
+        self.scheduler = self._started(
             "scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
-            "--scheduler-file", str(self._file), *options, env=self._env,
+            "--scheduler-file", str(self._file), *options,
         )  # fmt: skip
         self.workers = []
         assert soon(lambda: self._file.exists() and self._file.read_text())
@@ -73,17 +69,17 @@ class Cluster:
     def address(self):
         return json.loads(self._file.read_text())["address"]
 
-    def join(self, nthreads=1, preload=INSTALL):
-        preloaded = self.folder / "preloaded.py"
-        preloaded.write_text(preload)
-        worker = started(
+    def join(self, nthreads=1, serves=True):
+        worker = self._started(
             "worker", "--scheduler-file", str(self._file), "--nthreads", str(nthreads),
             "--no-nanny", "--no-dashboard", "--memory-limit", "0",
-            "--local-directory", str(self.folder), "--preload", str(preloaded),
-            env=self._env,
+            "--local-directory", str(self.folder), serves=serves,
         )  # fmt: skip
         self.workers.append(worker)
         return worker
+
+    def _started(self, *arguments, serves=False):
+        return self._forks.dask(arguments, self._env, serves)
 
     def started_solvers(self):
         """The process of every start of a slow solve, in order."""
@@ -96,8 +92,8 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(tmp_path):
-    cluster = Cluster(tmp_path)
+def cluster(tmp_path, forks):
+    cluster = Cluster(tmp_path, forks)
     yield cluster
     cluster.close()
 
@@ -332,26 +328,27 @@ def descendants(process):
 
 
 def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
-    worker = cluster.join(preload="")
-    idle = []
+    worker = cluster.join()
+    assert soon(lambda: descendants(worker.pid))  # what forks, and outlives the run
+    before, idle = set(descendants(worker.pid)), []
 
     def look():
         assert soon(cluster.started_solvers)
-        idle.extend(descendants(worker.pid))
+        idle.extend(set(descendants(worker.pid)) - before)
 
     with meanwhile(look):
         run = ("run", "toy.toml", "--out", "d", "--case", "well/depth=2/dual")
         assert cli(*run, "--dask", cluster.address)[0] == 0
 
     assert len(idle) >= 2  # a solver and the generator
-    assert soon(lambda: not descendants(worker.pid))
+    assert soon(lambda: set(descendants(worker.pid)) == before)
 
 
 @pytest.mark.slow
 def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     cli, cluster, tmp_path
 ):
-    worker = cluster.join(preload="")
+    worker = cluster.join(serves=False)
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "

@@ -65,14 +65,14 @@ def in_environment(credentials):
 
 @pytest.mark.slow
 def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
-    tmp_path, monkeypatch
+    tmp_path, monkeypatch, forks
 ):
     import dask
 
     credentials = certificates(tmp_path)
     for name, value in in_environment(credentials).items():
         monkeypatch.setenv(name, value)
-    cluster = Cluster(tmp_path, "--protocol", "tls")
+    cluster = Cluster(tmp_path, forks, "--protocol", "tls")
     (tmp_path / "toy.toml").write_text(SUITE)
     nothing = {"reference": None}
     plugin = load_plugin(TOY_PROBLEM)

@@ -157,7 +157,10 @@ def test_the_same_cases_are_drawn_alike():
 # ---- ties
 
 
-@pytest.mark.parametrize(("cases", "solvers"), [(6, 3), (12, 20), (30, 8)])
+@pytest.mark.parametrize(
+    ("cases", "solvers"),
+    [(6, 3), pytest.param(12, 20, marks=pytest.mark.slow), (30, 8)],
+)
 @pytest.mark.parametrize("failing", [0.0, 0.1])
 def test_equal_solvers_are_told_apart_once_in_twenty_sets_at_most(
     cases, solvers, failing
