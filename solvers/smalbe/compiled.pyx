@@ -102,8 +102,7 @@ cdef extern from "vectors.h" nogil:
     void add_gram(const double *s, const double *V, const int *row, double *S,
                   Py_ssize_t k)
     int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
-    void solve(const double *R, const double *inverse, double *y, Py_ssize_t k,
-               Py_ssize_t stride)
+    void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
@@ -797,6 +796,7 @@ cdef class Solver:
         self.above = self.vectors.at + self.found * n
         memcpy(self.vectors.at, numbers(vectors), kept * n * sizeof(double))
         memcpy(self.vectors.at + kept * n, self.C, self.r * n * sizeof(double))
+        self.C = self.vectors.at + kept * n  # read once, not twice, from farther caches
         for i in range(self.found):
             self.above[i] = -self.tail
             if i < kept:
@@ -929,7 +929,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, self.inverse, dy, k, B.gram.stride)
+            solve(self.core, self.inverse, dy, B.gram.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -1006,7 +1006,7 @@ cdef class Solver:
         rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.inverse, self.c, M.k, M.gram.stride)
+        solve(self.core, self.inverse, self.c, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         add_combination(-1.0, M.U, self.c, z, M.k, n)

@@ -764,9 +764,9 @@ TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict 
     return count;
 }
 
-/* S = RᵀR (k, k) with rows of `stride` numbers, a multiple of four, zeros from k on: R
-   above the diagonal of S, zeros up to it in blocks of four, 1/Rᵢᵢ in `inverse` (k,); 0
-   where S is not positive definite. */
+/* S = RᵀR (k, k) in a square of `stride` numbers a side, a multiple of four, zeros from
+   column k on: R above the diagonal of S, 1/Rᵢᵢ in `inverse`, zeros for what is beyond k;
+   0 where S is not positive definite. */
 TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
@@ -775,8 +775,8 @@ TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t s
         if (!(r[i] > 0))
             return 0;
         inverse[i] = 1 / sqrt(r[i]);
-        for (Py_ssize_t j = first; j <= i; j++)
-            r[j] = 0;
+        for (Py_ssize_t j = first; j < i; j++)
+            r[j] = 0; /* means nothing, and would grow from face to face */
         for (Py_ssize_t j = first; j < stride; j += 4)
             *(four *) (r + j) *= EACH(inverse[i]);
         for (Py_ssize_t j = i + 1; j < k; j++) {
@@ -785,27 +785,45 @@ TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t s
                 *(four *) (S + j * stride + l) -= s * FOUR(r + l);
         }
     }
+    for (Py_ssize_t i = k; i < stride; i++) {
+        memset(S + i * stride, 0, stride * sizeof(double));
+        inverse[i] = 0;
+    }
     return 1;
 }
 
-/* y = S⁻¹y with its `cholesky`; y has `stride` components, of which those from k on are
-   not used. */
-TWICE static void solve(const double *R, const double *inverse, double *y, Py_ssize_t k,
+/* y = S⁻¹y with its `cholesky`, four components at once; y has `stride` of them, of which
+   those from k on become zero. */
+TWICE static void solve(const double *R, const double *inverse, double *y,
                         Py_ssize_t stride)
 {
-    for (Py_ssize_t i = 0; i < k; i++) {
-        const double *r = R + i * stride;
-        y[i] *= inverse[i];
-        four at = EACH(y[i]);
-        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < stride; j += 4)
-            *(four *) (y + j) -= at * FOUR(r + j);
+    for (Py_ssize_t i = 0; i < stride; i += 4) { /* Rᵀa = y */
+        const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
+        const double *r3 = r2 + stride, *d = inverse + i;
+        double a0 = y[i] * d[0];
+        double a1 = (y[i + 1] - r0[i + 1] * a0) * d[1];
+        double a2 = (y[i + 2] - r0[i + 2] * a0 - r1[i + 2] * a1) * d[2];
+        double a3 = (y[i + 3] - r0[i + 3] * a0 - r1[i + 3] * a1 - r2[i + 3] * a2) * d[3];
+        for (Py_ssize_t j = i + 4; j < stride; j += 4)
+            *(four *) (y + j) -= FOUR(r0 + j) * EACH(a0) + FOUR(r1 + j) * EACH(a1)
+                                 + FOUR(r2 + j) * EACH(a2) + FOUR(r3 + j) * EACH(a3);
+        *(four *) (y + i) = (four){a0, a1, a2, a3};
     }
-    for (Py_ssize_t i = k - 1; i >= 0; i--) {
-        const double *r = R + i * stride;
-        four sum = EACH(0);
-        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < stride; j += 4)
-            sum += FOUR(r + j) * FOUR(y + j);
-        y[i] = (y[i] - total(sum)) * inverse[i];
+    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* Ry = a */
+        const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
+        const double *r3 = r2 + stride, *d = inverse + i;
+        four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0;
+        for (Py_ssize_t j = i + 4; j < stride; j += 4) {
+            t0 += FOUR(r0 + j) * FOUR(y + j);
+            t1 += FOUR(r1 + j) * FOUR(y + j);
+            t2 += FOUR(r2 + j) * FOUR(y + j);
+            t3 += FOUR(r3 + j) * FOUR(y + j);
+        }
+        double a3 = (y[i + 3] - total(t3)) * d[3];
+        double a2 = (y[i + 2] - total(t2) - r2[i + 3] * a3) * d[2];
+        double a1 = (y[i + 1] - total(t1) - r1[i + 2] * a2 - r1[i + 3] * a3) * d[1];
+        double a0 = y[i] - total(t0) - r0[i + 1] * a1 - r0[i + 2] * a2 - r0[i + 3] * a3;
+        *(four *) (y + i) = (four){a0 * d[0], a1, a2, a3};
     }
 }
 
