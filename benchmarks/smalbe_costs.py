@@ -1,4 +1,4 @@
-"""What a solve of SMALBE costs beside its products: three tables of docs/performance.md.
+"""What a solve of SMALBE costs beside its products: tables of docs/performance.md.
 
     python -m benchmarks.smalbe_costs dense|sparse|kept
 
@@ -10,9 +10,8 @@
 * kept: the same solves with and without keeping directions of CG.
 
 All that is compared runs in turn in one process, in seconds of its own processor time
-(those of other processes are not in it). Each is given by the median of
-the runs, and by the median of their fastest tenth, which interruptions by others on the
-same processor change less.
+(those of other processes are not in it). Each is given by the median of the runs, and
+by the median of their fastest tenth, which others on the same processor change less.
 """
 
 from __future__ import annotations
@@ -25,7 +24,8 @@ from time import process_time
 import numpy as np
 from scipy.linalg.blas import dsymv
 
-from harness import QP
+from harness import QP, Solution
+from harness.plugin import Solver
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -74,47 +74,43 @@ def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
 
 
 def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
+    """Build a dual of the paper's beam."""
     family = PROBLEMS["beam-ring"]
     params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
     return family.build(form, params, reference_solution).qp
 
 
 def dense(tol: float = 1e-6) -> None:
-    solver = SOLVERS["smalbe"]
+    """Prepare and solve duals."""
     print("form m | products of the solve, of preparing | a product | prepare | solve")
     for form, sizes in DUALS.items():
         for size in sizes:
-            qp = beam_ring(form, *size)
-            n = qp.q.size
-            v, P, blas = np.ones(n), Product(qp.P, n), np.asarray(qp.P).T
-            ready = []
+            _dense(form, beam_ring(form, *size), tol)
 
-            def prepare(qp: QP = qp, ready: list = ready) -> None:
-                ready.append(solver.prepare(qp, tol))
 
-            def solve(ready: list = ready) -> None:
-                ready.pop()()
-
-            before = _products_of_preparing(qp, tol)
-            spent = solver.prepare(qp, tol)().counts["P_products"] - before
-            told = in_turn(
-                150 if n > 600 else 600,
-                ours=timed(lambda: P(v), REPEATS),
-                dsymv=timed(lambda: dsymv(1.0, blas, v, lower=1), REPEATS),
-                prepare=timed(prepare),
-                solve=timed(solve),
-            )
-            cells = []
-            for k in (0, 1):
-                product = min(told["ours"][k], told["dsymv"][k])
-                bound = 1.5 * spent * product + 100e-6
-                cells.append(
-                    f"{1e6 * product:.1f} µs, {1e6 * told['prepare'][k]:.0f} µs, "
-                    f"{1e6 * told['solve'][k]:.0f} µs, "
-                    f"solve/bound {told['solve'][k] / bound:.2f}, prepare/solve "
-                    f"{told['prepare'][k] / told['solve'][k]:.2f}"
-                )
-            print(f"{form} {n} | {spent}, {before} | {cells[0]} | fast: {cells[1]}")
+def _dense(form: str, qp: QP, tol: float) -> None:
+    solver, n = SOLVERS["smalbe"], qp.q.size
+    v, P, blas = np.ones(n), Product(qp.P, n), np.asarray(qp.P).T
+    ready: list[Callable[[], Solution]] = []
+    before = _products_of_preparing(qp, tol)
+    spent = solver.prepare(qp, tol)().counts["P_products"] - before
+    told = in_turn(
+        150 if n > 600 else 600,
+        ours=timed(lambda: P(v), REPEATS),
+        dsymv=timed(lambda: dsymv(1.0, blas, v, lower=1), REPEATS),
+        prepare=timed(lambda: ready.append(solver.prepare(qp, tol))),
+        solve=timed(lambda: ready.pop()()),
+    )
+    cells = []
+    for k in (0, 1):
+        product = min(told["ours"][k], told["dsymv"][k])
+        prepare, solve = told["prepare"][k], told["solve"][k]
+        cells.append(
+            f"{1e6 * product:.1f} µs, {1e6 * prepare:.0f} µs, {1e6 * solve:.0f} µs, "
+            f"solve/bound {solve / (1.5 * spent * product + 100e-6):.2f}, "
+            f"prepare/solve {prepare / solve:.2f}"
+        )
+    print(f"{form} {n} | {spent}, {before} | {cells[0]} | fast: {cells[1]}", flush=True)
 
 
 def _products_of_preparing(qp: QP, tol: float) -> int:
@@ -124,66 +120,77 @@ def _products_of_preparing(qp: QP, tol: float) -> int:
 
 
 def sparse(tol: float = 1e-6) -> None:
+    """Solve large sparse problems; a product with its step in units of a bare one."""
     solver = SOLVERS["smalbe"]
     for name, params in LARGE.items():
         family = PROBLEMS[name]
-        form = family.forms[0]
-        qp = family.build(form, family.complete(params), reference_solution).qp
-        n = qp.q.size
-        P, v, w = Product(qp.P, n), np.ones(n), np.ones(n)
+        form, given = family.forms[0], family.complete(params)
+        _sparse(name, family.build(form, given, reference_solution).qp, solver, tol)
 
-        def passes(v: np.ndarray = v, w: np.ndarray = w) -> None:
-            for _ in range(5):
-                np.add(v, w, out=w)
 
-        spent = solver.prepare(qp, tol)().counts["P_products"]
-        told = in_turn(
-            15 if n > 20_000 else 60,
-            product=timed(lambda: P(v), 5 * REPEATS),
-            passes=timed(passes, 5 * REPEATS),
-            scipy=timed(lambda: qp.P @ v, REPEATS),
-            whole=timed(lambda: solver.prepare(qp, tol)()),
+def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
+    n = qp.q.size
+    P, v, w = Product(qp.P, n), np.ones(n), np.ones(n)
+
+    def passes() -> None:
+        for _ in range(5):
+            np.add(v, w, out=w)
+
+    spent = solver.prepare(qp, tol)().counts["P_products"]
+    told = in_turn(
+        15 if n > 20_000 else 60,
+        cold_product=timed(lambda: P(v)),
+        cold_passes=timed(passes),
+        product=timed(lambda: P(v), 5 * REPEATS),
+        passes=timed(passes, 5 * REPEATS),
+        scipy=timed(lambda: qp.P @ v, REPEATS),
+        whole=timed(lambda: solver.prepare(qp, tol)()),
+    )
+    for k, which in enumerate(("medians", "fastest tenth")):
+        us = {name: 1e6 * seconds[k] for name, seconds in told.items()}
+        step = us["whole"] / spent
+        unit = us["product"] + us["passes"]
+        cold = us["cold_product"] + us["cold_passes"]
+        print(
+            f"{name} n={n}, {which}: {spent} products, {us['whole'] / 1e3:.1f} ms, "
+            f"{step:.1f} µs each; product {us['product']:.1f} µs, SciPy's "
+            f"{us['scipy']:.1f} µs, five passes {us['passes']:.1f} µs; ratio "
+            f"{step / unit:.2f}; with caches as a solve leaves them "
+            f"{us['cold_product']:.1f} µs, {us['cold_passes']:.1f} µs, "
+            f"{step / cold:.2f}",
+            flush=True,
         )
-        for k, which in enumerate(("medians", "fastest tenth")):
-            step = told["whole"][k] / spent
-            unit = told["product"][k] + told["passes"][k]
-            print(
-                f"{name} n={n}, {which}: {spent} products, {told['whole'][k]:.4f} s, "
-                f"{1e6 * step:.1f} µs each; product {1e6 * told['product'][k]:.1f} µs, "
-                f"SciPy's {1e6 * told['scipy'][k]:.1f} µs, five passes "
-                f"{1e6 * told['passes'][k]:.1f} µs; ratio {step / unit:.2f}"
-            )
 
 
 def kept() -> None:
+    """Solve duals with and without keeping directions."""
     for form, *size in KEPT:
-        qp = beam_ring(form, *size)
         for tol in (1e-6, 1e-8):
-            solvers = {
-                name: replace(SOLVERS["smalbe"], recycle=name == "kept")
-                for name in ("kept", "forgotten")
-            }
-            ready = {name: [] for name in solvers}
+            _kept(form, beam_ring(form, *size), tol)
 
-            def solve(name: str, qp: QP = qp, tol: float = tol) -> float:
-                run = solvers[name].prepare(qp, tol)
-                return timed(run)()
 
-            products = {
-                name: s.prepare(qp, tol)().counts["P_products"]
-                for name, s in solvers.items()
-            }
-            told = in_turn(
-                60 if qp.q.size > 600 else 400,
-                kept=lambda: solve("kept"),
-                forgotten=lambda: solve("forgotten"),
-            )
-            for k, which in enumerate(("medians", "fastest tenth")):
-                print(
-                    f"{form} m={qp.q.size} {tol:.0e} {which}: kept "
-                    f"{1e3 * told['kept'][k]:.3f} ms ({products['kept']}), forgotten "
-                    f"{1e3 * told['forgotten'][k]:.3f} ms ({products['forgotten']})"
-                )
+def _kept(form: str, qp: QP, tol: float) -> None:
+    solvers = {
+        "kept": SOLVERS["smalbe"],
+        "forgotten": replace(SOLVERS["smalbe"], recycle=False),
+    }
+    products = {
+        name: s.prepare(qp, tol)().counts["P_products"] for name, s in solvers.items()
+    }
+    told = in_turn(
+        60 if qp.q.size > 600 else 400,
+        **{
+            name: lambda s=s: timed(s.prepare(qp, tol))() for name, s in solvers.items()
+        },
+    )
+    for k, which in enumerate(("medians", "fastest tenth")):
+        ms = {name: 1e3 * seconds[k] for name, seconds in told.items()}
+        print(
+            f"{form} m={qp.q.size} {tol:.0e} {which}: kept {ms['kept']:.3f} ms "
+            f"({products['kept']}), forgotten {ms['forgotten']:.3f} ms "
+            f"({products['forgotten']})",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
