@@ -14,9 +14,9 @@ counts, and the same points up to rounding.
 P is dense (then one triangle is read), sparse, or an operator, which is asked by Python.
 A sparse P whose entries lie on few diagonals, as differences and finite elements on a
 grid have them, is multiplied with by these: neighbouring rows at once, and half the
-entries, for P is symmetric. A CG step goes through memory three times: product and
-lengths, the step and the new gradient, the next direction. Its loops over vectors are in
-`vectors.h`.
+entries, for P is symmetric. A CG step goes through memory twice then: the direction, its
+product and the lengths; the step and the new gradient, whose free part is not stored. Its
+loops over vectors are in `vectors.h`.
 """
 
 from cpython.buffer cimport (
@@ -47,38 +47,62 @@ cdef extern from "vectors.h" nogil:
                               signed char *slot)
     void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
     void sparse_product(const sparse *F, double s, const double *v, double *y)
-    double sparse_curvature(const sparse *F, double s, const double *p, double *Hp)
     void sparse_lengths(const sparse *F, double s, const double *x, const double *g,
-                        const double *p, double *Hp, const double *lower,
+                        double *p, double *Hp, const double *lower,
                         const double *upper, double *told)
+    void sparse_turn(const sparse *F, double s, double gamma, const double *x,
+                     const double *g, double *p, double *Hp, const double *lower,
+                     const double *upper, double *told)
+    double turn_freely(const double *g, const double *free, double gamma, double *p,
+                       Py_ssize_t n)
+    void sparse_turn_freely(const sparse *F, double s, const double *g,
+                            const double *free, double gamma, double *p, double *Hp,
+                            double *told)
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
+    void copy_scaled(double s, const double *a, double *b, Py_ssize_t n)
+    void scale_free(double s, const double *free, double *z, Py_ssize_t n)
+    bint same(const double *a, const double *b, Py_ssize_t n)
     void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
                     Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
-    void lengths(const double *x, const double *g, const double *p, double *Hp,
+    void lengths(const double *x, const double *g, double *p, double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
-    void move(double alpha, double *x, double *g, const double *p, const double *Hp,
-              const double *lower, const double *upper, Py_ssize_t n)
+    void leave(double alpha, double beta, bint release, double *x, double *g,
+               const double *p, const double *Hp, const double *lower,
+               const double *upper, double *x0, double *g0, double *free,
+               double *box_lower, double *box_upper, double *z, double *z_g,
+               Py_ssize_t n)
     void split(const double *x, const double *g, const double *lower,
                const double *upper, double tau, double *phi, double *free,
                Py_ssize_t n, double *told)
     void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, double tau, double *phi,
                  double *free, Py_ssize_t n, double *told)
-    void within(const double *x, const double *origin, const double *lower,
-                const double *upper, double *s, Py_ssize_t n)
+    double within(const double *x, const double *origin, const double *g,
+                  const double *lower, const double *upper, bint release, double *s,
+                  Py_ssize_t n)
+    double tilted_within(const double *x, const double *x_g, double tau,
+                         const double *origin, const double *g, const double *lower,
+                         const double *upper, double *s, Py_ssize_t n)
+    void rest_of_step(const double *x, const double *g, const double *s,
+                      const double *Hs, const double *z_g, double *z, Py_ssize_t n,
+                      double *told)
+    void projected(const double *x, const double *g, double tau, const double *lower,
+                   const double *upper, double *y, Py_ssize_t n)
+    bint turn_round(double *s, Py_ssize_t n)
     double turn(const double *z, double gamma, double *p, Py_ssize_t n)
     void advance_freely(double alpha, double *x, double *g, const double *p,
-                        const double *Hp, const double *free, double *phi, Py_ssize_t n,
+                        const double *Hp, const double *free, Py_ssize_t n,
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
-    void add_gram(const double *s, const double *V, double *S, Py_ssize_t k)
-    int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
-    void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
+    void add_gram(const double *s, const double *V, const int *row, double *S,
+                  Py_ssize_t k)
+    int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
+    void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
@@ -326,10 +350,12 @@ cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
 def lanczos(Product F, C, start, int steps):
     """Find upper Ritz pairs of PFP from start (n,): the fields of `Ritz`.
 
+    Without vectors where the first pair is not found: then no model holds any.
+
     C : (r, n)
     """
     cdef Py_ssize_t i, k, n = F.n, r = len(C)
-    cdef int kept = 0, info = 0, again
+    cdef int kept = 0, info = 0
     steps = min(steps, n - r)  # in the range of P
     cdef Room room = Room((steps + 2) * n + r + (steps + 5) * steps)
     cdef const double *rows = numbers(C)
@@ -350,16 +376,17 @@ def lanczos(Product F, C, start, int steps):
     without(rows, r, v, Cv, n)
     beta = sqrt(dot(v, v, n))
     for k in range(steps if beta else 0):
-        memcpy(basis + k * n, v, n * sizeof(double))
-        scale(1 / beta, basis + k * n, n)
+        copy_scaled(1 / beta, v, basis + k * n, n)
         memcpy(Fv, basis + k * n, n * sizeof(double))
         without(rows, r, Fv, Cv, n)
         F.apply(Fv, v)
         without(rows, r, v, Cv, n)
         diagonal[k] = dot(basis + k * n, v, n)
         largest = fmax(largest, fabs(diagonal[k]))
-        for again in range(2):
-            without(basis, k + 1, v, share, n)
+        add(-diagonal[k], basis + k * n, v, n)
+        if k:
+            add(-beta, basis + (k - 1) * n, v, n)
+        without(basis, k + 1, v, share, n)
         beta = sqrt(dot(v, v, n))
         off[k] = beta
         kept = k + 1
@@ -372,12 +399,16 @@ def lanczos(Product F, C, start, int steps):
     at_start = diagonal[0]
     beta = off[kept - 1]
     dstev(b"V", &kept, diagonal, off, S, &kept, space, &info)
-    values, residuals, vectors = np.empty(kept), np.empty(kept), np.zeros((kept, n))
-    value, residual, vector = numbers(values), numbers(residuals), numbers(vectors)
+    values, residuals = np.empty(kept), np.empty(kept)
+    value, residual = numbers(values), numbers(residuals)
     for i in range(kept):  # in descending order
         k = kept - 1 - i
         value[i] = diagonal[k]
         residual[i] = beta * fabs(S[k * kept + kept - 1])
+    vectors = np.zeros((kept if residual[0] <= FOUND * value[0] else 0, n))
+    vector = numbers(vectors)
+    for i in range(len(vectors)):
+        k = kept - 1 - i
         add_combination(1.0, basis, S + k * kept, vector + i * n, kept, n)
     return values, residuals, vectors, at_start
 
@@ -443,23 +474,25 @@ cdef class Gram:
     """
 
     cdef Py_ssize_t n, k, stride, flips
-    cdef const double *U
-    cdef Room holder, room  # of U, and of all others
-    cdef int *where
+    cdef Room room
+    cdef int *where  # (n + 3,)
     cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *columns  # (4, stride)
+    cdef double *columns  # Uᵀ (n, stride)
     cdef double *held
 
     @staticmethod
     cdef Gram of(Model B):
         cdef Gram made = Gram.__new__(Gram)
-        made.U, made.holder, made.k, made.n = B.U, B.holder, B.k, B.n
-        made.stride, made.flips = (B.k + 3) & ~3, B.n + 1
-        made.room = Room(made.stride * (made.stride + 4) + 2 * B.n)
+        cdef Py_ssize_t i, j, stride = (B.k + 3) & ~3
+        made.k, made.n, made.stride, made.flips = B.k, B.n, stride, B.n + 1
+        made.room = Room(stride * (stride + B.n) + 2 * B.n + 2)
         made.values = made.room.at
-        made.columns = made.values + made.stride * made.stride
-        made.held = made.columns + 4 * made.stride
+        made.columns = made.values + stride * stride
+        made.held = made.columns + stride * B.n
         made.where = <int *> (made.held + B.n)
+        for j in range(B.k):
+            for i in range(B.n):
+                made.columns[i * stride + j] = B.U[j * B.n + i]
         return made
 
     cdef void enter(self, const double *piece) noexcept:
@@ -469,7 +502,7 @@ cdef class Gram:
         changes as there are components it is summed up anew, by what is held or by
         what is not, whichever is less.
         """
-        cdef Py_ssize_t i, j, c, q, count, k = self.k, stride = self.stride
+        cdef Py_ssize_t i, c, q, count, k = self.k, stride = self.stride
         cdef double sign[4]
         cdef bint is_held
         if self.flips > self.n:
@@ -488,11 +521,10 @@ cdef class Gram:
             for q in range(4):
                 sign[q] = 0.0
                 if c + q < count:
-                    i = self.where[c + q]
-                    sign[q] = 1 - 2 * self.held[i]
-                    for j in range(k):
-                        self.columns[q * stride + j] = self.U[j * self.n + i]
-            add_gram(sign, self.columns, self.values, stride)
+                    sign[q] = 1 - 2 * self.held[self.where[c + q]]
+                else:
+                    self.where[c + q] = 0
+            add_gram(sign, self.columns, self.where + c, self.values, stride)
 
 
 cdef class Model:
@@ -593,16 +625,12 @@ cdef class Directions:
     cdef void begin(self, const double *free) noexcept:
         """Forget all, on another face."""
         self.count = self.oldest = 0
-        if self.n:
+        if self.n and self.most:
             memcpy(self.free, free, self.n * sizeof(double))
 
     cdef bint is_on(self, const double *free) noexcept:
         """Whether they are directions on that face."""
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            if self.free[i] != free[i]:
-                return False
-        return True
+        return same(self.free, free, self.n)
 
     cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
         """Add one with pᵀHp, in place of the oldest where there are too many."""
@@ -615,10 +643,8 @@ cdef class Directions:
             self.room = min(max(16, 2 * self.room), self.most)
             self.p = enlarged(self.p, self.room * self.n)
             self.Hp = enlarged(self.Hp, self.room * self.n)
-        memcpy(self.p + at * self.n, p, self.n * sizeof(double))
-        memcpy(self.Hp + at * self.n, Hp, self.n * sizeof(double))
-        scale(1 / sqrt(curvature), self.p + at * self.n, self.n)
-        scale(1 / sqrt(curvature), self.Hp + at * self.n, self.n)
+        copy_scaled(1 / sqrt(curvature), p, self.p + at * self.n, self.n)
+        copy_scaled(1 / sqrt(curvature), Hp, self.Hp + at * self.n, self.n)
         self.count = min(self.count + 1, self.most)
         return 0
 
@@ -648,6 +674,7 @@ cdef class Solver:
     cdef Py_ssize_t n, r, m
     cdef double inverse_norm, norm, e_size, x_tilde_size, alpha, Gamma_square, rho
     cdef bint reduced, plain, preconditioned, newton_proportions
+    cdef bint in_two  # whether CG steps go through memory twice: φ, `free` not stored
     cdef int expansion
     cdef Py_ssize_t found  # directions of the model: Ritz vectors, then C
     cdef tuple held  # the arrays that are read
@@ -690,6 +717,7 @@ cdef class Solver:
     cdef double *slope2
     cdef double *c
     cdef double *core
+    cdef double *inverse  # of the diagonal of the factor of the core
     cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
@@ -731,8 +759,8 @@ cdef class Solver:
         if spectrum.ritz is not None:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
-        k = self.found
-        self.room = Room(19 * n + 2 * self.r + (9 + k) * (k + 3))
+        k = (self.found + 3) & ~3
+        self.room = Room(19 * n + 2 * self.r + (7 + k) * k)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -745,7 +773,8 @@ cdef class Solver:
         self.x0, self.g0 = at + 5 * n, at + 6 * n
         at += 7 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
-        self.slope2, self.c, self.Cv = at + 4 * k, at + 5 * k, at + 6 * k
+        self.slope2, self.c, self.inverse = at + 4 * k, at + 5 * k, at + 6 * k
+        self.Cv = at + 7 * k
         self.Cw = self.Cv + self.r
         self.core = self.Cw + self.r
 
@@ -767,6 +796,7 @@ cdef class Solver:
         self.above = self.vectors.at + self.found * n
         memcpy(self.vectors.at, numbers(vectors), kept * n * sizeof(double))
         memcpy(self.vectors.at + kept * n, self.C, self.r * n * sizeof(double))
+        self.C = self.vectors.at + kept * n  # read once, not twice, from farther caches
         for i in range(self.found):
             self.above[i] = -self.tail
             if i < kept:
@@ -791,7 +821,7 @@ cdef class Solver:
         add_combination(1.0, self.C, self.Cw, out, self.r, n)
         return 0
 
-    cdef int lengths_along(self, const double *p, double *Hp) except -1:
+    cdef int lengths_along(self, double *p, double *Hp) except -1:
         """Hp ← H p, and the `lengths` of x − αp, which are kept in `told`; one product."""
         if self.r or not self.F.rows.data:
             self.H(p, Hp)
@@ -803,13 +833,24 @@ cdef class Solver:
                        self.lower, self.upper_if_any, self.told)
         return 0
 
-    cdef double curvature_along(self, const double *p, double *Hp) except? -1:
-        """Hp ← H p; returns pᵀHp; one product."""
-        if self.r or not self.F.rows.data:
-            self.H(p, Hp)
-            return dot(p, Hp, self.n)
+    cdef int lengths_of_next(self, double gamma) except -1:
+        """p ← φ − γp, and the `lengths_along` it; one product."""
         self.F.count += 1
-        return sparse_curvature(&self.F.rows, self.inverse_norm, p, Hp)
+        sparse_turn(&self.F.rows, self.inverse_norm, gamma, self.x, self.g, self.p,
+                    self.Hp, self.lower, self.upper_if_any, self.told)
+        return 0
+
+    cdef int turn_beyond(self, double gamma) except -1:
+        """p ← φ − γp at z, Hp ← H p; φᵀp and pᵀHp are told; one product."""
+        if self.r or not self.F.rows.data:
+            self.told[0] = turn_freely(self.g2, self.free, gamma, self.p, self.n)
+            self.H(self.p, self.Hp)
+            self.told[1] = dot(self.p, self.Hp, self.n)
+            return 0
+        self.F.count += 1
+        sparse_turn_freely(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
+                           self.p, self.Hp, self.told)
+        return 0
 
     cdef double infeasibility(self, const double *x):
         """Find Cx, which is kept in `Cv`, and ‖Cx‖."""
@@ -843,8 +884,10 @@ cdef class Solver:
         for i in range(k):
             for j in range(i, k):
                 S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
+            for j in range(k, stride):
+                S[i * stride + j] = 0.0
             S[i * stride + i] += B.tau
-        if not cholesky(S, k, stride):
+        if not cholesky(S, self.inverse, k, stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -855,7 +898,7 @@ cdef class Solver:
         cdef Py_ssize_t i, n = self.n
         cdef double *t = self.t
         if not B.k:
-            tilted(x, g, B.tau, lower, upper, s, piece, n)
+            tilted(x, g, B.tau, lower, upper, s, NULL, n)
             return
         memcpy(t, g, n * sizeof(double))
         add_combination(1.0, B.U, y, t, B.k, n)
@@ -886,16 +929,13 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, dy, k, B.gram.stride)
+            solve(self.core, self.inverse, dy, B.gram.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
             begun = dot(slope, dy, k)
             self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
-            for i in range(n):
-                if piece[i] != piece_there[i]:
-                    break
-            else:
+            if same(piece, piece_there, n):
                 return 0  # where Newton's method is exact
             now = dot(slope_there, dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
@@ -920,10 +960,13 @@ cdef class Solver:
             t = fmax(t, B.w[i])
         return self.step_of_model(Model.of_norm(B.tau + t, n), x, g, lower, upper, s)
 
-    cdef Model raised(self, Model B, const double *s, double sHs):
-        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
+    cdef Model raised(self, Model B, const double *s, double square, double sHs):
+        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is.
+
+        square : ‖s‖²
+        """
         cdef Py_ssize_t i
-        cdef double square = dot(s, s, self.n), rest = square, missing, tau
+        cdef double rest = square, missing, tau
         missing = sHs - B.tau * square
         rows_times(B.U, s, self.c, B.k, self.n)
         for i in range(B.k):
@@ -960,15 +1003,14 @@ cdef class Solver:
         if not self.preconditioned or not M.k:
             return self.phi  # directions have no length
         memcpy(z, self.phi, n * sizeof(double))
-        rows_times(M.U, z, self.c, M.k, n)
+        rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.c, M.k, M.gram.stride)
+        solve(self.core, self.inverse, self.c, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         add_combination(-1.0, M.U, self.c, z, M.k, n)
-        for i in range(n):
-            z[i] *= self.free[i] / M.tau
+        scale_free(1 / M.tau, self.free, z, n)
         return z
 
     # MPRGP
@@ -982,9 +1024,13 @@ cdef class Solver:
         return total
 
     cdef void to(self, double alpha, const double *p, const double *Hp):
-        """x ← x − αp; the gradient follows without a product."""
-        move(alpha, self.x, self.g, p, Hp, self.lower, self.upper,
-             self.n)
+        """x ← x − αp, and its face; the gradient follows without a product."""
+        cdef bint stored = not self.in_two
+        advance(alpha, self.x, self.g, p, Hp, self.lower, self.upper_if_any, self.B.tau,
+                self.phi if stored else NULL, self.free if stored else NULL, self.n,
+                self.told)
+        self.phi_square, self.beta_square = self.told[0], self.told[1]
+        self.reduced_square = self.told[2]
 
     cdef double searched(self, double *s, double *Hs) except? -1:
         """Find the length along s of the least cost, in the box where 1 is not beyond.
@@ -992,13 +1038,8 @@ cdef class Solver:
         0 for s = 0, inf where the cost falls without end. It turns s round, so that
         x − αs is where it leads, and leaves its `lengths` in `told`; one product.
         """
-        cdef Py_ssize_t i, n = self.n
-        cdef bint moves = False
-        for i in range(n):
-            moves = moves or s[i] != 0
-        if not moves:
+        if not turn_round(s, self.n):
             return 0
-        scale(-1.0, s, n)
         self.lengths_along(s, Hs)
         return fmin(self.told[0], fmax(1.0, self.told[1]))
 
@@ -1007,7 +1048,7 @@ cdef class Solver:
 
         0 where there is nothing to gain, or the cost falls without end.
         """
-        cdef Py_ssize_t i, n = self.n
+        cdef Py_ssize_t n = self.n
         cdef double *s = self.s
         cdef double *Hs = self.Hs
         cdef double length
@@ -1017,7 +1058,7 @@ cdef class Solver:
         if length == 0 or isinf(length):
             return 0
         if self.told[0] < 1:
-            self.B = self.raised(self.B, s, dot(s, Hs, n))
+            self.B = self.raised(self.B, s, dot(s, s, n), dot(s, Hs, n))
         self.to(length, s, Hs)
         return 1
 
@@ -1029,7 +1070,7 @@ cdef class Solver:
             return self.step_by_model()
         for i in range(n):
             beta[i] = 0.0
-            if not self.free[i] and (
+            if not self.lower[i] < self.x[i] < self.upper[i] and (
                 (self.g[i] < 0 and self.x[i] < self.upper[i])
                 or (self.g[i] > 0 and self.x[i] > self.lower[i])
             ):
@@ -1055,52 +1096,44 @@ cdef class Solver:
             ):
                 memcpy(self.x, self.x2, n * sizeof(double))
                 memcpy(self.g, self.g2, n * sizeof(double))
+                self.split()
                 return b"e"
         if self.expansion == MODEL:
             return self.expand_by_model(cg, feasible, is_first, most, enough, trace)
         self.to(feasible, self.p, self.Hp)
-        self.split()
-        for i in range(n):
-            step = self.x[i] - self.phi[i] / self.B.tau  # cuts φ to φ̃
-            self.x[i] = fmin(fmax(step, self.lower[i]), self.upper[i])
+        projected(self.x, self.g, self.B.tau, self.lower, self.upper, self.x2, n)
+        memcpy(self.x, self.x2, n * sizeof(double))  # the step cut φ to φ̃
         self.gradient(self.x, self.g)
+        self.split()
         return b"f" if self.expansion == MIXED else b"e"
 
     cdef int expand_by_model(self, double cg, double feasible, bint is_first, long most,
                              double enough, bytearray trace) except -1:
         """Project z, where CG leads beyond the box, on it in the metric of the model."""
-        cdef Py_ssize_t i, n = self.n
-        cdef double *p = self.p
-        cdef double *Hp = self.Hp
+        cdef Py_ssize_t n = self.n
         cdef double *s = self.s
         cdef double *Hs = self.Hs
+        cdef double *x2 = self.x2
         cdef double *lower = self.box_lower
         cdef double *upper = self.box_upper
         cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, tau = self.B.tau
         cdef double change = -feasible * self.told[2] + 0.5 * feasible**2 * self.told[3]
-        cdef double least = self.reduced_square / (2 * tau)
-        cdef bint held, is_flat = not self.B.k, release = is_first and not is_flat
-        memcpy(self.x0, self.x, n * sizeof(double))
-        memcpy(self.g0, self.g, n * sizeof(double))
-        self.to(feasible, p, Hp)
-        for i in range(n):
-            held = (self.x[i] <= self.lower[i] or self.x[i] >= self.upper[i])
-            held = held and not release
-            lower[i] = self.x[i] if held else self.lower[i]
-            upper[i] = self.x[i] if held else self.upper[i]
-            self.x2[i] = self.x[i] - beyond * p[i]
-            self.g2[i] = self.g[i] - beyond * Hp[i]
+        cdef double least = self.reduced_square / (2 * tau), slope
+        cdef bint is_flat = not self.B.k, release = is_first and not is_flat
+        leave(feasible, beyond, release, self.x, self.g, self.p, self.Hp, self.lower,
+              self.upper, self.x0, self.g0, self.free, lower, upper, x2, self.g2, n)
         if beyond and is_flat:
             self.minimise_beyond(most, enough, trace)
-        self.B.tau = tau / self.alpha
-        self.step_of_model(self.B, self.x2, self.g2, lower, upper, s)
-        self.B.tau = tau
-        within(self.x2, self.x, lower, upper, s, n)
-        for i in range(n):
-            if lower[i] == upper[i] and not release:
-                s[i] = 0.0
-        if dot(self.g, s, n) >= 0:
-            memcpy(self.x2, self.x, n * sizeof(double))
+        if is_flat:
+            slope = tilted_within(x2, self.g2, tau / self.alpha, self.x, self.g, lower,
+                                  upper, s, n)
+        else:
+            self.B.tau = tau / self.alpha
+            self.step_of_model(self.B, x2, self.g2, lower, upper, s)
+            self.B.tau = tau
+            slope = within(x2, self.x, self.g, lower, upper, release, s, n)
+        if slope >= 0:
+            memcpy(x2, self.x, n * sizeof(double))
             memcpy(self.g2, self.g, n * sizeof(double))
             self.step_of_model(self.B, self.x, self.g, lower, upper, s)
         length = self.searched(s, Hs)
@@ -1110,11 +1143,11 @@ cdef class Solver:
             if -self.told[2] + 0.5 * self.told[3] + change < 0:
                 length = fmax(length, 1.0)
             change += -length * self.told[2] + 0.5 * length**2 * self.told[3]
-            for i in range(n):  # x + s − z and its product
-                self.x2[i] = self.x[i] - s[i] - self.x2[i]
-                self.g2[i] = self.g[i] - Hs[i] - self.g2[i]
+            rest_of_step(self.x, self.g, s, Hs, self.g2, x2, n, self.told)
+            self.B = self.raised(self.B, x2, self.told[0], self.told[1])
             self.to(length, s, Hs)
-            self.B = self.raised(self.B, self.x2, dot(self.x2, self.g2, n))
+        else:
+            self.split()
         if is_flat and -change < least:
             return self.project_gradient(tau)
         return b"e"
@@ -1124,35 +1157,32 @@ cdef class Solver:
         cdef Py_ssize_t n = self.n
         cdef long step
         cdef double curvature = dot(self.p, self.Hp, n), slope
-        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, self.phi, n,
-                       self.told)
+        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, n, self.told)
         for step in range(most):
             if self.told[0] <= enough:
                 break
-            slope = turn(self.phi, self.told[1] / curvature, self.p, n)
-            curvature = self.curvature_along(self.p, self.Hp)
+            self.turn_beyond(self.told[1] / curvature)
+            slope, curvature = self.told[0], self.told[1]
             trace.append(c'b')
             if curvature <= 0:
                 break
             advance_freely(slope / curvature, self.x2, self.g2, self.p, self.Hp,
-                           self.free, self.phi, n, self.told)
+                           self.free, n, self.told)
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
         """Take the step of plain gradient projection from where the expansion began."""
-        cdef Py_ssize_t i, n = self.n
+        cdef Py_ssize_t n = self.n
         cdef double length
         memcpy(self.x, self.x0, n * sizeof(double))
         memcpy(self.g, self.g0, n * sizeof(double))
-        for i in range(n):
-            self.s[i] = fmin(
-                fmax(self.x[i] - self.free[i] * self.g[i] / tau, self.lower[i]),
-                self.upper[i],
-            ) - self.x[i]
+        projected(self.x, self.g, tau, self.lower, self.upper, self.s, n)
+        add(-1.0, self.x, self.s, n)
         length = self.searched(self.s, self.Hs)
         if length == 0 or isinf(length):
             return 0
-        self.B = self.raised(self.B, self.s, dot(self.s, self.Hs, n))
+        self.B = self.raised(self.B, self.s, dot(self.s, self.s, n),
+                             dot(self.s, self.Hs, n))
         self.to(length, self.s, self.Hs)
         return b"f"
 
@@ -1169,12 +1199,14 @@ cdef class Solver:
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
-        cdef double weight, began
+        cdef double weight, began, gamma = 0.0  # of p ← φ − γp, where that is put off
+        self.in_two = self.F.rows.data != NULL and not self.r and not (
+            self.preconditioned and self.preconditioner.k
+        )
         self.split()
         self.minimise_along_directions()
-        self.enter_face()
         began = self.phi_square
-        memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        self.first_direction()
         self.directions.conjugate(self.p)
         while True:
             PyErr_CheckSignals()  # an interrupt ends it
@@ -1190,13 +1222,14 @@ cdef class Solver:
                 by_model = by_model and self.newton_proportions
                 letter = b"p" if self.proportion(by_model) else 0
             else:
-                self.lengths_along(self.p, self.Hp)
+                if self.in_two:
+                    self.lengths_of_next(gamma)
+                else:
+                    self.lengths_along(self.p, self.Hp)
                 if isinf(fmin(self.told[0], self.told[1])):
                     return 0
                 if self.told[0] <= self.told[1]:
-                    self.directions.add(self.p, self.Hp, self.told[3])
-                    self.minimise_along_p()
-                    self.directions.conjugate(self.p)
+                    gamma = self.minimise_along_p()
                     self.tell(b"c", trace, note)
                     inside += 1
                     continue
@@ -1207,22 +1240,30 @@ cdef class Solver:
                 has_expanded = True
             if not letter:
                 return 0
-            self.split()
             self.directions.begin(self.free)
-            self.enter_face()
-            inside, began = 0, self.phi_square
-            memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+            inside, began, gamma = 0, self.phi_square, 0.0
+            self.first_direction()
             self.tell(letter, trace, note)
+
+    cdef int first_direction(self) except -1:
+        """Have the preconditioner know the face, and p be its direction of descent."""
+        if self.in_two:
+            memset(self.p, 0, self.n * sizeof(double))  # φ is added with the product
+            return 0
+        self.enter_face()
+        memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        return 0
 
     cdef int minimise_along_directions(self) except -1:
         """Minimise along the directions known on this face, as far as is feasible."""
         cdef double *s = self.s
         cdef double *Hs = self.Hs
+        if not self.directions.most:
+            return 0
         if self.directions.count and self.directions.is_on(self.free):
             self.directions.minimise(self.g, s, Hs)
             lengths(self.x, self.g, s, Hs, self.lower, self.upper, self.n, self.told)
             self.to(fmin(1.0, self.told[1]), s, Hs)
-            self.split()
         if not self.directions.is_on(self.free):
             self.directions.begin(self.free)
         return 0
@@ -1233,19 +1274,25 @@ cdef class Solver:
             note(chr(letter), copied(self.x, self.n), copied(self.g, self.n))
         return 0
 
-    cdef void minimise_along_p(self):
-        """Take the CG step whose `lengths` are told, and find the next direction."""
+    cdef double minimise_along_p(self) except? -1:
+        """Take the CG step whose `lengths` are told, and find the next direction.
+
+        Returns γ of p ← φ − γp where that is put off, 0 else.
+        """
         cdef double curvature = self.told[3], z_Hp
         cdef const double *z
-        advance(self.told[0], self.x, self.g, self.p, self.Hp,
-                self.lower, self.upper_if_any, self.B.tau, self.phi,
-                self.free, self.n, self.told)
-        self.phi_square, self.beta_square = self.told[0], self.told[1]
-        self.reduced_square, z_Hp = self.told[2], self.told[3]
+        if not self.in_two:
+            self.directions.add(self.p, self.Hp, curvature)
+        self.to(self.told[0], self.p, self.Hp)
+        z_Hp = self.told[3]
+        if self.in_two:
+            return z_Hp / curvature
         z = self.preconditioned_gradient()
         if z != self.phi:
             z_Hp = dot(z, self.Hp, self.n)
         turn(z, z_Hp / curvature, self.p, self.n)
+        self.directions.conjugate(self.p)
+        return 0
 
     # when to stop
 
@@ -1290,7 +1337,7 @@ cdef class Solver:
             most = fmax(most, fabs(self.q[i]))
         noise = 1e3 * 2.0 ** -52 * most
         for i in range(self.n):
-            if not self.free[i] and not (
+            if not (
                 (self.g[i] < 0 and self.x[i] < self.upper[i])
                 or (self.g[i] > 0 and self.x[i] > self.lower[i])
             ):

@@ -21,7 +21,8 @@ class Ritz(NamedTuple):
 
     values: Vector  #: (k,)
     residuals: Vector  #: (k,) ‖Hv − θv‖: an eigenvalue lies that near to θ
-    vectors: NDArray[np.float64]  #: (k, n) orthonormal rows
+    #: (k, n) orthonormal rows; (0, n) where the compiled process found no first pair
+    vectors: NDArray[np.float64]
     at_start: float  #: vᵀHv/‖v‖² of the start vector
 
     @property
@@ -46,10 +47,11 @@ def size(v: Vector) -> int:
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
     """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
 
-    The residual of the pair (θ, Vᵀs) is |β s_k| with the last off-diagonal entry β. A
-    start vector from an invariant subspace keeps the process there. It ends after FEW
-    steps where all Ritz values are of one size: conjugate gradients need few steps
-    there, and no model.
+    What three terms leave is of the size of the next vector, so that one pass over all
+    vectors makes it orthogonal to them to rounding. The residual of the pair (θ, Vᵀs)
+    is |β s_k| with the last off-diagonal entry β. A start vector from an invariant
+    subspace keeps the process there. It ends after FEW steps where all Ritz values are
+    of one size: conjugate gradients need few steps there, and no model.
     """
     basis = np.zeros((min(steps, size(start)), start.size))
     diagonal: list[float] = []
@@ -59,8 +61,10 @@ def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
         basis[k] = v / beta
         v = H(basis[k])
         diagonal.append(float(basis[k] @ v))
-        for _ in range(2):
-            v = v - basis[: k + 1].T @ (basis[: k + 1] @ v)
+        v = v - diagonal[-1] * basis[k]
+        if k:
+            v = v - beta * basis[k - 1]
+        v = v - basis[: k + 1].T @ (basis[: k + 1] @ v)
         beta = float(np.linalg.norm(v))
         off.append(beta)
         if beta <= 1e-12 * max(map(abs, diagonal)):

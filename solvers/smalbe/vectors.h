@@ -132,17 +132,44 @@ TWICE static void sparse_product(const sparse *F, double s, in v, out y)
         some_rows(F, i, i + BLOCK < F->n ? i + BLOCK : F->n, s, v, y + i);
 }
 
-/* Hp = s F p; returns pᵀHp. */
-TWICE static double sparse_curvature(const sparse *F, double s, in p, out Hp)
+/* How far from row i the columns of its entries are at most. */
+INLINE Py_ssize_t reach(const sparse *F)
 {
-    double curvature = 0;
-    for (Py_ssize_t i = 0; i < F->n; i += BLOCK) {
-        Py_ssize_t last = i + BLOCK < F->n ? i + BLOCK : F->n;
+    return F->count ? F->offset[F->count - 1] : F->n;
+}
+
+/* p = φ − γp with φ = g on free components, zero on others; returns φᵀp. */
+INLINE double turn_block(in g, in free, double gamma, out p, Py_ssize_t n)
+{
+    double slope = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double f = free[i] * g[i];
+        p[i] = f - gamma * p[i];
+        slope += f * p[i];
+    }
+    return slope;
+}
+
+TWICE static double turn_freely(in g, in free, double gamma, out p, Py_ssize_t n)
+{
+    return turn_block(g, free, gamma, p, n);
+}
+
+/* `turn_freely`, then Hp = s F p, in one go through memory; told = φᵀp, pᵀHp. */
+TWICE static void sparse_turn_freely(const sparse *F, double s, in g, in free,
+                                     double gamma, out p, out Hp, out told)
+{
+    Py_ssize_t n = F->n, turned = 0;
+    told[0] = told[1] = 0;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t last = i + BLOCK < n ? i + BLOCK : n;
+        Py_ssize_t to = last + reach(F) < n ? last + reach(F) : n;
+        told[0] += turn_block(g + turned, free + turned, gamma, p + turned, to - turned);
+        turned = to;
         some_rows(F, i, last, s, p, Hp + i);
         for (Py_ssize_t j = i; j < last; j++)
-            curvature += p[j] * Hp[j];
+            told[1] += p[j] * Hp[j];
     }
-    return curvature;
 }
 
 /* Find the diagonals of F by its rows: their offsets, as many as there are, 0 where more
@@ -240,22 +267,52 @@ TWICE static void scale(double s, double *a, Py_ssize_t n)
         a[i] *= s;
 }
 
-/* c = U v for U (k, n) by rows, four of which share a pass over v. */
+/* b = s a. */
+TWICE static void copy_scaled(double s, in a, out b, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        b[i] = s * a[i];
+}
+
+/* z = s z on the free components, zero on the others. */
+TWICE static void scale_free(double s, in free, out z, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        z[i] *= s * free[i];
+}
+
+/* Whether a and b have the same components. */
+TWICE static int same(in a, in b, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t last = i + BLOCK < n ? i + BLOCK : n, differ = 0;
+        for (Py_ssize_t j = i; j < last; j++)
+            differ |= a[j] != b[j];
+        if (differ)
+            return 0;
+    }
+    return 1;
+}
+
+/* c = U v for U (k, n) by rows, four of which share a pass over v. Two sums a row, for
+   one would wait for itself. */
 TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
 {
-    Py_ssize_t i = 0, whole = n & ~(Py_ssize_t) 3;
+    Py_ssize_t i = 0;
     for (; i + 4 <= k; i += 4) {
         in u0 = U + i * n, u1 = u0 + n, u2 = u1 + n, u3 = u2 + n;
-        four t0 = EACH(0), t1 = EACH(0), t2 = EACH(0), t3 = EACH(0);
-        for (Py_ssize_t j = 0; j < whole; j += 4) {
-            four w = FOUR(v + j);
-            t0 += FOUR(u0 + j) * w;
-            t1 += FOUR(u1 + j) * w;
-            t2 += FOUR(u2 + j) * w;
-            t3 += FOUR(u3 + j) * w;
+        four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0, s0 = t0, s1 = t0, s2 = t0, s3 = t0;
+        Py_ssize_t j = 0;
+        for (; j + 8 <= n; j += 8) {
+            four w = FOUR(v + j), z = FOUR(v + j + 4);
+            t0 += FOUR(u0 + j) * w, s0 += FOUR(u0 + j + 4) * z;
+            t1 += FOUR(u1 + j) * w, s1 += FOUR(u1 + j + 4) * z;
+            t2 += FOUR(u2 + j) * w, s2 += FOUR(u2 + j + 4) * z;
+            t3 += FOUR(u3 + j) * w, s3 += FOUR(u3 + j + 4) * z;
         }
-        double c0 = total(t0), c1 = total(t1), c2 = total(t2), c3 = total(t3);
-        for (Py_ssize_t j = whole; j < n; j++) {
+        double c0 = total(t0 + s0), c1 = total(t1 + s1);
+        double c2 = total(t2 + s2), c3 = total(t3 + s3);
+        for (; j < n; j++) {
             c0 += u0[j] * v[j];
             c1 += u1[j] * v[j];
             c2 += u2[j] * v[j];
@@ -265,13 +322,14 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     }
     for (; i + 2 <= k; i += 2) {
         in u0 = U + i * n, u1 = u0 + n;
-        four t0 = EACH(0), t1 = EACH(0);
-        for (Py_ssize_t j = 0; j < whole; j += 4) {
+        four t0 = EACH(0), t1 = t0;
+        Py_ssize_t j = 0;
+        for (; j + 4 <= n; j += 4) {
             t0 += FOUR(u0 + j) * FOUR(v + j);
             t1 += FOUR(u1 + j) * FOUR(v + j);
         }
         double c0 = total(t0), c1 = total(t1);
-        for (Py_ssize_t j = whole; j < n; j++) {
+        for (; j < n; j++) {
             c0 += u0[j] * v[j];
             c1 += u1[j] * v[j];
         }
@@ -285,31 +343,42 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     }
 }
 
-/* y = y + s Uᵀc for U (k, n) by rows, four of which share a pass over y. */
+/* y = y + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over y. */
+INLINE void
+add_rows(in U, const double *c, out y, Py_ssize_t rows, Py_ssize_t n)
+{
+    Py_ssize_t j = 0;
+    for (; j + 4 <= n; j += 4) {
+        four sum = EACH(0);
+        for (Py_ssize_t i = 0; i < rows; i++)
+            sum += FOUR(U + i * n + j) * EACH(c[i]);
+        *(four *) (y + j) += sum;
+    }
+    for (; j < n; j++)
+        for (Py_ssize_t i = 0; i < rows; i++)
+            y[j] += c[i] * U[i * n + j];
+}
+
+/* y = y + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over y. */
 TWICE static void add_combination(double s, in U, in c, out y, Py_ssize_t k,
                                   Py_ssize_t n)
 {
-    Py_ssize_t i = 0, whole = n & ~(Py_ssize_t) 3;
-    for (; i + 4 <= k; i += 4) {
-        in u0 = U + i * n, u1 = u0 + n, u2 = u1 + n, u3 = u2 + n;
-        double c0 = s * c[i], c1 = s * c[i + 1], c2 = s * c[i + 2], c3 = s * c[i + 3];
-        four w0 = EACH(c0), w1 = EACH(c1), w2 = EACH(c2), w3 = EACH(c3);
-        for (Py_ssize_t j = 0; j < whole; j += 4)
-            *(four *) (y + j) += FOUR(u0 + j) * w0 + FOUR(u1 + j) * w1
-                                 + FOUR(u2 + j) * w2 + FOUR(u3 + j) * w3;
-        for (Py_ssize_t j = whole; j < n; j++)
-            y[j] += c0 * u0[j] + c1 * u1[j] + c2 * u2[j] + c3 * u3[j];
-    }
-    for (; i + 2 <= k; i += 2) {
-        in u0 = U + i * n, u1 = u0 + n;
-        double c0 = s * c[i], c1 = s * c[i + 1];
-        for (Py_ssize_t j = 0; j < n; j++)
-            y[j] += c0 * u0[j] + c1 * u1[j];
-    }
-    if (i < k) {
-        double c0 = s * c[i];
-        for (Py_ssize_t j = 0; j < n; j++)
-            y[j] += c0 * U[i * n + j];
+    double sc[8];
+    for (Py_ssize_t i = 0, rows; i < k; i += rows) {
+        rows = k - i < 8 ? k - i : 8;
+        for (Py_ssize_t j = 0; j < rows; j++)
+            sc[j] = s * c[i + j];
+        in V = U + i * n;
+        switch (rows) { /* the number of rows known, the loop over them is none */
+        case 1: add_rows(V, sc, y, 1, n); break;
+        case 2: add_rows(V, sc, y, 2, n); break;
+        case 3: add_rows(V, sc, y, 3, n); break;
+        case 4: add_rows(V, sc, y, 4, n); break;
+        case 5: add_rows(V, sc, y, 5, n); break;
+        case 6: add_rows(V, sc, y, 6, n); break;
+        case 7: add_rows(V, sc, y, 7, n); break;
+        default: add_rows(V, sc, y, 8, n);
+        }
     }
 }
 
@@ -349,17 +418,16 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
         told[3] += p[j] * Hp[j];
         told[2] += g[j] * p[j];
     }
-    if (!(nearer[0] | nearer[1] | nearer[2] | nearer[3]) && whole == n)
-        return least;
+    Py_ssize_t from = nearer[0] | nearer[1] | nearer[2] | nearer[3] ? 0 : whole;
     double room[BLOCK];
     ordered first = *(ordered *) &least;
-    for (Py_ssize_t j = 0; j < n; j++) {
+    for (Py_ssize_t j = from; j < n; j++) {
         double bound = p[j] > 0 ? lower[j] : upper ? upper[j] : INFINITY;
         double to = (x[j] - bound) / p[j];
         to = to > 0 ? to : 0;
         room[j] = p[j] != 0 ? to : INFINITY;
     }
-    for (Py_ssize_t j = 0; j < n; j++) {
+    for (Py_ssize_t j = from; j < n; j++) {
         ordered to = *(ordered *) (room + j);
         first = to < first ? to : first;
     }
@@ -367,15 +435,42 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
     return least;
 }
 
+/* p = φ − γp with the free gradient φ at x. */
+INLINE void
+turn_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
+{
+    four length = EACH(gamma);
+    Py_ssize_t i = 0;
+    for (; i + 4 <= n; i += 4) {
+        mask inside = FOUR(x + i) > FOUR(lower + i);
+        if (upper)
+            inside &= FOUR(x + i) < FOUR(upper + i);
+        *(four *) (p + i) = (four) ((mask) FOUR(g + i) & inside) - length * FOUR(p + i);
+    }
+    for (; i < n; i++) {
+        int inside = (x[i] > lower[i]) & (upper ? x[i] < upper[i] : 1);
+        p[i] = (inside ? g[i] : 0) - gamma * p[i];
+    }
+}
+
 /* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. With F, Hp = s F p
-   is found first, in the same go through memory. */
-INLINE void find_lengths(const sparse *F, double s, in x, in g, in p, out Hp, in lower,
-                         in upper, Py_ssize_t n, out told)
+   is found first, in the same go through memory; and before, where p is `turning`,
+   p = φ − γp, as far as the product needs it. */
+INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, in x,
+                         in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
+                         out told)
 {
     double feasible = INFINITY;
+    Py_ssize_t turned = 0;
     told[2] = told[3] = 0;
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
         Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        if (turning) {
+            Py_ssize_t to = i + size + reach(F) < n ? i + size + reach(F) : n;
+            turn_at(x + turned, g + turned, lower + turned, upper ? upper + turned : NULL,
+                    gamma, p + turned, to - turned);
+            turned = to;
+        }
         if (F)
             some_rows(F, i, i + size, s, p, Hp + i);
         feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
@@ -386,34 +481,49 @@ INLINE void find_lengths(const sparse *F, double s, in x, in g, in p, out Hp, in
 }
 
 /* upper : NULL where no component has a bound above */
-TWICE static void lengths(in x, in g, in p, out Hp, in lower, in upper, Py_ssize_t n,
-                          out told)
+TWICE static void lengths(in x, in g, double *p, out Hp, in lower, in upper,
+                          Py_ssize_t n, out told)
 {
     if (upper)
-        find_lengths(NULL, 1, x, g, p, Hp, lower, upper, n, told);
+        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, upper, n, told);
     else
-        find_lengths(NULL, 1, x, g, p, Hp, lower, NULL, n, told);
+        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, NULL, n, told);
 }
 
-TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, in p, out Hp,
-                                 in lower, in upper, out told)
+TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *p,
+                                 out Hp, in lower, in upper, out told)
 {
     if (upper)
-        find_lengths(F, s, x, g, p, Hp, lower, upper, F->n, told);
+        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, upper, F->n, told);
     else
-        find_lengths(F, s, x, g, p, Hp, lower, NULL, F->n, told);
+        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, NULL, F->n, told);
+}
+
+/* p = φ − γp with the free gradient φ at x, and the `sparse_lengths` along it. */
+TWICE static void sparse_turn(const sparse *F, double s, double gamma, in x, in g,
+                              double *p, out Hp, in lower, in upper, out told)
+{
+    if (upper)
+        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, upper, F->n, told);
+    else
+        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, told);
+}
+
+/* Where x - s is; on the bound that is nearer than rounding. */
+INLINE double moved(double x, double step, double lower, double upper)
+{
+    double to = x - step, noise = ROUNDING * (fabs(x) + fabs(step));
+    int down = (to - lower <= noise) & (step >= 0);
+    int up = (upper - to <= noise) & (step <= 0);
+    to = up ? upper : to;
+    return down ? lower : to;
 }
 
 INLINE void
 move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
-        double step = alpha * p[i], to = x[i] - step;
-        double noise = ROUNDING * (fabs(x[i]) + fabs(step));
-        int down = (to - lower[i] <= noise) & (step >= 0);
-        int up = (upper[i] - to <= noise) & (step <= 0);
-        to = up ? upper[i] : to;
-        x[i] = down ? lower[i] : to;
+        x[i] = moved(x[i], alpha * p[i], lower[i], upper[i]);
         g[i] -= alpha * Hp[i];
     }
 }
@@ -444,11 +554,28 @@ split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ss
     told[2] += reduced;
 }
 
-/* x = x - αp and g = g - αHp; what is nearer to a bound than rounding is on it. */
-TWICE static void move(double alpha, out x, out g, in p, in Hp, in lower, in upper,
-                       Py_ssize_t n)
+/* x = x - αp and g = g - αHp, what is nearer to a bound than rounding on it; x₀, g₀ and
+   `free` (1, others 0) as they were before. The box of the step that follows, where
+   components on a bound are held there unless it may `release` them; z = x - βp and its
+   gradient. */
+TWICE static void leave(double alpha, double beta, int release, out x, out g, in p, in Hp,
+                        in lower, in upper, out x0, out g0, out free, out box_lower,
+                        out box_upper, out z, out z_g, Py_ssize_t n)
 {
-    move_block(alpha, x, g, p, Hp, lower, upper, n);
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double low = lower[i], high = upper[i], was = x[i], push = g[i];
+        double to = moved(was, alpha * p[i], low, high), now = push - alpha * Hp[i];
+        int held = ((to <= low) | (to >= high)) & !release;
+        x0[i] = was;
+        g0[i] = push;
+        free[i] = (was > low) & (was < high) ? 1.0 : 0.0;
+        x[i] = to;
+        g[i] = now;
+        box_lower[i] = held ? to : low;
+        box_upper[i] = held ? to : high;
+        z[i] = to - beta * p[i];
+        z_g[i] = now - beta * Hp[i];
+    }
 }
 
 /* φ, free components (1, others 0); told = ‖φ‖², ‖β‖², φ̃ᵀφ with ᾱ = 1/τ. */
@@ -491,8 +618,10 @@ INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upp
         cut = CHOSEN(cut < most, cut, most);
         *(four *) (x + i) = to;
         *(four *) (g + i) = push;
-        *(four *) (phi + i) = f;
-        *(four *) (free + i) = (four) ((mask) EACH(1) & inside);
+        if (phi) {
+            *(four *) (phi + i) = f;
+            *(four *) (free + i) = (four) ((mask) EACH(1) & inside);
+        }
         phi_square += f * f;
         beta_square += b * b;
         reduced += cut * f;
@@ -503,35 +632,70 @@ INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upp
     told[2] = total(reduced);
     told[3] = total(phi_Hp);
     for (Py_ssize_t i = whole; i < n; i++) {
-        double above = upper ? upper[i] : INFINITY;
+        double above = upper ? upper[i] : INFINITY, f, inside;
         move_block(alpha, x + i, g + i, p + i, Hp + i, lower + i, &above, 1);
-        split_block(x + i, g + i, lower + i, &above, tau, phi + i, free + i, 1, told);
-        told[3] += phi[i] * Hp[i];
+        split_block(x + i, g + i, lower + i, &above, tau, &f, &inside, 1, told);
+        told[3] += f * Hp[i];
+        if (phi)
+            phi[i] = f, free[i] = inside;
     }
 }
 
-/* What `move` and `split` do, in one go through memory; told[3] = φᵀHp.
+/* x = x - αp and g = g - αHp, what is nearer to a bound than rounding on it, and what
+   `split` does, in one go through memory; told[3] = φᵀHp.
 
-   upper : NULL where no component has a bound above */
+   upper : NULL where no component has a bound above
+   phi, free : NULL where they are not asked for */
 TWICE static void advance(double alpha, out x, out g, in p, in Hp, in lower, in upper,
                           double tau, out phi, out free, Py_ssize_t n, out told)
 {
-    if (upper)
+    if (upper && phi)
         advance_by(alpha, x, g, p, Hp, lower, upper, tau, phi, free, n, told);
-    else
+    else if (phi)
         advance_by(alpha, x, g, p, Hp, lower, NULL, tau, phi, free, n, told);
+    else if (upper)
+        advance_by(alpha, x, g, p, Hp, lower, upper, tau, NULL, NULL, n, told);
+    else
+        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, NULL, NULL, n, told);
 }
 
-/* s = x + s - from, where x + s is in the box up to rounding, and on bounds that it
-   reaches. */
-TWICE static void within(in x, in from, in lower, in upper, out s, Py_ssize_t n)
+INLINE double within_block(in x, in from, in g, in lower, in upper, int release, out s,
+                           Py_ssize_t n)
 {
+    double slope = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
         double to = x[i] + s[i], noise = ROUNDING * (fabs(x[i]) + fabs(s[i]));
         int down = to - lower[i] <= noise, up = upper[i] - to <= noise;
+        int held = (lower[i] == upper[i]) & !release;
         to = up ? upper[i] : to;
-        s[i] = (down ? lower[i] : to) - from[i];
+        to = (down ? lower[i] : to) - from[i];
+        s[i] = held ? 0.0 : to;
+        slope += g[i] * s[i];
     }
+    return slope;
+}
+
+/* s = x + s - from, where x + s is in the box up to rounding, and on bounds that it
+   reaches; zero where the box leaves no choice, unless that is a `release`. Returns gᵀs. */
+TWICE static double within(in x, in from, in g, in lower, in upper, int release, out s,
+                           Py_ssize_t n)
+{
+    return within_block(x, from, g, lower, upper, release, s, n);
+}
+
+/* r = x - s - z and its product Hr = g - Hs - z_g; z = r; told = ‖r‖², rᵀHr. */
+TWICE static void rest_of_step(in x, in g, in s, in Hs, in z_g, out z, Py_ssize_t n,
+                               out told)
+{
+    double square = 0, curvature = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double r = x[i] - s[i] - z[i];
+        square += r * r;
+        curvature += r * (g[i] - Hs[i] - z_g[i]);
+        z[i] = r;
+    }
+    told[0] = square;
+    told[1] = curvature;
 }
 
 /* p = z - γp; returns zᵀp. */
@@ -545,27 +709,29 @@ TWICE static double turn(in z, double gamma, out p, Py_ssize_t n)
     return slope;
 }
 
-/* x = x - αp and g = g - αHp on a face without bounds, and φ there; told = ‖φ‖², φᵀHp. */
+/* x = x - αp and g = g - αHp on a face without bounds; told = ‖φ‖², φᵀHp. */
 TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in free,
-                                 out phi, Py_ssize_t n, out told)
+                                 Py_ssize_t n, out told)
 {
     double phi_square = 0, phi_Hp = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
+        double f;
         x[i] -= alpha * p[i];
         g[i] -= alpha * Hp[i];
-        phi[i] = free[i] * g[i];
-        phi_square += phi[i] * phi[i];
-        phi_Hp += phi[i] * Hp[i];
+        f = free[i] * g[i];
+        phi_square += f * f;
+        phi_Hp += f * Hp[i];
     }
     told[0] = phi_square;
     told[1] = phi_Hp;
 }
 
-/* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, the rows of V (4, k), k a multiple of four; only
+/* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, those rows of V (n, k), k a multiple of four; only
    the upper triangle of S (k, k) means something. */
-TWICE static void add_gram(in s, in V, out S, Py_ssize_t k)
+TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_t k)
 {
-    in v0 = V, v1 = V + k, v2 = v1 + k, v3 = v2 + k;
+    in v0 = V + row[0] * k, v1 = V + row[1] * k, v2 = V + row[2] * k;
+    in v3 = V + row[3] * k;
     for (Py_ssize_t i = 0; i < k; i++) {
         four a0 = EACH(s[0] * v0[i]), a1 = EACH(s[1] * v1[i]), a2 = EACH(s[2] * v2[i]);
         four a3 = EACH(s[3] * v3[i]);
@@ -580,55 +746,88 @@ TWICE static void add_gram(in s, in V, out S, Py_ssize_t k)
 TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict where)
 {
     Py_ssize_t count = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double now = piece[i] != 0 ? 1.0 : 0.0;
-        where[count] = (int) i;
-        count += held[i] != now;
-        held[i] = now;
+    four zero = EACH(0);
+    for (Py_ssize_t i = 0; i < n; i += 8) {
+        if (i + 8 <= n) { /* few blocks have any */
+            mask other = ((FOUR(piece + i) != zero) ^ (FOUR(held + i) != zero))
+                         | ((FOUR(piece + i + 4) != zero) ^ (FOUR(held + i + 4) != zero));
+            if (!(other[0] | other[1] | other[2] | other[3]))
+                continue;
+        }
+        for (Py_ssize_t j = i; j < n && j < i + 8; j++) {
+            double now = piece[j] != 0 ? 1.0 : 0.0;
+            where[count] = (int) j;
+            count += held[j] != now;
+            held[j] = now;
+        }
     }
     return count;
 }
 
-/* S = RᵀR (k, k) with rows of `stride` numbers, a multiple of four: R in the upper
-   triangle, 1/Rᵢᵢ in place of Rᵢᵢ; 0 where S is not positive definite. */
-TWICE static int cholesky(double *S, Py_ssize_t k, Py_ssize_t stride)
+/* S = RᵀR (k, k) in a square of `stride` numbers a side, a multiple of four, zeros from
+   column k on: R above the diagonal of S, 1/Rᵢᵢ in `inverse`, zeros for what is beyond k;
+   0 where S is not positive definite. */
+TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
         double *r = S + i * stride;
+        Py_ssize_t first = i & ~(Py_ssize_t) 3;
         if (!(r[i] > 0))
             return 0;
-        double inverse = 1 / sqrt(r[i]);
-        r[i] = inverse;
-        for (Py_ssize_t j = i + 1; j < k; j++)
-            r[j] *= inverse;
+        inverse[i] = 1 / sqrt(r[i]);
+        for (Py_ssize_t j = first; j < i; j++)
+            r[j] = 0; /* means nothing, and would grow from face to face */
+        for (Py_ssize_t j = first; j < stride; j += 4)
+            *(four *) (r + j) *= EACH(inverse[i]);
         for (Py_ssize_t j = i + 1; j < k; j++) {
             four s = EACH(r[j]);
-            for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < k; l += 4)
+            for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < stride; l += 4)
                 *(four *) (S + j * stride + l) -= s * FOUR(r + l);
         }
+    }
+    for (Py_ssize_t i = k; i < stride; i++) {
+        memset(S + i * stride, 0, stride * sizeof(double));
+        inverse[i] = 0;
     }
     return 1;
 }
 
-/* y = S⁻¹y with its `cholesky`. */
-TWICE static void solve(const double *R, double *y, Py_ssize_t k, Py_ssize_t stride)
+/* y = S⁻¹y with its `cholesky`, four components at once; y has `stride` of them, of which
+   those from k on become zero. */
+TWICE static void solve(const double *R, const double *inverse, double *y,
+                        Py_ssize_t stride)
 {
-    for (Py_ssize_t i = 0; i < k; i++) {
-        const double *r = R + i * stride;
-        y[i] *= r[i];
-        for (Py_ssize_t j = i + 1; j < k; j++)
-            y[j] -= r[j] * y[i];
+    for (Py_ssize_t i = 0; i < stride; i += 4) { /* Rᵀa = y */
+        const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
+        const double *r3 = r2 + stride, *d = inverse + i;
+        double a0 = y[i] * d[0];
+        double a1 = (y[i + 1] - r0[i + 1] * a0) * d[1];
+        double a2 = (y[i + 2] - r0[i + 2] * a0 - r1[i + 2] * a1) * d[2];
+        double a3 = (y[i + 3] - r0[i + 3] * a0 - r1[i + 3] * a1 - r2[i + 3] * a2) * d[3];
+        for (Py_ssize_t j = i + 4; j < stride; j += 4)
+            *(four *) (y + j) -= FOUR(r0 + j) * EACH(a0) + FOUR(r1 + j) * EACH(a1)
+                                 + FOUR(r2 + j) * EACH(a2) + FOUR(r3 + j) * EACH(a3);
+        *(four *) (y + i) = (four){a0, a1, a2, a3};
     }
-    for (Py_ssize_t i = k - 1; i >= 0; i--) {
-        const double *r = R + i * stride;
-        for (Py_ssize_t j = i + 1; j < k; j++)
-            y[i] -= r[j] * y[j];
-        y[i] *= r[i];
+    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* Ry = a */
+        const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
+        const double *r3 = r2 + stride, *d = inverse + i;
+        four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0;
+        for (Py_ssize_t j = i + 4; j < stride; j += 4) {
+            t0 += FOUR(r0 + j) * FOUR(y + j);
+            t1 += FOUR(r1 + j) * FOUR(y + j);
+            t2 += FOUR(r2 + j) * FOUR(y + j);
+            t3 += FOUR(r3 + j) * FOUR(y + j);
+        }
+        double a3 = (y[i + 3] - total(t3)) * d[3];
+        double a2 = (y[i + 2] - total(t2) - r2[i + 3] * a3) * d[2];
+        double a1 = (y[i + 1] - total(t1) - r1[i + 2] * a2 - r1[i + 3] * a3) * d[1];
+        double a0 = y[i] - total(t0) - r0[i + 1] * a1 - r0[i + 2] * a2 - r0[i + 3] * a3;
+        *(four *) (y + i) = (four){a0 * d[0], a1, a2, a3};
     }
 }
 
-/* Minimise gᵀs + τ/2‖s‖² over the box; piece: -1 at the lower bound, 1 at the upper. */
-TWICE static void tilted(in x, in g, double tau, in lower, in upper, out s, out piece,
+INLINE void tilted_block(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -637,7 +836,57 @@ TWICE static void tilted(in x, in g, double tau, in lower, in upper, out s, out 
         double high = target >= upper[i] ? 1.0 - low : 0.0;
         target = target >= upper[i] ? upper[i] : target;
         target = low > 0 ? lower[i] : target;
-        piece[i] = high - low;
+        if (piece)
+            piece[i] = high - low;
         s[i] = target - x[i];
     }
+}
+
+/* Minimise gᵀs + τ/2‖s‖² over the box; piece: -1 at the lower bound, 1 at the upper;
+   NULL where it is not asked for. */
+TWICE static void tilted(in x, in g, double tau, in lower, in upper, out s, out piece,
+                         Py_ssize_t n)
+{
+    if (piece)
+        tilted_block(x, g, tau, lower, upper, s, piece, n);
+    else
+        tilted_block(x, g, tau, lower, upper, s, NULL, n);
+}
+
+/* `tilted` from x, then `within`, in one go through memory. Returns the latter's gᵀs, g at
+   `from`. */
+TWICE static double tilted_within(in x, in x_g, double tau, in from, in g, in lower,
+                                  in upper, out s, Py_ssize_t n)
+{
+    double slope = 0;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        tilted_block(x + i, x_g + i, tau, lower + i, upper + i, s + i, NULL, size);
+        slope += within_block(x + i, from + i, g + i, lower + i, upper + i, 0, s + i,
+                              size);
+    }
+    return slope;
+}
+
+/* y = P(x - φ/τ) with the free gradient φ at x. */
+TWICE static void projected(in x, in g, double tau, in lower, in upper, out y,
+                            Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        int inside = (x[i] > lower[i]) & (x[i] < upper[i]);
+        double target = x[i] - (inside ? g[i] : 0) / tau;
+        target = target < lower[i] ? lower[i] : target;
+        y[i] = target > upper[i] ? upper[i] : target;
+    }
+}
+
+/* s = -s; whether it is not zero. */
+TWICE static int turn_round(out s, Py_ssize_t n)
+{
+    Py_ssize_t any = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        any |= s[i] != 0;
+        s[i] = -s[i];
+    }
+    return any != 0;
 }

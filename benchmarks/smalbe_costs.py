@@ -1,0 +1,197 @@
+"""What a solve of SMALBE costs beside its products: tables of docs/performance.md.
+
+    python -m benchmarks.smalbe_costs dense|sparse|kept
+
+* dense: preparing and solving duals, in units of their products with F. The bound of a
+  solve is 1.5 times its products, by `smalbe` or by BLAS' `dsymv`, whichever is
+  faster, and 100 µs.
+* sparse: a product with all work shared out, in units of one product and five passes
+  w += v over vectors.
+* kept: the same solves with and without keeping directions of CG.
+
+All that is compared runs in turn in one process, in seconds of its own processor time
+(those of other processes are not in it). Each is given by the median of the runs, and
+by the median of their fastest tenth, which others on the same processor change less.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from time import process_time
+
+import numpy as np
+from scipy.linalg.blas import dsymv
+
+from harness import QP, Solution
+from harness.plugin import Solver
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from solvers.smalbe.compiled import Product
+
+DUALS = {
+    "dual": [(12, 6, 5), (12, 7, 5), (24, 12, 10), (30, 15, 10), (60, 30, 5)],
+    "dual-bounds": [(12, 6, 5), (12, 7, 5), (24, 12, 10), (30, 15, 10), (60, 30, 5)],
+}  #: Nr, Nh and step of beam-ring
+LARGE = {
+    "journal-bearing": {"n": 300},
+    "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
+    "torsion": {"n": 100},
+}
+KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
+REPEATS = 20  #: of a product, which is too short to be timed alone
+
+Times = dict[str, tuple[float, float]]  #: median, and median of the fastest tenth
+
+
+def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
+    """Time calls, which say the seconds that they took."""
+    spent: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            spent[name].append(call())
+    return {
+        name: (
+            float(np.median(s)),
+            float(np.median(sorted(s)[: max(1, len(s) // 10)])),
+        )
+        for name, s in spent.items()
+    }
+
+
+def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
+    """Make a call that says the seconds of another, on average over `repeats`."""
+
+    def run() -> float:
+        start = process_time()
+        for _ in range(repeats):
+            call()
+        return (process_time() - start) / repeats
+
+    return run
+
+
+def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
+    """Build a dual of the paper's beam."""
+    family = PROBLEMS["beam-ring"]
+    params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
+    return family.build(form, params, reference_solution).qp
+
+
+def dense(tol: float = 1e-6) -> None:
+    """Prepare and solve duals."""
+    print("form m | products of the solve, of preparing | a product | prepare | solve")
+    for form, sizes in DUALS.items():
+        for size in sizes:
+            _dense(form, beam_ring(form, *size), tol)
+
+
+def _dense(form: str, qp: QP, tol: float) -> None:
+    solver, n = SOLVERS["smalbe"], qp.q.size
+    v, P, blas = np.ones(n), Product(qp.P, n), np.asarray(qp.P).T
+    ready: list[Callable[[], Solution]] = []
+    before = _products_of_preparing(qp, tol)
+    spent = solver.prepare(qp, tol)().counts["P_products"] - before
+    told = in_turn(
+        150 if n > 600 else 600,
+        ours=timed(lambda: P(v), REPEATS),
+        dsymv=timed(lambda: dsymv(1.0, blas, v, lower=1), REPEATS),
+        prepare=timed(lambda: ready.append(solver.prepare(qp, tol))),
+        solve=timed(lambda: ready.pop()()),
+    )
+    cells = []
+    for k in (0, 1):
+        product = min(told["ours"][k], told["dsymv"][k])
+        prepare, solve = told["prepare"][k], told["solve"][k]
+        cells.append(
+            f"{1e6 * product:.1f} µs, {1e6 * prepare:.0f} µs, {1e6 * solve:.0f} µs, "
+            f"solve/bound {solve / (1.5 * spent * product + 100e-6):.2f}, "
+            f"prepare/solve {prepare / solve:.2f}"
+        )
+    print(f"{form} {n} | {spent}, {before} | {cells[0]} | fast: {cells[1]}", flush=True)
+
+
+def _products_of_preparing(qp: QP, tol: float) -> int:
+    """Count the products of `prepare`: a solve stopped at its start shows them."""
+    s = replace(SOLVERS["smalbe"], max_steps=1).prepare(qp, tol)()
+    return s.counts["P_products"] - s.iterations - 2  # its point, and the residuals
+
+
+def sparse(tol: float = 1e-6) -> None:
+    """Solve large sparse problems; a product with its step in units of a bare one."""
+    solver = SOLVERS["smalbe"]
+    for name, params in LARGE.items():
+        family = PROBLEMS[name]
+        form, given = family.forms[0], family.complete(params)
+        _sparse(name, family.build(form, given, reference_solution).qp, solver, tol)
+
+
+def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
+    n = qp.q.size
+    P, v, w = Product(qp.P, n), np.ones(n), np.ones(n)
+
+    def passes() -> None:
+        for _ in range(5):
+            np.add(v, w, out=w)
+
+    spent = solver.prepare(qp, tol)().counts["P_products"]
+    told = in_turn(
+        15 if n > 20_000 else 60,
+        cold_product=timed(lambda: P(v)),
+        cold_passes=timed(passes),
+        product=timed(lambda: P(v), 5 * REPEATS),
+        passes=timed(passes, 5 * REPEATS),
+        scipy=timed(lambda: qp.P @ v, REPEATS),
+        whole=timed(lambda: solver.prepare(qp, tol)()),
+    )
+    for k, which in enumerate(("medians", "fastest tenth")):
+        us = {name: 1e6 * seconds[k] for name, seconds in told.items()}
+        step = us["whole"] / spent
+        unit = us["product"] + us["passes"]
+        cold = us["cold_product"] + us["cold_passes"]
+        print(
+            f"{name} n={n}, {which}: {spent} products, {us['whole'] / 1e3:.1f} ms, "
+            f"{step:.1f} µs each; product {us['product']:.1f} µs, SciPy's "
+            f"{us['scipy']:.1f} µs, five passes {us['passes']:.1f} µs; ratio "
+            f"{step / unit:.2f}; with caches as a solve leaves them "
+            f"{us['cold_product']:.1f} µs, {us['cold_passes']:.1f} µs, "
+            f"{step / cold:.2f}",
+            flush=True,
+        )
+
+
+def kept() -> None:
+    """Solve duals with and without keeping directions."""
+    for form, *size in KEPT:
+        for tol in (1e-6, 1e-8):
+            _kept(form, beam_ring(form, *size), tol)
+
+
+def _kept(form: str, qp: QP, tol: float) -> None:
+    solvers = {
+        "kept": SOLVERS["smalbe"],
+        "forgotten": replace(SOLVERS["smalbe"], recycle=False),
+    }
+    products = {
+        name: s.prepare(qp, tol)().counts["P_products"] for name, s in solvers.items()
+    }
+    told = in_turn(
+        60 if qp.q.size > 600 else 400,
+        **{
+            name: lambda s=s: timed(s.prepare(qp, tol))() for name, s in solvers.items()
+        },
+    )
+    for k, which in enumerate(("medians", "fastest tenth")):
+        ms = {name: 1e3 * seconds[k] for name, seconds in told.items()}
+        print(
+            f"{form} m={qp.q.size} {tol:.0e} {which}: kept {ms['kept']:.3f} ms "
+            f"({products['kept']}), forgotten {ms['forgotten']:.3f} ms "
+            f"({products['forgotten']})",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    {"dense": dense, "sparse": sparse, "kept": kept}[sys.argv[1]]()
