@@ -27,16 +27,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from harness import QP, InputError, Reference, Vector, no_rows
+from harness import (
+    QP,
+    Friction,
+    InputError,
+    Reference,
+    Solution,
+    Vector,
+    no_rows,
+)
 from harness.digest import hex_digest
 from harness.distributed.vectors import (
     EMITTED,
     DistributedColumns,
+    DistributedVector,
     Emitted,
     Ranks,
     Share,
     distributed,
 )
+from problems.contact.friction import iterate_of, settled
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import (
     Halo,
@@ -57,7 +67,7 @@ from problems.feti.own_bodies import (
     OwnSolution,
     Results,
     answers,
-    holds_all,
+    contact_multipliers,
     own_solution,
 )
 from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
@@ -71,6 +81,17 @@ class Contact(NamedTuple):
     rows: csr_array  #: (m_I, n) columns are components of the whole
     c: Vector  #: (m_I,)
     bound: Vector  #: (k,) of the last rows, those of friction with a given bound
+    #: (m_I − k,) slave node of each row of contact; none where nobody asks
+    place: Nodes = np.zeros(0, dtype=np.int64)
+
+
+class FixedPoint(NamedTuple):
+    """Coulomb's law as a sequence of given bounds (`problems.contact.friction`)."""
+
+    friction: Friction  #: of the rows of friction, with the bound that it begins from
+    step: int  #: number of the load step, which refusals name
+    iterate: int  #: the problem that is emitted, 1, 2, …; 0: the last
+    problems: int = 0  #: how many there are, once they are solved
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,10 +109,12 @@ class ProblemInParts:
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
     contact: Contact
+    coulomb: FixedPoint | None = None  #: where the bound is that of Coulomb's law
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
     #: what an answer means physically; None where only the whole tells
     results: Results | None = None
-    #: what follows once this is solved, and is emitted in its place; None where this is
+    #: what follows once this, and the fixed point of Coulomb's law, is solved, and is
+    #: emitted in its place; None where this is
     then: Callable[[OwnSolution], ProblemInParts] | None = None
 
 
@@ -258,6 +281,15 @@ class OwnSubdomains:
         """Its rows of B."""
         return _rows(self)
 
+    def bounded(self, coulomb: FixedPoint) -> OwnSubdomains:
+        """Hold the same with the bound of another problem of the fixed point."""
+        contact = self.problem.contact._replace(bound=coulomb.friction.bound)
+        problem = replace(self.problem, contact=contact, coulomb=coulomb)
+        found = replace(self, problem=problem)
+        # nothing that is remembered here depends on the bound
+        vars(found).update({**vars(self), "problem": problem})
+        return found
+
 
 class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
@@ -266,8 +298,6 @@ class _Rows(NamedTuple):
     B: csr_array  #: (t, N_p)
     reach: csr_array  #: (t, ranks) which ranks touch them
     c: Vector  #: (t,)
-    lower: Vector  #: (t,) bounds of the multipliers
-    upper: Vector  #: (t,)
     equalities: int  #: of all rows of the whole
     total: int  #: rows of the whole
 
@@ -286,65 +316,118 @@ def emitted(problem: ProblemInParts, ranks: Ranks, reference: Reference) -> Emit
     ------
     InputError
         Where there are fewer subdomains than ranks, ranks know different ones, or
-        something comes before and supports do not hold all bodies.
+        Coulomb's law does not settle or has less problems than are asked for.
 
     """
     rank = _agreed(problem, ranks)
     dual, before = _dual(OwnSubdomains(problem, ranks, rank)), list[str]()
+    sequence, solved = _fixed_point(dual, reference)
     while (then := dual.own.problem.then) is not None:
-        if not holds_all(dual.own.problem):
-            raise InputError(
-                "the supports leave a rigid motion of some body, which load steps and "
-                "re-linearisations do not allow; expected steps=1 and relin=1"
-            )
-        before.append(before[0] if before else _digest(dual.own))
-        found = own_solution(dual.own, dual.at, dual.scale, reference(dual.share().qp))
+        before += (before[:1] or [_digest(dual.own)]) * len(sequence)
+        last = sequence[-1]
+        found = own_solution(last.own, last.at, last.scale, solved())
         dual = _dual(OwnSubdomains(then(found), ranks, rank))
-    own, q = dual.own, dual.share().qp
+        sequence, solved = _fixed_point(dual, reference)
+    chosen = _chosen(sequence)
+    if others := sequence.index(chosen):
+        before += (before[:1] or [_digest(dual.own)]) * others
+    own, (lower, upper) = chosen.own, chosen.bounds(chosen.own.problem.contact.bound)
 
     def digest() -> str:
         return EMITTED + hex_digest(map(str.encode, before or [_digest(own)]), 16)
 
     return Emitted(
         variables=own.rows.total, equality_rows=own.coarse,
-        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in (q.lb, q.ub)),
-        share=dual.share, digest=digest,
-        answer=answers(own, dual.at, dual.scale, _torn(own, dual.explicit)),
+        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in (lower, upper)),
+        share=chosen.share, digest=digest,
+        answer=answers(own, chosen.at, chosen.scale, _torn(own, chosen.explicit)),
     )  # fmt: skip
 
 
-class _Dual(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Dual:
     """What this rank has made of a problem."""
 
     own: OwnSubdomains
     at: Halo
     scale: Vector  #: (m,) of the rows of contact and friction
     explicit: NDArray[np.bool_]  #: kinds whose blocks are formed
-    share: Callable[[], Share]
+    q: Vector  #: (o,) of own rows
+    G: csr_array  #: (r, o)
+    b: Vector  #: (r,)
+
+    def share(self) -> Share:
+        """Put the operator together, without any factor."""
+        rows, domains, ranks = self.own.rows, self.own.domains, self.own.ranks
+        anew = Subdomains(tuple(map(replace, domains.kinds)), domains.kind)
+        local = DualOperator(rows.B, anew, self.explicit, rows.equalities)
+        lower, upper = self.bounds(self.own.problem.contact.bound)
+        part = QP(
+            P=RankOperator(local, self.at), q=distributed(self.q, ranks),
+            lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
+            A=DistributedColumns(self.G, ranks), b=self.b,
+        )  # fmt: skip
+        return Share(part, gathered_on_one(self.at, rows.total))
+
+    def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
+        """Bound the multipliers of own rows (o,), those of friction by (k,)."""
+        ranks, E = self.own.ranks, self.own.rows.equalities
+        pressing = self.scale.size - bound.size
+        bound = bound / self.scale[pressing:]
+        below = np.concatenate([np.zeros(pressing), -bound])
+        above = np.concatenate([np.full(pressing, np.inf), bound])
+        number = self.at.rows[self.at.own]
+        touching = number >= E
+        lower, upper = (np.full(number.size, x) for x in (-np.inf, np.inf))
+        lower[touching] = below[number[touching] - E]
+        upper[touching] = above[number[touching] - E]
+        return distributed(lower, ranks), distributed(upper, ranks)
+
+
+def _fixed_point(
+    dual: _Dual, reference: Reference
+) -> tuple[list[_Dual], Callable[[], Solution]]:
+    """Settle Coulomb's law; without it, the problem is the only one.
+
+    Returns
+    -------
+    the problems of the fixed point, and the solution of the last
+
+    """
+    coulomb = dual.own.problem.coulomb
+    if coulomb is None:
+        return [dual], lambda: reference(dual.share().qp)
+    qp, found = dual.share().qp, list[Solution]()
+    contacts = dual.scale.size - coulomb.friction.bound.size
+
+    def normal(friction: Friction) -> Vector:
+        lower, upper = dual.bounds(friction.bound)
+        found[:] = [reference(replace(qp, lb=lower, ub=upper))]
+        z = contact_multipliers(dual.own, dual.at, dual.scale, found[0])
+        return z[:contacts]
+
+    frictions = settled(coulomb.friction, normal, coulomb.step)
+    known = coulomb._replace(problems=len(frictions))
+    owns = [dual.own.bounded(known._replace(friction=f)) for f in frictions]
+    return [replace(dual, own=own) for own in owns], lambda: found[0]
+
+
+def _chosen(sequence: list[_Dual]) -> _Dual:
+    """Choose the problem of a fixed point that is asked for."""
+    coulomb = sequence[-1].own.problem.coulomb
+    if coulomb is None:
+        return sequence[-1]
+    return iterate_of(sequence, coulomb.iterate, coulomb.step)
 
 
 def _dual(own: OwnSubdomains) -> _Dual:
     rows, domains, ranks = own.rows, own.domains, own.ranks
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
-    mine = at.own
-    q = rows.c[mine] - at.added(rows.B @ domains.inverse(own.f))
-    lower, upper = rows.lower[mine], rows.upper[mine]
-    G, b = _coarse_rows(own, at.rows[mine]), _resultants(own)
-    explicit, kinds = explicit_kinds(rows.B, domains), domains.kinds
-    B, kind, equalities, total = rows.B, domains.kind, rows.equalities, rows.total
-
-    def share() -> Share:
-        anew = Subdomains(tuple(map(replace, kinds)), kind)  # without any factor
-        local = DualOperator(B, anew, explicit, equalities)
-        part = QP(
-            P=RankOperator(local, at), q=distributed(q, ranks),
-            lb=distributed(lower, ranks), ub=distributed(upper, ranks),
-            G=no_rows(q.size), h=np.zeros(0),
-            A=DistributedColumns(G, ranks), b=b,
-        )  # fmt: skip
-        return Share(part, gathered_on_one(at, total))
-
-    return _Dual(own, at, _contact_scale(own.problem), explicit, share)
+    return _Dual(
+        own, at, _contact_scale(own.problem), explicit_kinds(rows.B, domains),
+        q=rows.c[at.own] - at.added(rows.B @ domains.inverse(own.f)),
+        G=_coarse_rows(own, at.rows[at.own]), b=_resultants(own),
+    )  # fmt: skip
 
 
 def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
@@ -467,16 +550,11 @@ def _rows(own: OwnSubdomains) -> _Rows:
     reach.sort_indices()
     reach.data[:] = 1
     contact, scale = problem.contact, _contact_scale(problem)
-    rubbing = contact.bound.size  # the last rows, of which both bounds are finite
-    bound = contact.bound / scale[scale.size - rubbing :]
-    below = np.concatenate([np.zeros(scale.size - rubbing), -bound])
-    above = np.concatenate([np.full(scale.size - rubbing, np.inf), bound])
     E = _equalities(problem)
     touching = number >= E
-    c, lower, upper = (np.full(number.size, x) for x in (0.0, -np.inf, np.inf))
-    for whole, part in ((scale * contact.c, c), (below, lower), (above, upper)):
-        part[touching] = whole[number[touching] - E]
-    return _Rows(number, B, reach, c, lower, upper, E, E + scale.size)
+    c = np.zeros(number.size)
+    c[touching] = (scale * contact.c)[number[touching] - E]
+    return _Rows(number, B, reach, c, E, E + scale.size)
 
 
 def _supports(own: OwnSubdomains) -> Entries:

@@ -76,12 +76,23 @@ def own_solution(
     v = own.domains.inverse(own.f - rows.B.T @ touched)
     v -= R @ np.asarray(s.y)[bodies.coarse]
     u = bodies.among.completed(T.T @ v) / times
+    z = contact_multipliers(own, halo, scale, s)
+    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+
+
+def contact_multipliers(
+    own: OwnSubdomains, halo: Halo, scale: Vector, s: Solution
+) -> Vector:
+    """Tell all ranks the multipliers (m,) of the rows of contact and friction.
+
+    scale : (m,) by which these rows are multiplied
+    """
+    rows = own.rows
     owned = rows.number[halo.own]
     is_contact = owned >= rows.equalities
     z = np.zeros(scale.size)
     z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
-    z = scale * own.ranks.total(z)
-    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+    return np.asarray(scale * own.ranks.total(z))
 
 
 def answers(
@@ -169,9 +180,9 @@ def holds_all(problem: ProblemInParts) -> bool:
     body = of.body[of.holder(node)]
     for b in range(problem.E.size):
         own = body == b
+        if not own.any():
+            return False
         if d == 1:
-            if not own.any():
-                return False
             continue
         points = of.position(node[own])
         size = np.ptp(points, axis=0).max(initial=0.0) or 1.0

@@ -18,10 +18,12 @@ HELD = (
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
     "plate/Sx=4/Sy=2/n=4/dual",
     "obstacle/n=10/shape=hemisphere/feti=3/dual",
+    "beam-ring/Nr=2/Nh=2/steps=1/friction=coulomb/mu=0.3/feti=3/dual",
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
+MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
 #: of a bound; K is the sum over subdomains on ranks, and the stored one elsewhere
 ROUNDING = 1e-4
 
@@ -36,7 +38,7 @@ def found(request):
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
             str(SUPPORT / "evaluated_on_ranks.py"),
-            *HELD, HELD_BY_CONTACT, PATCH, HERTZ,
+            *HELD, HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
@@ -79,7 +81,9 @@ def test_what_contact_alone_holds_is_certified_by_the_whole(found):
         assert answer["by_one"]["bound"] < 1
 
 
-@pytest.mark.parametrize("case", [*HELD[:2], HELD[3], HELD_BY_CONTACT, PATCH, HERTZ])
+@pytest.mark.parametrize(
+    "case", [*HELD[:2], *HELD[3:], HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN]
+)
 def test_quantities_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         by_ranks, by_one = (
