@@ -200,6 +200,12 @@ def at_sides(found: OwnSolution, pairs: Sequence[ContactPair]) -> tuple[Vector, 
     return u, forces_at_nodes(normal, contact.place, places)
 
 
+def tresca_problems(found: OwnSolution) -> int:
+    """Count the problems of the last fixed point; 1 without Coulomb's law."""
+    coulomb = found.subdomains.problem.coulomb
+    return 1 if coulomb is None else coulomb.problems
+
+
 class AtSides(NamedTuple):
     """What is known along the sides that may touch, as of the bodies themselves."""
 
@@ -255,7 +261,7 @@ def in_parts(
     share = longitudinal_share(D)
     at = displaced or at_rest(pairs)
     sides = _linearised(layout, pairs, names, units, linearise, laws, at)
-    coulomb = any(law.mu for law in laws)
+    coulomb = any(law.mu for law in laws) or iterate > 1  # which there may not be
 
     def reported(found: OwnSolution) -> dict[str, Any]:
         own = found.subdomains

@@ -82,6 +82,7 @@ from problems.feti.elastic import (
     linearised_by,
     posed_on,
     subdivide,
+    tresca_problems,
 )
 from problems.feti.emission import ProblemInParts
 from problems.feti.own_bodies import OwnSolution
@@ -290,8 +291,7 @@ def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
                 at.bodies, at.primal, exact, s, friction, params, shear
             )
         if p["friction"] == "coulomb":
-            of = found.subdomains.problem.coulomb
-            told["tresca_problems"] = 1 if of is None else of.problems
+            told["tresca_problems"] = tresca_problems(found)
         return told
 
     def posed(

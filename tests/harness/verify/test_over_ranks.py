@@ -19,6 +19,7 @@ HELD = (
     "plate/Sx=4/Sy=2/n=4/dual",
     "obstacle/n=10/shape=hemisphere/feti=3/dual",
     "beam-ring/Nr=2/Nh=2/steps=1/friction=coulomb/mu=0.3/feti=3/dual",
+    "greco/n=8/feti=3/dual",
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 PATCH = "contact-patch/feti=3/dual"

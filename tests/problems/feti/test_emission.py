@@ -35,6 +35,7 @@ LATER = (
     "contact=mortar/feti=2/dual",
     "contact-patch/ratio=5/friction=coulomb/mu=0.3/glue=redundant/feti=3/dual",
     "hertz-cylinder/n=1/m=1/friction=coulomb/mu=0.3/Q=0.2/peak=0.6/feti=9/dual",
+    "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
 )
 #: of which active sets alone come in circles (`solvers.reference.over_ranks`)
 CIRCLES = (
@@ -213,6 +214,8 @@ def generated_with_coulomb_s_law(rng, count=3):
             f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0, 0.3, 0.7])}/"
             f"{method}"
         )
+        mu = rng.choice([0, 0.4, 1])
+        yield f"greco/n={n[7] + 4}/mu={mu}/feti={n[0] % 3 + 1}/dual"
 
 
 @pytest.mark.parametrize(
