@@ -56,7 +56,7 @@ from problems.feti.distributed import (
     halo,
     owners,
 )
-from problems.feti.gluing import GLUE
+from problems.feti.gluing import GLUE, without
 from problems.feti.operators import (
     DualOperator,
     block_bytes,
@@ -108,6 +108,9 @@ class ProblemInParts:
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
+    #: whether these are eliminated, as by `problems.feti.gluing.without_supports`, and
+    #: have no rows; axes of subdomains are those of the whole there
+    eliminated: bool = False
     contact: Contact
     coulomb: FixedPoint | None = None  #: where the bound is that of Coulomb's law
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
@@ -156,13 +159,25 @@ class OwnSubdomains:
     @property
     def component(self) -> Nodes:
         """Component of the whole that each torn unknown is a copy of, (N_p,)."""
+        return self._component[self.kept]
+
+    @property
+    def _component(self) -> Nodes:
+        """Of those that are eliminated, too."""
         d = self.problem.components
         return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
 
     @property
     def times(self) -> NDArray[np.int64]:
         """How many copies it has on all ranks together, (N_p,)."""
-        return np.repeat(self.nodes.times, self.problem.components)
+        return np.repeat(self.nodes.times, self.problem.components)[self.kept]
+
+    @cached_property
+    def kept(self) -> slice | Nodes:
+        """Choose the torn unknowns among all components of all torn nodes."""
+        if not self.problem.eliminated:
+            return slice(None)
+        return np.flatnonzero(~np.isin(self._component, self.problem.held))
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
@@ -187,6 +202,16 @@ class OwnSubdomains:
                 problem.kind(Part(at, cells, np.full(len(cells), material[s])))
             )
         return Subdomains(tuple(kinds), kind), rotation
+
+    @cached_property
+    def domains(self) -> Subdomains:
+        """Its subdomains on their own."""
+        found = self._classified[0]
+        if not self.problem.eliminated:
+            return found
+        free = np.zeros(int(found.start[-1]), dtype=bool)
+        free[self.kept] = True
+        return without(found, free)
 
     def _leaders(
         self, own: list[tuple[int, Hashable, Points]]
@@ -221,47 +246,54 @@ class OwnSubdomains:
         return found
 
     @property
-    def domains(self) -> Subdomains:
-        """Its subdomains on their own."""
-        return self._classified[0]
-
-    @property
     def rotation(self) -> NDArray[np.float64]:
         """(S_p, 2, 2) turns each from the axes of its kind to those of the whole."""
         return self._classified[1]
 
+    @cached_property
+    def motions(self) -> NDArray[np.int64]:
+        """First rigid motion of each subdomain of the whole, and how many: (S + 1,)."""
+        modes = np.array([kind.R.shape[1] for kind in self.domains.kinds])
+        found = np.zeros(self.rank.size, dtype=np.int64)
+        own = self.number, modes[self.domains.kind]
+        for number, count in self.ranks.comm.allgather(own):
+            found[number] = count
+        return np.concatenate([[0], np.cumsum(found)])
+
     @property
     def coarse(self) -> int:
         """How many rigid motions all subdomains have together."""
-        return self.rank.size * int(self.domains.kinds[0].R.shape[1])
+        return int(self.motions[-1])
 
     @cached_property
     def f(self) -> Vector:
         """Its part of the load, (N_p,) in the axes of subdomains."""
         d = self.problem.components
-        found = self.problem.load(self.component) / self.times
+        times = np.repeat(self.nodes.times, d)
+        found = self.problem.load(self._component) / times
         if d > 1:
             loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
             turn = self.rotation[self.nodes.subdomain[loaded]]
             shared = found.reshape(-1, d)
             shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
-        return np.asarray(found)
+        return np.asarray(found[self.kept])
 
-    def resultants(
-        self, unknown: Nodes, value: Vector
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return Rᵀ of single forces: coarse numbers and values, both (k, r).
+    def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
+        """Return Rᵀ of single forces (k, r), in the columns of the rigid motions.
 
         unknown, value : torn unknowns and the forces there, (k,)
         """
         domains = self.domains
-        modes = domains.kinds[0].R.shape[1]
         of = np.searchsorted(domains.start, unknown, side="right") - 1
-        R = np.concatenate([kind.R for kind in domains.kinds])
-        first = np.cumsum([0, *(kind.R.shape[0] for kind in domains.kinds)])
-        at = first[domains.kind[of]] + unknown - domains.start[of]
-        number = modes * self.number[of][:, None] + np.arange(modes)
-        return number, R[at] * value[:, None]
+        R = np.concatenate([kind.R.ravel() for kind in domains.kinds])
+        first = np.cumsum([0, *(kind.R.size for kind in domains.kinds)])
+        modes = np.diff(self.motions)[self.number[of]]
+        at = first[domains.kind[of]] + modes * (unknown - domains.start[of])
+        ends = np.concatenate([[0], np.cumsum(modes)])
+        along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
+        entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
+        column = np.repeat(self.motions[self.number[of]], modes) + along
+        return csr_array((entries, column, ends), shape=(unknown.size, self.coarse))
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
@@ -534,10 +566,15 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
 def _rows(own: OwnSubdomains) -> _Rows:
     """Fill the rows of B, numbered as by `problems.feti.gluing.glue`."""
     problem, ranks = own.problem, own.ranks
-    parts = [_supports(own), _glued(own), _contact(own)]
+    parts = [_glued(own), _contact(own)]
+    if not problem.eliminated:
+        parts.insert(0, _supports(own))
     row, column, value = (np.concatenate(p) for p in list(zip(*parts, strict=True))[:3])
     number, place = np.unique(row, return_inverse=True)
-    B = csr_array((value, (place, column)), shape=(number.size, own.component.size))
+    unknowns = problem.components * own.nodes.number.size
+    B = csr_array((value, (place, column)), shape=(number.size, unknowns))
+    if problem.eliminated:
+        B = csr_array(B[:, own.kept])
     pairs = np.concatenate([part.reached for part in parts])
     pairs = pairs[np.isin(pairs[:, 0], number)]
     reach = csr_array(
@@ -599,7 +636,7 @@ def _glued(own: OwnSubdomains) -> Entries:
     d = problem.components
     held = np.sort(problem.held)
     held_times = of.times(held // d)
-    base = int(held_times.sum())
+    base = 0 if problem.eliminated else int(held_times.sum())
     none = np.zeros(0, dtype=np.int64)
     found = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
     for m, nodes_with in sorted(of.having.items()):
@@ -671,7 +708,7 @@ def _equalities(problem: ProblemInParts) -> int:
         len(GLUE[problem.glue](m)) * (d * count - int((times == m).sum()))
         for m, count in of.having.items()
     )
-    return int(times.sum()) + glued
+    return glued if problem.eliminated else int(times.sum()) + glued
 
 
 def _contact_scale(problem: ProblemInParts) -> Vector:
@@ -691,10 +728,7 @@ def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
     ranks, rows = own.ranks, own.rows
     B, t = rows.B, rows.number.size
     unknown, place = np.unique(B.indices, return_inverse=True)
-    coarse, value = own.resultants(unknown, np.ones(unknown.size))
-    r, modes = own.coarse, coarse.shape[1]
-    ends = modes * np.arange(unknown.size + 1)
-    R = csr_array((value.ravel(), coarse.ravel(), ends), shape=(unknown.size, r))
+    R = own.resultants(unknown, np.ones(unknown.size))
     touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
     part = csr_array(touched @ R)
     owner = owners(rows.number, rows.reach)
@@ -713,8 +747,8 @@ def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
 def _resultants(own: OwnSubdomains) -> Vector:
     """Return Rᵀf (3S,) of all subdomains."""
     loaded = np.flatnonzero(own.f)
-    coarse, value = own.resultants(loaded, own.f[loaded])
+    mine = own.resultants(loaded, own.f[loaded])
     found = np.zeros(own.coarse)
-    for number, part in own.ranks.comm.allgather((coarse, value)):
+    for number, part in own.ranks.comm.allgather((mine.indices, mine.data)):
         np.add.at(found, number, part)
     return found

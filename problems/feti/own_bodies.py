@@ -101,7 +101,7 @@ def answers(
     """Make what says what an answer means, on each rank for its own.
 
     Where the supports leave a rigid motion of some body, only the whole knows what
-    holds it.
+    holds it; where they are eliminated, subdomains do not float, as is taken here.
 
     Parameters
     ----------
@@ -112,6 +112,8 @@ def answers(
     problem, is_held = own.problem, holds_all(own.problem)
 
     def answer(s: Solution) -> Answered:
+        if problem.eliminated:
+            return Answered(None, None)
         found, results = own_solution(own, halo, scale, s), None
         if (reported := problem.results) is not None:
 
@@ -137,7 +139,8 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     times = np.empty(components.size)
     times[place] = own.times
     T = _spread(own, place, components.size)
-    modes = domains.kinds[0].R.shape[1]
+    first, end = own.motions[own.number], own.motions[own.number + 1]
+    coarse = [np.arange(*motions) for motions in zip(first, end, strict=True)]
     torn = Torn(
         kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
         scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
@@ -145,7 +148,7 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     return OwnBodies(
         ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
         shared=np.bincount(place, minlength=times.size) < times,
-        coarse=(modes * own.number[:, None] + np.arange(modes)).ravel(),
+        coarse=np.concatenate(coarse),
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(

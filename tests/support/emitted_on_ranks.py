@@ -67,15 +67,21 @@ def compared(name, ranks):
             "B": float(abs(B_whole - whole.B).max() / abs(whole.B).max()),
             "q": _off(joined("q", m), qp.q),
             "Fx": _off(joined("Fx", m), whole(x)),
-            "A": max(float(abs(e["A"] - A[:, e["own"]]).max()) for e in everyone)
-            / float(abs(A).max()),
+            "A": max(_largest(e["A"] - A[:, e["own"]]) for e in everyone)
+            / max(_largest(A), 1e-300),
             "b": max(_off(e["b"], qp.b) for e in everyone),
         },
     }
 
 
+def _largest(M):
+    """Return the largest size of an entry; 0 where no subdomain floats."""
+    return float(abs(M).max()) if M.shape[0] else 0.0
+
+
 def _off(found, known):
-    return float(np.abs(found - known).max() / max(np.abs(known).max(), 1e-300))
+    largest = np.abs(known).max(initial=0.0)
+    return float(np.abs(found - known).max(initial=0.0) / max(largest, 1e-300))
 
 
 def _bounds_off(found, known):

@@ -22,6 +22,7 @@ HELD = (
     "greco/n=8/feti=3/dual",
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
+ELIMINATED = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
 MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
@@ -39,7 +40,7 @@ def found(request):
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
             str(SUPPORT / "evaluated_on_ranks.py"),
-            *HELD, HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN,
+            *HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ, MINDLIN,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
@@ -47,7 +48,7 @@ def found(request):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, HERTZ])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, HERTZ, MINDLIN])
 def test_residuals_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         one = answer["by_one"]["values"]
@@ -75,8 +76,9 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         )
 
 
-def test_what_contact_alone_holds_is_certified_by_the_whole(found):
-    for answer in found[HELD_BY_CONTACT]:
+@pytest.mark.parametrize("case", [HELD_BY_CONTACT, ELIMINATED, MINDLIN])
+def test_what_contact_holds_or_is_eliminated_is_certified_by_the_whole(found, case):
+    for answer in found[case]:
         assert answer["by_ranks"]["bounds"] is None
         assert answer["by_ranks"]["notes"] == []
         assert answer["by_one"]["bound"] < 1
@@ -116,7 +118,7 @@ def test_an_exact_solution_is_recovered_across_subdomains(found):
         assert largest == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH, HERTZ])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ])
 def test_sizes_are_those_of_the_whole(found, case):
     for answer in found[case]:
         assert answer["sizes"][0] == answer["sizes"][1]

@@ -21,6 +21,8 @@ CASES = (
     "contact-patch/feti=3/slave=upper/ratio=5/glue=chain/dual",
     "membranes/S=2/n=3/dual",
     "plate/Sx=3/Sy=2/n=3/ny=2/pattern=checkerboard/jump=10/load=edge/dual",
+    "plate/Sx=3/Sy=3/n=3/ny=2/pattern=column/jump=10/supports=eliminated/dual",
+    "plate/Sx=1/Sy=4/n=2/supports=eliminated/glue=redundant/dual",
     "beam-ring/Nr=4/Nh=3/steps=5/step=1/contact=mortar/feti=4/dual",
     "hertz-plane/n=2/feti=5/dual",
     "obstacle/n=11/shape=hemisphere/feti=4/dual",
@@ -165,7 +167,8 @@ def generated(rng, count=8):
         yield (
             f"plate/Sx={n[0] % 3 + 1}/Sy={n[1] % 2 + 3}/n={n[2] % 4 + 1}/ny={n[3] % 4}/"
             f"pattern={rng.choice(['checkerboard', 'column'])}/jump=100/"
-            f"load={rng.choice(['point', 'edge', 'nodal'])}/glue={glue}/dual"
+            f"load={rng.choice(['point', 'edge', 'nodal'])}/glue={glue}/"
+            f"supports={rng.choice(['rows', 'eliminated'])}/dual"
         )
         yield f"membranes/S={n[4] % 3 + 2}/n={n[5] % 4 + 1}/glue={glue}/dual"
         yield (
@@ -210,7 +213,7 @@ def generated_with_coulomb_s_law(rng, count=3):
             f"slave={rng.choice(['upper', 'lower'])}/{method}"
         )
         yield (
-            f"hertz-cylinder/n={n[2] % 2 + 1}/m={n[3] % 2 + 1}/feti={n[4] + 4}/"
+            f"hertz-cylinder/n=1/m={n[3] % 2 + 1}/feti={n[4] + 8}/"
             f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0, 0.3, 0.7])}/"
             f"{method}"
         )
@@ -223,7 +226,7 @@ def generated_with_coulomb_s_law(rng, count=3):
     [
         "beam-ring/steps=1/dual", "beam-ring/steps=1/feti=4/primal",
         "beam-ring/kinematics=finite/steps=1/dual",
-        "plate/supports=eliminated/dual", "hertz-plane/dual",
+        "plate/primal", "hertz-plane/dual",
         "obstacle/dim=1/feti=5/dual",
     ],
 )  # fmt: skip
