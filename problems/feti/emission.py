@@ -31,7 +31,7 @@ from harness import (
     QP,
     Friction,
     InputError,
-    Reference,
+    ReferenceOverRanks,
     Solution,
     Vector,
     no_rows,
@@ -334,7 +334,9 @@ class _Rows(NamedTuple):
     total: int  #: rows of the whole
 
 
-def emitted(problem: ProblemInParts, ranks: Ranks, reference: Reference) -> Emitted:
+def emitted(
+    problem: ProblemInParts, ranks: Ranks, reference: ReferenceOverRanks
+) -> Emitted:
     """Make this rank's share of the dual; called by all ranks.
 
     The digest of a problem that others come before is that of the first of these, with
@@ -417,7 +419,7 @@ class _Dual:
 
 
 def _fixed_point(
-    dual: _Dual, reference: Reference
+    dual: _Dual, reference: ReferenceOverRanks
 ) -> tuple[list[_Dual], Callable[[], Solution]]:
     """Settle Coulomb's law; without it, the problem is the only one.
 
@@ -434,7 +436,8 @@ def _fixed_point(
 
     def normal(friction: Friction) -> Vector:
         lower, upper = dual.bounds(friction.bound)
-        found[:] = [reference(replace(qp, lb=lower, ub=upper))]
+        bounded = replace(qp, lb=lower, ub=upper)
+        found[:] = [reference(bounded, found[0] if found else None)]
         z = contact_multipliers(dual.own, dual.at, dual.scale, found[0])
         return z[:contacts]
 

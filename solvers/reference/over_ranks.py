@@ -43,8 +43,10 @@ SIGNIFICANT = 1e-12  #: of the largest multiplier, or component: a wrong sign
 ACCEPTED = 1e-9  #: KKT residual of what is called a solution
 
 
-def reference_over_ranks(qp: QP) -> Solution:
+def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """Solve a share of a dual to about rounding; called by all ranks.
+
+    start : solution of a dual with other bounds alone, whose active set is tried first
 
     Raises
     ------
@@ -53,8 +55,10 @@ def reference_over_ranks(qp: QP) -> Solution:
 
     """
     task = _Task.of(qp)
-    lower, upper = task.lower == task.upper, np.zeros(task.q.size, dtype=bool)
-    point = task.at_rest()
+    point = task.at_rest() if start is None else _Point.of(start)
+    same = task.lower == task.upper
+    lower = (point.z < 0) | same
+    upper = (point.z > 0) & ~same & np.isfinite(task.upper)
     fewest, patience = np.inf, PATIENCE
     for faces in range(1, MOST_FACES + 1):
         point = task.on_face(point.x, lower, upper)
@@ -95,6 +99,11 @@ class _Point(NamedTuple):
     x: Vector  #: (n,)
     y: Vector  #: (r,) multipliers of Gx = e, on every rank
     z: Vector  #: (n,) multipliers of bounds; negative at a lower one
+
+    @classmethod
+    def of(cls, s: Solution) -> _Point:
+        """Take this rank's part of a solution."""
+        return cls(np.asarray(s.x), np.asarray(s.y), np.asarray(s.z_box))
 
 
 @dataclass(eq=False)
