@@ -170,7 +170,8 @@ class OwnSubdomains:
     @property
     def times(self) -> NDArray[np.int64]:
         """How many copies it has on all ranks together, (N_p,)."""
-        return np.repeat(self.nodes.times, self.problem.components)[self.kept]
+        times = np.repeat(self.nodes.times, self.problem.components)
+        return np.asarray(times[self.kept])
 
     @cached_property
     def kept(self) -> slice | Nodes:

@@ -407,7 +407,9 @@ def _added(loads: Sequence[tuple[Nodes, Vector]]) -> tuple[Nodes, Vector]:
     """Add up forces at components: each component once."""
     component, force = (np.concatenate(part) for part in zip(*loads, strict=True))
     at, place = np.unique(component, return_inverse=True)
-    return at, np.bincount(place, weights=force)
+    found = np.zeros(at.size)
+    np.add.at(found, place, force)
+    return at, found
 
 
 def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
