@@ -21,6 +21,13 @@ Value = int | float | str  #: of one key of a case name
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
+class ReferenceOverRanks(Protocol):
+    """The injected high-accuracy solve of shares of a QP; called by all ranks."""
+
+    def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
+        """Solve; `start` is a solution of a QP that differs in its bounds alone."""
+
+
 class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options."""
 
@@ -188,7 +195,7 @@ class Family(ABC):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, Reference], Emitted] | None:
+    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
         """Say how ranks make their shares of what `build` would emit, complete params.
 
         All ranks call what is returned, with a reference that solves shares of a QP on
@@ -241,8 +248,8 @@ class _Offered(Family):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, Reference], Emitted] | None:
-        emit: Callable[[Ranks, Reference], Emitted] | None
+    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
+        emit: Callable[[Ranks, ReferenceOverRanks], Emitted] | None
         emit = self._own("emission")(form, params)
         return emit
 

@@ -248,12 +248,5 @@ def fits_dense(family: str, n: int) -> None:
 
 
 def emitted_on_ranks(params: Mapping[str, Value]) -> bool:
-    """Whether bodies are in subdomains, and nothing needs a solution of the whole.
-
-    Coulomb's law and Newton's method do.
-    """
-    return (
-        bool(params["feti"])
-        and params.get("friction") != "coulomb"
-        and params.get("kinematics") != "finite"
-    )
+    """Whether bodies are in subdomains, and need no Newton's method."""
+    return bool(params["feti"]) and params.get("kinematics") != "finite"

@@ -16,16 +16,24 @@ point, and a contraction where mu is small.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
-from harness import Friction, Vector
+from harness import Friction, InputError, Vector
+from harness.errors import PastEndError
 from harness.mechanics import NO_FRICTION
 from problems.contact.bodies import Bodies, ContactSides
 from problems.contact.node_to_segment import ContactRows
+from problems.fem.mesh import Nodes
+
+T = TypeVar("T")
+
+SETTLED = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
+MOST_ITERATES = 1000  #: Tresca problems of a fixed point
+PATIENCE = 30  #: of them that need not come nearer to it
 
 
 @dataclass(frozen=True)
@@ -82,3 +90,79 @@ def friction_of(
         T=rows.T, bound=cohesion + mu * pressed[place], start=rows.T @ before,
         row=rows.row, cohesion=cohesion, mu=mu,
     )  # fmt: skip
+
+
+def settled(
+    first: Friction, normal: Callable[[Friction], Vector], step: int
+) -> list[Friction]:
+    """Settle Coulomb's law: the friction of each problem of its fixed point.
+
+    All but the last say how far they are from it, `Friction.unsettled`.
+
+    Parameters
+    ----------
+    first : with the bound that it begins from
+    normal : solves the problem with the bound of a friction, and returns the
+        multipliers λ_n (m,) of the contact rows
+    step : number of the load step, which refusals name
+
+    Raises
+    ------
+    InputError
+        When the bounds do not settle, or hold no equilibrium: `normal` raises
+        ArithmeticError.
+
+    """
+    found, residuals, friction = list[Friction](), list[float](), first
+    while len(found) < MOST_ITERATES:
+        try:
+            forces = normal(friction)
+        except ArithmeticError as e:
+            raise InputError(
+                f"load step {step}: no equilibrium was found with the "
+                f"{len(found) + 1}. bound of Coulomb's law; expected supports or "
+                f"friction that hold the bodies: {e}"
+            ) from None
+        residuals.append(friction.residual(forces))
+        if residuals[-1] <= SETTLED:
+            return [*found, friction]
+        found.append(replace(friction, unsettled=residuals[-1]))
+        if len(found) - int(np.argmin(residuals)) > PATIENCE:
+            break
+        friction = replace(friction, bound=friction.demanded(forces))
+    raise InputError(
+        f"the friction of load step {step} does not settle: after {len(found)} Tresca "
+        f"problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
+        f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
+    )
+
+
+def iterate_of(problems: Sequence[T], iterate: int, step: int) -> T:
+    """Choose a problem of the fixed point of a load step: 1, 2, …; 0 is the last.
+
+    Raises
+    ------
+    PastEndError
+        When there are fewer.
+
+    """
+    if iterate > len(problems):
+        raise PastEndError(
+            f"iterate={iterate}: the fixed point of step {step} has {len(problems)} "
+            "problems; expected at most that, or 0 for the last"
+        )
+    return problems[iterate - 1]
+
+
+def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
+    """Return the normal force (places,) of each slave node; zero without a row.
+
+    Parameters
+    ----------
+    normal : (m,) multipliers of the contact rows
+    place : (m,) slave node of each, see `ContactRows`
+
+    """
+    force = np.zeros(places)
+    force[place] = np.maximum(normal, 0.0)
+    return force

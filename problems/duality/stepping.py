@@ -24,18 +24,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import (
-    QP,
-    Friction,
-    InputError,
-    Reference,
-    Solution,
-    Vector,
-    kkt_residuals,
-)
-from harness.errors import PastEndError
+from harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
 from problems.contact.bodies import Bodies
-from problems.contact.friction import FrictionLaw, friction_of
+from problems.contact.friction import (
+    FrictionLaw,
+    forces_at_nodes,
+    friction_of,
+    iterate_of,
+    settled,
+)
 from problems.contact.node_to_segment import ContactRows
 from problems.duality.dualisation import Transformed, bounded, dual_bounds, dualise
 from problems.fem.inverse import GeneralisedInverse
@@ -47,9 +44,6 @@ Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
 #: residual that a reference solve may leave: the next step is linearised there
 REFERENCE = 1e-6
-SETTLED = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
-MOST_ITERATES = 1000  #: Tresca problems of a fixed point
-PATIENCE = 30  #: of them that need not come nearer to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +127,7 @@ class LoadPath:
         """
         while len(self._steps) < k:
             self._steps.append(self._posed(len(self._steps) + 1))
-        sequence = self._steps[k - 1]
-        if iterate > len(sequence):
-            raise PastEndError(
-                f"iterate={iterate}: the fixed point of step {k} has {len(sequence)} "
-                "problems; expected at most that, or 0 for the last"
-            )
-        return sequence[iterate - 1]
+        return iterate_of(self._steps[k - 1], iterate, k)
 
     def iterates(self, k: int) -> int:
         """Count the problems of the fixed point of step k; 1 without Coulomb's law."""
@@ -200,31 +188,17 @@ class LoadPath:
 
         if not coulomb:
             return [posed(first)]
-        found, friction = list[ContactProblem](), first
-        residuals: list[float] = []
-        while len(found) < MOST_ITERATES:
-            problem = posed(friction)
-            try:
-                normal = problem.normal
-            except ArithmeticError as e:
-                raise InputError(
-                    f"load step {k}: no equilibrium was found with the "
-                    f"{len(found) + 1}. bound of Coulomb's law; expected supports or "
-                    f"friction that hold the bodies: {e}"
-                ) from None
-            residuals.append(friction.residual(normal))
-            if residuals[-1] <= SETTLED:
-                return [*found, problem]
-            unsettled = replace(friction, unsettled=residuals[-1])
-            found.append(replace(problem, friction=unsettled))
-            if len(found) - int(np.argmin(residuals)) > PATIENCE:
-                break
-            friction = replace(friction, bound=friction.demanded(normal))
-        raise InputError(
-            f"the friction of load step {k} does not settle: after {len(found)} Tresca "
-            f"problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
-            f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
-        )
+        found = list[ContactProblem]()
+
+        def normal(friction: Friction) -> Vector:
+            found.append(posed(friction))
+            return found[-1].normal
+
+        frictions = settled(first, normal, k)
+        return [
+            replace(problem, friction=friction)
+            for problem, friction in zip(found, frictions, strict=True)
+        ]
 
     @property
     def _places(self) -> int:
@@ -232,9 +206,7 @@ class LoadPath:
 
     def _pressed(self, problem: ContactProblem) -> Vector:
         """Return the normal force (places,) of each slave node; zero without a row."""
-        force = np.zeros(self._places)
-        force[problem.place] = np.maximum(problem.normal, 0.0)
-        return force
+        return forces_at_nodes(problem.normal, problem.place, self._places)
 
     def _solve(self, dual: QP, load_factor: float) -> Solution:
         s = self.reference(dual)

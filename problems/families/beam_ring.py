@@ -95,7 +95,7 @@ class BeamRing(InSubdomains):
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and nothing needs a solution of the whole."""
+        """Whether there are subdomains, and no Newton iterations."""
         return emitted_on_ranks(params)
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:

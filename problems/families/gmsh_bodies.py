@@ -95,12 +95,8 @@ class GmshBodies(InSubdomains):
         check_digest(p["path"], p["sha256"], digest(path, mesh))
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are parts, and nothing needs a solution of the whole."""
-        if not params["parts"] or params["kinematics"] == "finite":
-            return False
-        from problems.models.gmsh_bodies import laws_of
-
-        return not any(law.mu for law in laws_of(params))
+        """Whether there are parts, and no Newton iterations."""
+        return bool(params["parts"]) and params["kinematics"] == "linear"
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""

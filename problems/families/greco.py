@@ -7,22 +7,25 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
+from harness import InputError
+from problems.families.in_subdomains import InSubdomains
 from problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
     MOST,
     at_least,
+    emitted_on_ranks,
     fits,
     torn_by,
 )
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Value
+    from problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class Greco(Family):
+class Greco(InSubdomains):
     """GRECO's plate, pushed along a rigid plane with Coulomb friction (SSNV128)."""
 
     name: str = "greco"
@@ -45,6 +48,16 @@ class Greco(Family):
             )
         at_least(0, self.name, params, ("iterate",))
         torn_by(self.name, params)
+
+    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+        """Whether there are subdomains."""
+        return emitted_on_ranks(params)
+
+    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
+        """Describe the dual that ranks emit."""
+        from problems.models.greco import in_subdomains
+
+        return in_subdomains(params)
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -160,7 +160,7 @@ class HertzCylinder(InSubdomains):
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and no friction that needs a solution."""
+        """Whether there are subdomains."""
         return emitted_on_ranks(params)
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness import Family
 
 if TYPE_CHECKING:
-    from harness import Reference, Value
+    from harness import ReferenceOverRanks, Value
     from harness.distributed.vectors import Emitted, Ranks
     from problems.feti.emission import ProblemInParts
 
@@ -27,12 +27,12 @@ class InSubdomains(Family):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, Reference], Emitted] | None:
+    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
         """Return what has each rank make its share; None where one process must."""
         if form != "dual" or not self.is_emitted_by_ranks(params):
             return None
 
-        def emit(ranks: Ranks, reference: Reference) -> Emitted:
+        def emit(ranks: Ranks, reference: ReferenceOverRanks) -> Emitted:
             from problems.feti.emission import emitted
 
             return emitted(self.in_subdomains(params), ranks, reference)

@@ -92,7 +92,7 @@ class ContactPatch(InSubdomains):
         return {**params, **doubled(params, "lower", "upper")}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and nothing needs a solution first."""
+        """Whether there are subdomains, and no Newton iterations."""
         return emitted_on_ranks(params)
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:

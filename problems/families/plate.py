@@ -59,8 +59,8 @@ class Plate(InSubdomains):
         return {**params, **doubled(params, "n", "ny")}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether supports are rows of the dual."""
-        return params["supports"] == "rows"
+        """Say that there are always subdomains."""
+        return True
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""

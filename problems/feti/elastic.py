@@ -19,7 +19,7 @@ from problems.contact.bodies import (
     ContactSides,
     elasticity_matrices,
 )
-from problems.contact.friction import FrictionLaw, friction_of
+from problems.contact.friction import FrictionLaw, forces_at_nodes, friction_of
 from problems.contact.linearise import linearisation
 from problems.contact.node_to_segment import ContactRows
 from problems.contact.results import Inside, results_of
@@ -27,7 +27,7 @@ from problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
 from problems.fem.fixing import fixing_nodes
 from problems.fem.mesh import Mesh, Nodes, as_vectors, boundary_edges, dofs_of
 from problems.fem.stress import centre_stress, recover, von_mises
-from problems.feti.emission import Contact, ProblemInParts
+from problems.feti.emission import Contact, FixedPoint, ProblemInParts
 from problems.feti.gluing import glue
 from problems.feti.own_bodies import OwnSolution
 from problems.feti.structured import Layout
@@ -133,6 +133,15 @@ class Displaced(NamedTuple):
 
     u: Vector  #: (w,)
     before: Vector  #: (w,) where the slip begins
+    #: (places,) normal forces of slave nodes, which Coulomb's law begins from
+    pressed: Vector
+
+
+def at_rest(pairs: Sequence[ContactPair], pressed: float = 0.0) -> Displaced:
+    """Begin where nothing is displaced, and each slave node is pressed alike."""
+    nothing = np.zeros(2 * side_nodes(pairs).size)
+    places = sum(pair.slave.size for pair in pairs)
+    return Displaced(nothing, nothing, np.full(places, pressed))
 
 
 def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
@@ -141,25 +150,26 @@ def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
 
 
 def load_path(
-    posed: Callable[[int, Displaced | None], ProblemInParts],
+    posed: Callable[[int, Displaced], ProblemInParts],
     pairs: Sequence[ContactPair],
     steps: Sequence[int],
     *,
     quasi_static: bool,
+    pressed: float = 0.0,
 ) -> ProblemInParts:
     """Chain problems, each linearised at the solution of the one before.
 
-    As `problems.duality.stepping.LoadPath` does, without Coulomb's law.
+    As `problems.duality.stepping.LoadPath` does.
 
     Parameters
     ----------
     posed : the problem of a load step, linearised somewhere
     steps : ascending; a step that is there several times is linearised anew
     quasi_static : whether slip is that of the step
+    pressed : normal force of each slave node that the first bound of Coulomb's law is
+        of, without dimension
 
     """
-    components = dofs_of(side_nodes(pairs))
-    nothing = np.zeros(components.size)
 
     def problem(i: int, at: Displaced) -> ProblemInParts:
         found = posed(steps[i], at)
@@ -168,11 +178,32 @@ def load_path(
         )
 
     def after(i: int, at: Displaced, found: OwnSolution) -> ProblemInParts:
-        u = found.at(components)
+        u, forces = at_sides(found, pairs)
         ends = quasi_static and steps[i + 1] > steps[i]
-        return problem(i + 1, Displaced(u, u if ends else at.before))
+        return problem(i + 1, Displaced(u, u if ends else at.before, forces))
 
-    return problem(0, Displaced(nothing, nothing))
+    return problem(0, at_rest(pairs, pressed))
+
+
+def at_sides(found: OwnSolution, pairs: Sequence[ContactPair]) -> tuple[Vector, Vector]:
+    """Tell all ranks what a solution is at the sides, without dimensions.
+
+    Returns
+    -------
+    displacement (w,) of `side_nodes`, and normal forces (places,) of the slave nodes
+
+    """
+    contact = found.subdomains.problem.contact
+    u = found.at(dofs_of(side_nodes(pairs)))
+    places = sum(pair.slave.size for pair in pairs)
+    normal = found.z[: contact.place.size]
+    return u, forces_at_nodes(normal, contact.place, places)
+
+
+def tresca_problems(found: OwnSolution) -> int:
+    """Count the problems of the last fixed point; 1 without Coulomb's law."""
+    coulomb = found.subdomains.problem.coulomb
+    return 1 if coulomb is None else coulomb.problems
 
 
 class AtSides(NamedTuple):
@@ -203,6 +234,8 @@ def in_parts(
     laws: Sequence[FrictionLaw] = (),
     glue: str,
     displaced: Displaced | None = None,
+    step: int = 1,
+    iterate: int = 0,
     results: Callable[[OwnSolution, AtSides], Mapping[str, Any]] = nothing_more,
 ) -> ProblemInParts:
     """Describe elastic bodies in contact, linearised, before they are torn.
@@ -215,8 +248,9 @@ def in_parts(
     materials, plane, units, names, fixed, pairs : as of `assemble`
     load : components with a force, and the forces, N/m; each component once
     linearise : takes the rows at a displacement, m, from the nodes of the sides alone
-    laws : of friction with a given bound, one per pair
+    laws : of friction, one per pair
     displaced : where contact is linearised; None: at rest
+    step, iterate : of Coulomb's law, see `FixedPoint`
     results : reports more of what ranks have found than of all elastic bodies; called
         by all ranks
 
@@ -225,7 +259,9 @@ def in_parts(
     D = elasticity_matrices(materials, plane) * (length / force)
     E = np.array([m.E for m in materials]) * (length / force)
     share = longitudinal_share(D)
-    sides = _linearised(layout, pairs, names, units, linearise, laws, displaced)
+    at = displaced or at_rest(pairs)
+    sides = _linearised(layout, pairs, names, units, linearise, laws, at)
+    coulomb = any(law.mu for law in laws) or iterate > 1  # which there may not be
 
     def reported(found: OwnSolution) -> dict[str, Any]:
         own = found.subdomains
@@ -247,6 +283,7 @@ def in_parts(
         held=fixed,
         load=forces_at(load[0], load[1] / force), glue=glue,
         contact=sides.of_whole(layout.nodes), results=reported,
+        coulomb=FixedPoint(sides.friction, step, iterate) if coulomb else None,
     )  # fmt: skip
 
 
@@ -279,7 +316,8 @@ class _LinearisedSides:
     node: Nodes  #: (N,) their numbers in the whole
     B: csr_array  #: (m, 2N)
     c: Vector  #: (m,)
-    friction: Friction  #: none without rows
+    friction: Friction  #: none without rows; with the first bound of Coulomb's law
+    place: Nodes  #: (m,) slave node of each row
 
     def of_whole(self, nodes: int) -> Contact:
         """Give the rows the columns of all components of so many nodes."""
@@ -289,7 +327,7 @@ class _LinearisedSides:
             c = np.append(c, friction.start)
         column = dofs_of(self.node)[B.indices]
         rows = csr_array((B.data, column, B.indptr), shape=(B.shape[0], 2 * nodes))
-        return Contact(rows, c, friction.bound)
+        return Contact(rows, c, friction.bound, self.place)
 
     def found(self, found: OwnSolution) -> AtSides:
         """Gather what ranks have found along the sides; called by all of them."""
@@ -304,7 +342,8 @@ class _LinearisedSides:
             status=Status.SOLVED, x=found.at(at), y=np.zeros(0), z=found.z,
             z_box=np.zeros(at.size),
         )  # fmt: skip
-        return AtSides(self.bodies, primal, s, self.friction)
+        bound = found.subdomains.problem.contact.bound
+        return AtSides(self.bodies, primal, s, replace(self.friction, bound=bound))
 
 
 def _linearised(
@@ -314,13 +353,11 @@ def _linearised(
     units: tuple[float, float],
     linearise: Callable[[ContactSides, Vector], ContactRows],
     laws: Sequence[FrictionLaw],
-    displaced: Displaced | None,
+    displaced: Displaced,
 ) -> _LinearisedSides:
     """Linearise contact, as of `in_parts`."""
     length, force = units
     node = side_nodes(pairs)
-    nothing = np.zeros(2 * node.size)
-    u, before = displaced or Displaced(nothing, nothing)
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
         body_of_node=np.asarray(layout.body[layout.holder(node)]), names=names,
@@ -330,11 +367,11 @@ def _linearised(
         ),
         length=length, force=force,
     )  # fmt: skip
-    rows = linearise(bodies, u * length)
-    pressed = np.zeros(sum(pair.slave.size for pair in pairs))
+    rows = linearise(bodies, displaced.u * length)
     return _LinearisedSides(
         bodies=bodies, node=node, B=csr_array(rows.B), c=rows.c / length,
-        friction=friction_of(bodies, rows, laws, before, pressed),
+        friction=friction_of(bodies, rows, laws, displaced.before, displaced.pressed),
+        place=rows.place,
     )  # fmt: skip
 
 

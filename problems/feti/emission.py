@@ -27,16 +27,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from harness import QP, InputError, Reference, Vector, no_rows
+from harness import (
+    QP,
+    Friction,
+    InputError,
+    ReferenceOverRanks,
+    Solution,
+    Vector,
+    no_rows,
+)
 from harness.digest import hex_digest
 from harness.distributed.vectors import (
     EMITTED,
     DistributedColumns,
+    DistributedVector,
     Emitted,
     Ranks,
     Share,
     distributed,
 )
+from problems.contact.friction import iterate_of, settled
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import (
     Halo,
@@ -46,7 +56,7 @@ from problems.feti.distributed import (
     halo,
     owners,
 )
-from problems.feti.gluing import GLUE
+from problems.feti.gluing import GLUE, without
 from problems.feti.operators import (
     DualOperator,
     block_bytes,
@@ -57,7 +67,7 @@ from problems.feti.own_bodies import (
     OwnSolution,
     Results,
     answers,
-    holds_all,
+    contact_multipliers,
     own_solution,
 )
 from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
@@ -71,6 +81,17 @@ class Contact(NamedTuple):
     rows: csr_array  #: (m_I, n) columns are components of the whole
     c: Vector  #: (m_I,)
     bound: Vector  #: (k,) of the last rows, those of friction with a given bound
+    #: (m_I − k,) slave node of each row of contact; none where nobody asks
+    place: Nodes = np.zeros(0, dtype=np.int64)
+
+
+class FixedPoint(NamedTuple):
+    """Coulomb's law as a sequence of given bounds (`problems.contact.friction`)."""
+
+    friction: Friction  #: of the rows of friction, with the bound that it begins from
+    step: int  #: number of the load step, which refusals name
+    iterate: int  #: the problem that is emitted, 1, 2, …; 0: the last
+    problems: int = 0  #: how many there are, once they are solved
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,11 +108,16 @@ class ProblemInParts:
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
     held: Nodes  #: components of the whole that are zero, in the order of their rows
+    #: whether these are eliminated, as by `problems.feti.gluing.without_supports`, and
+    #: have no rows; axes of subdomains are those of the whole there
+    eliminated: bool = False
     contact: Contact
+    coulomb: FixedPoint | None = None  #: where the bound is that of Coulomb's law
     glue: str  #: how copies are glued, one of `problems.feti.gluing.GLUE`
     #: what an answer means physically; None where only the whole tells
     results: Results | None = None
-    #: what follows once this is solved, and is emitted in its place; None where this is
+    #: what follows once this, and the fixed point of Coulomb's law, is solved, and is
+    #: emitted in its place; None where this is
     then: Callable[[OwnSolution], ProblemInParts] | None = None
 
     @cached_property
@@ -145,13 +171,26 @@ class OwnSubdomains:
     @property
     def component(self) -> Nodes:
         """Component of the whole that each torn unknown is a copy of, (N_p,)."""
+        return self._component[self.kept]
+
+    @property
+    def _component(self) -> Nodes:
+        """Of those that are eliminated, too."""
         d = self.problem.components
         return np.asarray((d * self.nodes.number[:, None] + np.arange(d)).ravel())
 
     @property
     def times(self) -> NDArray[np.int64]:
         """How many copies it has on all ranks together, (N_p,)."""
-        return np.repeat(self.nodes.times, self.problem.components)
+        times = np.repeat(self.nodes.times, self.problem.components)
+        return np.asarray(times[self.kept])
+
+    @cached_property
+    def kept(self) -> slice | Nodes:
+        """Choose the torn unknowns among all components of all torn nodes."""
+        if not self.problem.eliminated:
+            return slice(None)
+        return np.flatnonzero(~np.isin(self._component, self.problem.held))
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
@@ -176,6 +215,16 @@ class OwnSubdomains:
                 problem.kind(Part(at, cells, np.full(len(cells), material[s])))
             )
         return Subdomains(tuple(kinds), kind), rotation
+
+    @cached_property
+    def domains(self) -> Subdomains:
+        """Its subdomains on their own."""
+        found = self._classified[0]
+        if not self.problem.eliminated:
+            return found
+        free = np.zeros(int(found.start[-1]), dtype=bool)
+        free[self.kept] = True
+        return without(found, free)
 
     def _leaders(
         self, own: list[tuple[int, Hashable, Points]]
@@ -210,47 +259,54 @@ class OwnSubdomains:
         return found
 
     @property
-    def domains(self) -> Subdomains:
-        """Its subdomains on their own."""
-        return self._classified[0]
-
-    @property
     def rotation(self) -> NDArray[np.float64]:
         """(S_p, 2, 2) turns each from the axes of its kind to those of the whole."""
         return self._classified[1]
 
+    @cached_property
+    def motions(self) -> NDArray[np.int64]:
+        """First rigid motion of each subdomain of the whole, and how many: (S + 1,)."""
+        modes = np.array([kind.R.shape[1] for kind in self.domains.kinds])
+        found = np.zeros(self.rank.size, dtype=np.int64)
+        own = self.number, modes[self.domains.kind]
+        for number, count in self.ranks.comm.allgather(own):
+            found[number] = count
+        return np.concatenate([[0], np.cumsum(found)])
+
     @property
     def coarse(self) -> int:
         """How many rigid motions all subdomains have together."""
-        return self.rank.size * int(self.domains.kinds[0].R.shape[1])
+        return int(self.motions[-1])
 
     @cached_property
     def f(self) -> Vector:
         """Its part of the load, (N_p,) in the axes of subdomains."""
         d = self.problem.components
-        found = self.problem.load(self.component) / self.times
+        times = np.repeat(self.nodes.times, d)
+        found = self.problem.load(self._component) / times
         if d > 1:
             loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
             turn = self.rotation[self.nodes.subdomain[loaded]]
             shared = found.reshape(-1, d)
             shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
-        return np.asarray(found)
+        return np.asarray(found[self.kept])
 
-    def resultants(
-        self, unknown: Nodes, value: Vector
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return Rᵀ of single forces: coarse numbers and values, both (k, r).
+    def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
+        """Return Rᵀ of single forces (k, r), in the columns of the rigid motions.
 
         unknown, value : torn unknowns and the forces there, (k,)
         """
         domains = self.domains
-        modes = domains.kinds[0].R.shape[1]
         of = np.searchsorted(domains.start, unknown, side="right") - 1
-        R = np.concatenate([kind.R for kind in domains.kinds])
-        first = np.cumsum([0, *(kind.R.shape[0] for kind in domains.kinds)])
-        at = first[domains.kind[of]] + unknown - domains.start[of]
-        number = modes * self.number[of][:, None] + np.arange(modes)
-        return number, R[at] * value[:, None]
+        R = np.concatenate([kind.R.ravel() for kind in domains.kinds])
+        first = np.cumsum([0, *(kind.R.size for kind in domains.kinds)])
+        modes = np.diff(self.motions)[self.number[of]]
+        at = first[domains.kind[of]] + modes * (unknown - domains.start[of])
+        ends = np.concatenate([[0], np.cumsum(modes)])
+        along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
+        entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
+        column = np.repeat(self.motions[self.number[of]], modes) + along
+        return csr_array((entries, column, ends), shape=(unknown.size, self.coarse))
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
@@ -270,6 +326,15 @@ class OwnSubdomains:
         """Its rows of B."""
         return _rows(self)
 
+    def bounded(self, coulomb: FixedPoint) -> OwnSubdomains:
+        """Hold the same with the bound of another problem of the fixed point."""
+        contact = self.problem.contact._replace(bound=coulomb.friction.bound)
+        problem = replace(self.problem, contact=contact, coulomb=coulomb)
+        found = replace(self, problem=problem)
+        # nothing that is remembered here depends on the bound
+        vars(found).update({**vars(self), "problem": problem})
+        return found
+
 
 class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
@@ -278,13 +343,13 @@ class _Rows(NamedTuple):
     B: csr_array  #: (t, N_p)
     reach: csr_array  #: (t, ranks) which ranks touch them
     c: Vector  #: (t,)
-    lower: Vector  #: (t,) bounds of the multipliers
-    upper: Vector  #: (t,)
     equalities: int  #: of all rows of the whole
     total: int  #: rows of the whole
 
 
-def emitted(problem: ProblemInParts, ranks: Ranks, reference: Reference) -> Emitted:
+def emitted(
+    problem: ProblemInParts, ranks: Ranks, reference: ReferenceOverRanks
+) -> Emitted:
     """Make this rank's share of the dual; called by all ranks.
 
     The digest of a problem that others come before is that of the first of these, with
@@ -298,65 +363,119 @@ def emitted(problem: ProblemInParts, ranks: Ranks, reference: Reference) -> Emit
     ------
     InputError
         Where there are fewer subdomains than ranks, ranks know different ones, or
-        something comes before and supports do not hold all bodies.
+        Coulomb's law does not settle or has less problems than are asked for.
 
     """
     rank = _agreed(problem, ranks)
     dual, before = _dual(OwnSubdomains(problem, ranks, rank)), list[str]()
+    sequence, solved = _fixed_point(dual, reference)
     while (then := dual.own.problem.then) is not None:
-        if not holds_all(dual.own.problem):
-            raise InputError(
-                "the supports leave a rigid motion of some body, which load steps and "
-                "re-linearisations do not allow; expected steps=1 and relin=1"
-            )
-        before.append(before[0] if before else _digest(dual.own))
-        found = own_solution(dual.own, dual.at, dual.scale, reference(dual.share().qp))
+        before += (before[:1] or [_digest(dual.own)]) * len(sequence)
+        last = sequence[-1]
+        found = own_solution(last.own, last.at, last.scale, solved())
         dual = _dual(OwnSubdomains(then(found), ranks, rank))
-    own, q = dual.own, dual.share().qp
+        sequence, solved = _fixed_point(dual, reference)
+    chosen = _chosen(sequence)
+    if others := sequence.index(chosen):
+        before += (before[:1] or [_digest(dual.own)]) * others
+    own, (lower, upper) = chosen.own, chosen.bounds(chosen.own.problem.contact.bound)
 
     def digest() -> str:
         return EMITTED + hex_digest(map(str.encode, before or [_digest(own)]), 16)
 
     return Emitted(
         variables=own.rows.total, equality_rows=own.coarse,
-        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in (q.lb, q.ub)),
-        share=dual.share, digest=digest,
-        answer=answers(own, dual.at, dual.scale, _torn(own, dual.explicit)),
+        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in (lower, upper)),
+        share=chosen.share, digest=digest,
+        answer=answers(own, chosen.at, chosen.scale, _torn(own, chosen.explicit)),
     )  # fmt: skip
 
 
-class _Dual(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Dual:
     """What this rank has made of a problem."""
 
     own: OwnSubdomains
     at: Halo
     scale: Vector  #: (m,) of the rows of contact and friction
     explicit: NDArray[np.bool_]  #: kinds whose blocks are formed
-    share: Callable[[], Share]
+    q: Vector  #: (o,) of own rows
+    G: csr_array  #: (r, o)
+    b: Vector  #: (r,)
+
+    def share(self) -> Share:
+        """Put the operator together, without any factor."""
+        rows, domains, ranks = self.own.rows, self.own.domains, self.own.ranks
+        anew = Subdomains(tuple(map(replace, domains.kinds)), domains.kind)
+        local = DualOperator(rows.B, anew, self.explicit, rows.equalities)
+        lower, upper = self.bounds(self.own.problem.contact.bound)
+        part = QP(
+            P=RankOperator(local, self.at), q=distributed(self.q, ranks),
+            lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
+            A=DistributedColumns(self.G, ranks), b=self.b,
+        )  # fmt: skip
+        return Share(part, gathered_on_one(self.at, rows.total))
+
+    def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
+        """Bound the multipliers of own rows (o,), those of friction by (k,)."""
+        ranks, E = self.own.ranks, self.own.rows.equalities
+        pressing = self.scale.size - bound.size
+        bound = bound / self.scale[pressing:]
+        below = np.concatenate([np.zeros(pressing), -bound])
+        above = np.concatenate([np.full(pressing, np.inf), bound])
+        number = self.at.rows[self.at.own]
+        touching = number >= E
+        lower, upper = (np.full(number.size, x) for x in (-np.inf, np.inf))
+        lower[touching] = below[number[touching] - E]
+        upper[touching] = above[number[touching] - E]
+        return distributed(lower, ranks), distributed(upper, ranks)
+
+
+def _fixed_point(
+    dual: _Dual, reference: ReferenceOverRanks
+) -> tuple[list[_Dual], Callable[[], Solution]]:
+    """Settle Coulomb's law; without it, the problem is the only one.
+
+    Returns
+    -------
+    the problems of the fixed point, and the solution of the last
+
+    """
+    coulomb = dual.own.problem.coulomb
+    if coulomb is None:
+        return [dual], lambda: reference(dual.share().qp)
+    qp, found = dual.share().qp, list[Solution]()
+    contacts = dual.scale.size - coulomb.friction.bound.size
+
+    def normal(friction: Friction) -> Vector:
+        lower, upper = dual.bounds(friction.bound)
+        bounded = replace(qp, lb=lower, ub=upper)
+        found[:] = [reference(bounded, found[0] if found else None)]
+        z = contact_multipliers(dual.own, dual.at, dual.scale, found[0])
+        return z[:contacts]
+
+    frictions = settled(coulomb.friction, normal, coulomb.step)
+    known = coulomb._replace(problems=len(frictions))
+    owns = [dual.own.bounded(known._replace(friction=f)) for f in frictions]
+    return [replace(dual, own=own) for own in owns], lambda: found[0]
+
+
+def _chosen(sequence: list[_Dual]) -> _Dual:
+    """Choose the problem of a fixed point that is asked for."""
+    coulomb = sequence[-1].own.problem.coulomb
+    if coulomb is None:
+        return sequence[-1]
+    return iterate_of(sequence, coulomb.iterate, coulomb.step)
 
 
 def _dual(own: OwnSubdomains) -> _Dual:
     rows, domains, ranks = own.rows, own.domains, own.ranks
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
-    mine = at.own
-    q = rows.c[mine] - at.added(rows.B @ domains.inverse(own.f))
-    lower, upper = rows.lower[mine], rows.upper[mine]
-    G, b = _coarse_rows(own, at.rows[mine]), _resultants(own)
-    explicit, kinds = explicit_kinds(rows.B, domains), domains.kinds
-    B, kind, equalities, total = rows.B, domains.kind, rows.equalities, rows.total
-
-    def share() -> Share:
-        anew = Subdomains(tuple(map(replace, kinds)), kind)  # without any factor
-        local = DualOperator(B, anew, explicit, equalities)
-        part = QP(
-            P=RankOperator(local, at), q=distributed(q, ranks),
-            lb=distributed(lower, ranks), ub=distributed(upper, ranks),
-            G=no_rows(q.size), h=np.zeros(0),
-            A=DistributedColumns(G, ranks), b=b,
-        )  # fmt: skip
-        return Share(part, gathered_on_one(at, total))
-
-    return _Dual(own, at, own.problem.contact_scale, explicit, share)
+    return _Dual(
+        own, at, own.problem.contact_scale, explicit_kinds(rows.B, domains),
+        q=rows.c[at.own] - at.added(rows.B @ domains.inverse(own.f)),
+        G=_coarse_rows(own, at.rows[at.own]), b=_resultants(own),
+    )  # fmt: skip
 
 
 def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
@@ -463,10 +582,15 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
 def _rows(own: OwnSubdomains) -> _Rows:
     """Fill the rows of B, numbered as by `problems.feti.gluing.glue`."""
     problem, ranks = own.problem, own.ranks
-    parts = [_supports(own), _glued(own), _contact(own)]
+    parts = [_glued(own), _contact(own)]
+    if not problem.eliminated:
+        parts.insert(0, _supports(own))
     row, column, value = (np.concatenate(p) for p in list(zip(*parts, strict=True))[:3])
     number, place = np.unique(row, return_inverse=True)
-    B = csr_array((value, (place, column)), shape=(number.size, own.component.size))
+    unknowns = problem.components * own.nodes.number.size
+    B = csr_array((value, (place, column)), shape=(number.size, unknowns))
+    if problem.eliminated:
+        B = csr_array(B[:, own.kept])
     pairs = np.concatenate([part.reached for part in parts])
     pairs = pairs[np.isin(pairs[:, 0], number)]
     reach = csr_array(
@@ -479,16 +603,11 @@ def _rows(own: OwnSubdomains) -> _Rows:
     reach.sort_indices()
     reach.data[:] = 1
     contact, scale = problem.contact, problem.contact_scale
-    rubbing = contact.bound.size  # the last rows, of which both bounds are finite
-    bound = contact.bound / scale[scale.size - rubbing :]
-    below = np.concatenate([np.zeros(scale.size - rubbing), -bound])
-    above = np.concatenate([np.full(scale.size - rubbing, np.inf), bound])
     E = _equalities(problem)
     touching = number >= E
-    c, lower, upper = (np.full(number.size, x) for x in (0.0, -np.inf, np.inf))
-    for whole, part in ((scale * contact.c, c), (below, lower), (above, upper)):
-        part[touching] = whole[number[touching] - E]
-    return _Rows(number, B, reach, c, lower, upper, E, E + scale.size)
+    c = np.zeros(number.size)
+    c[touching] = (scale * contact.c)[number[touching] - E]
+    return _Rows(number, B, reach, c, E, E + scale.size)
 
 
 def _supports(own: OwnSubdomains) -> Entries:
@@ -533,7 +652,7 @@ def _glued(own: OwnSubdomains) -> Entries:
     d = problem.components
     held = np.sort(problem.held)
     held_times = of.times(held // d)
-    base = int(held_times.sum())
+    base = 0 if problem.eliminated else int(held_times.sum())
     none = np.zeros(0, dtype=np.int64)
     found = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
     for m, nodes_with in sorted(of.having.items()):
@@ -605,7 +724,7 @@ def _equalities(problem: ProblemInParts) -> int:
         len(GLUE[problem.glue](m)) * (d * count - int((times == m).sum()))
         for m, count in of.having.items()
     )
-    return int(times.sum()) + glued
+    return glued if problem.eliminated else int(times.sum()) + glued
 
 
 def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
@@ -613,10 +732,7 @@ def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
     ranks, rows = own.ranks, own.rows
     B, t = rows.B, rows.number.size
     unknown, place = np.unique(B.indices, return_inverse=True)
-    coarse, value = own.resultants(unknown, np.ones(unknown.size))
-    r, modes = own.coarse, coarse.shape[1]
-    ends = modes * np.arange(unknown.size + 1)
-    R = csr_array((value.ravel(), coarse.ravel(), ends), shape=(unknown.size, r))
+    R = own.resultants(unknown, np.ones(unknown.size))
     touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
     part = csr_array(touched @ R)
     owner = owners(rows.number, rows.reach)
@@ -635,8 +751,8 @@ def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
 def _resultants(own: OwnSubdomains) -> Vector:
     """Return Rᵀf (3S,) of all subdomains."""
     loaded = np.flatnonzero(own.f)
-    coarse, value = own.resultants(loaded, own.f[loaded])
+    mine = own.resultants(loaded, own.f[loaded])
     found = np.zeros(own.coarse)
-    for number, part in own.ranks.comm.allgather((coarse, value)):
+    for number, part in own.ranks.comm.allgather((mine.indices, mine.data)):
         np.add.at(found, number, part)
     return found

@@ -30,7 +30,7 @@ from scipy.sparse import bsr_array, csc_array, csr_array, diags_array, eye_array
 from harness import Vector
 from problems.fem.mesh import Nodes
 from problems.feti.tearing import Decomposition
-from problems.feti.torn import Kind, Torn
+from problems.feti.torn import Kind, Subdomains, Torn
 
 Weights = Callable[[int], NDArray[np.float64]]
 
@@ -175,19 +175,25 @@ def without_supports(torn: Torn, held: Nodes) -> Torn:
     kept = np.flatnonzero(free)
     B = csr_array(torn.B[:, kept])
     rows = np.flatnonzero((np.diff(B.indptr) > 0) | (np.arange(B.shape[0]) >= E))
-    kinds, kind = list[Kind](), np.empty_like(torn.kind)
-    known = dict[tuple[int, bytes], int]()
-    for s, k in enumerate(torn.kind):
-        mine = free[torn.start[s] : torn.start[s + 1]]
-        found = known.setdefault((int(k), mine.tobytes()), len(kinds))
-        if found == len(kinds):
-            kinds.append(_held(torn.kinds[k], mine))
-        kind[s] = found
+    domains = without(torn.domains, free)
     return Torn(
-        kinds=tuple(kinds), kind=kind, spread=csr_array(torn.spread[kept]),
+        kinds=domains.kinds, kind=domains.kind, spread=csr_array(torn.spread[kept]),
         B=csr_array(B[rows]), c=torn.c[rows], scale=torn.scale[rows], f=torn.f[kept],
         equalities=int((rows < E).sum()),
     )  # fmt: skip
+
+
+def without(domains: Subdomains, free: NDArray[np.bool_]) -> Subdomains:
+    """Return subdomains without all but their free torn unknowns (N,)."""
+    kinds, kind = list[Kind](), np.empty_like(domains.kind)
+    known = dict[tuple[int, bytes], int]()
+    for s, k in enumerate(domains.kind):
+        mine = free[domains.start[s] : domains.start[s + 1]]
+        found = known.setdefault((int(k), mine.tobytes()), len(kinds))
+        if found == len(kinds):
+            kinds.append(_held(domains.kinds[k], mine))
+        kind[s] = found
+    return Subdomains(tuple(kinds), kind)
 
 
 def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:

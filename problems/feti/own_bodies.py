@@ -76,12 +76,23 @@ def own_solution(
     v = own.domains.inverse(own.f - rows.B.T @ touched)
     v -= R @ np.asarray(s.y)[bodies.coarse]
     u = bodies.among.completed(T.T @ v) / times
+    z = contact_multipliers(own, halo, scale, s)
+    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+
+
+def contact_multipliers(
+    own: OwnSubdomains, halo: Halo, scale: Vector, s: Solution
+) -> Vector:
+    """Tell all ranks the multipliers (m,) of the rows of contact and friction.
+
+    scale : (m,) by which these rows are multiplied
+    """
+    rows = own.rows
     owned = rows.number[halo.own]
     is_contact = owned >= rows.equalities
     z = np.zeros(scale.size)
     z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
-    z = scale * own.ranks.total(z)
-    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+    return np.asarray(scale * own.ranks.total(z))
 
 
 def answers(
@@ -90,7 +101,7 @@ def answers(
     """Make what says what an answer means, on each rank for its own.
 
     Where the supports leave a rigid motion of some body, only the whole knows what
-    holds it.
+    holds it; where they are eliminated, subdomains do not float, as is taken here.
 
     Parameters
     ----------
@@ -101,6 +112,8 @@ def answers(
     problem, is_held = own.problem, holds_all(own.problem)
 
     def answer(s: Solution) -> Answered:
+        if problem.eliminated:
+            return Answered(None, None)
         found, results = own_solution(own, halo, scale, s), None
         if (reported := problem.results) is not None:
 
@@ -126,7 +139,8 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     times = np.empty(components.size)
     times[place] = own.times
     T = _spread(own, place, components.size)
-    modes = domains.kinds[0].R.shape[1]
+    first, end = own.motions[own.number], own.motions[own.number + 1]
+    coarse = [np.arange(*motions) for motions in zip(first, end, strict=True)]
     torn = Torn(
         kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
         scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
@@ -134,7 +148,7 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     return OwnBodies(
         ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
         shared=np.bincount(place, minlength=times.size) < times,
-        coarse=(modes * own.number[:, None] + np.arange(modes)).ravel(),
+        coarse=np.concatenate(coarse),
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(
@@ -169,9 +183,9 @@ def holds_all(problem: ProblemInParts) -> bool:
     body = of.body[of.holder(node)]
     for b in range(problem.E.size):
         own = body == b
+        if not own.any():
+            return False
         if d == 1:
-            if not own.any():
-                return False
             continue
         points = of.position(node[own])
         size = np.ptp(points, axis=0).max(initial=0.0) or 1.0

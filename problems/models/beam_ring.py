@@ -114,13 +114,13 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     sides, layout = joined_sides(grids), Layout.of(grids, p["feti"])
     tip, pairs = _tip(sides), (_pair(sides),)
 
-    def posed(step: int, displaced: Displaced | None) -> ProblemInParts:
+    def posed(step: int, displaced: Displaced) -> ProblemInParts:
         return in_parts(
             layout, materials=(BEAM, RING), plane=p["plane"],
             units=(LENGTH, LOAD), names=NAMES, fixed=_clamps(sides),
             load=(tip[1:], np.array([-LOAD * (step / p["steps"])])), pairs=pairs,
             linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
-            glue=p["glue"], displaced=displaced,
+            glue=p["glue"], displaced=displaced, step=step, iterate=p["iterate"],
             results=lambda found, _: {"tip": (found.at(tip) * LENGTH).tolist()},
         )  # fmt: skip
 

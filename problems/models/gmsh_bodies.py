@@ -42,6 +42,7 @@ from problems.feti.elastic import (
     torn,
 )
 from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import holds_all
 from problems.feti.partition import graph_partition
 from problems.feti.subdivision import mesh_in_parts
 from problems.models.description import (
@@ -138,18 +139,25 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     named = np.concatenate([fixed, bodies.interface]) // 2
     layout, pairs = mesh_in_parts(mesh, label, bodies.body, named), bodies.pairs
 
-    def posed(step: int, displaced: Displaced | None) -> ProblemInParts:
+    def posed(step: int, displaced: Displaced) -> ProblemInParts:
         force = bodies.f[loaded] * (bodies.force * (step / p["steps"]))
         return in_parts(
             layout, materials=bodies.materials, plane=bodies.plane,
             units=(bodies.length, bodies.force), names=bodies.names, fixed=fixed,
             load=(loaded, force), pairs=pairs, linearise=linearised_by(*method, laws),
-            laws=laws, glue=p["glue"], displaced=displaced,
+            laws=laws, glue=p["glue"], displaced=displaced, step=step,
+            iterate=p["iterate"],
         )  # fmt: skip
 
     steps = np.repeat(np.arange(1, p["step"] + 1), p["relin"]).tolist()
-    quasi_static = p["loading"] == "quasi-static"
-    return load_path(posed, pairs, steps, quasi_static=quasi_static)
+    is_single = len(steps) == 1  # as of `single_load`, friction may hold bodies then
+    problem = load_path(
+        posed, pairs, steps, quasi_static=p["loading"] == "quasi-static",
+        pressed=float(np.abs(bodies.f).sum()) if is_single else 0.0,
+    )  # fmt: skip
+    if not is_single and not holds_all(problem):
+        raise _unsupported(p["path"])
+    return problem
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
@@ -195,14 +203,18 @@ def _path(
     try:
         inverse = _clamped(*source)
     except InputError:
-        raise InputError(
-            f"{source[0]}: the supports leave a rigid motion of some body, which load "
-            "steps and re-linearisations do not allow; expected steps=1 and relin=1"
-        ) from None
+        raise _unsupported(source[0]) from None
     return LoadPath(
         bodies, linearisation(bodies, *method, laws), lambda: inverse, reference, steps,
         relin, laws=laws, quasi_static=quasi_static,
     )  # fmt: skip
+
+
+def _unsupported(path: str) -> InputError:
+    return InputError(
+        f"{path}: the supports leave a rigid motion of some body, which load "
+        "steps and re-linearisations do not allow; expected steps=1 and relin=1"
+    )
 
 
 @lru_cache(maxsize=4)

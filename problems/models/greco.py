@@ -23,6 +23,7 @@ from harness import QP, Case, Friction, Reference, Solution, Value, Vector
 from problems.contact.bodies import (
     Bodies,
     ContactPair,
+    ContactSides,
     assemble,
     clamped,
     floating,
@@ -34,13 +35,25 @@ from problems.contact.rigid_plane import above_plane
 from problems.duality.case_forms import contact_case
 from problems.duality.stepping import LoadPath
 from problems.fem.elasticity import Material
-from problems.fem.mesh import nodal_lengths, rectangle
-from problems.feti.elastic import posed_on, subdivide
+from problems.fem.mesh import Nodes, StructuredGrid, nodal_lengths, rectangle_grid
+from problems.feti.elastic import (
+    AtSides,
+    SubdividedBodies,
+    in_parts,
+    posed_on,
+    subdivide,
+    tresca_problems,
+)
+from problems.feti.emission import ProblemInParts
+from problems.feti.own_bodies import OwnSolution
+from problems.feti.structured import Layout
 from problems.feti.tearing import blocks
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
+NAMES = ("plate",)
 TOP, LEFT = 5e7, 15e7  #: pressures, Pa
+UNITS = (SIDE, TOP * SIDE)  #: l and F₀, m and N/m
 PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: m
 PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
 FORCE_AT = 38.75e-3  #: m
@@ -57,8 +70,7 @@ def greco(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
         floating=lambda: floating(bodies), clamped=lambda: path.inverse,
         supported=lambda: supported(bodies), friction=friction,
         torn=posed_on(
-            params, lambda: subdivide(bodies, blocks((p["n"], p["n"]), p["feti"])),
-            primal, friction,
+            params, lambda: subdivided(bodies, p["n"], p["feti"]), primal, friction
         ),
         quantities=lambda s: quantities(bodies, primal, s, friction)
         | along_the_side(bodies, primal, s, friction) | {"tresca_problems": count},
@@ -67,23 +79,67 @@ def greco(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
 
 def plate(n: int) -> Bodies:
     """Mesh and assemble the plate with n × n cells."""
-    mesh = rectangle((0.0, 0.0), (SIDE, SIDE), (n, n))
-    top, left, right, bottom = (
-        mesh.boundaries[side] for side in ("top", "left", "right", "bottom")
-    )
+    grid = _grid(n)
+    mesh, (component, force) = grid.mesh(), _pressure(grid)
     load = np.zeros(mesh.dofs)
-    load[2 * top + 1] -= TOP * nodal_lengths(mesh.points[top])
-    load[2 * left] += LEFT * nodal_lengths(mesh.points[left])
+    load[component] = force
     return assemble(
-        mesh, np.zeros(n**2, dtype=np.int64), names=("plate",), materials=(MATERIAL,),
-        plane="strain", units=(SIDE, TOP * SIDE),
-        fixed=np.append(2 * right, 2 * bottom[-1] + 1), load=load,
-        pairs=(ContactPair(bottom[:-1], np.zeros(0, dtype=np.int64)),),
+        mesh, np.zeros(n**2, dtype=np.int64), names=NAMES, materials=(MATERIAL,),
+        plane="strain", units=UNITS, fixed=_supports(grid), load=load,
+        pairs=(_on_rigid(grid),),
     )  # fmt: skip
 
 
+def subdivided(bodies: Bodies, n: int, most: int) -> SubdividedBodies:
+    """Cut the plate into subdomains of at most so many cells a side."""
+    return subdivide(bodies, blocks((n, n), most), Layout.of((_grid(n),), most))
+
+
+def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+    """Describe the first problem of the fixed point in subdomains."""
+    p: Any = params
+    grid = _grid(p["n"])
+
+    def results(found: OwnSolution, at: AtSides) -> dict[str, Any]:
+        told = along_the_side(at.bodies, at.primal, at.solution, at.friction)
+        return told | {"tresca_problems": tresca_problems(found)}
+
+    return in_parts(
+        Layout.of((grid,), p["feti"]), materials=(MATERIAL,), plane="strain",
+        units=UNITS, names=NAMES, fixed=_supports(grid), load=_pressure(grid),
+        pairs=(_on_rigid(grid),),
+        linearise=lambda side, _: above_plane(
+            side.mesh, side.pairs[0].slave, tangential=True
+        ),
+        laws=(FrictionLaw("coulomb", mu=p["mu"]),), glue=p["glue"],
+        iterate=p["iterate"], results=results,
+    )  # fmt: skip
+
+
+def _grid(n: int) -> StructuredGrid:
+    return rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
+
+
+def _pressure(grid: StructuredGrid) -> tuple[Nodes, Vector]:
+    """Return the components on the top and the left, and the forces there, N/m."""
+    component = 2 * grid.sides["top"] + 1, 2 * grid.sides["left"]
+    force = (
+        -TOP * nodal_lengths(grid.side("top")), LEFT * nodal_lengths(grid.side("left"))
+    )  # fmt: skip
+    return np.concatenate(component), np.concatenate(force)
+
+
+def _supports(grid: StructuredGrid) -> Nodes:
+    """Return the components that are held."""
+    return np.append(2 * grid.sides["right"], 2 * grid.sides["bottom"][-1] + 1)
+
+
+def _on_rigid(grid: StructuredGrid) -> ContactPair:
+    return ContactPair(grid.sides["bottom"][:-1], np.zeros(0, dtype=np.int64))
+
+
 def along_the_side(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction
+    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
     """Report what was published; between nodes, by linear interpolation.
 

@@ -34,12 +34,13 @@ Their load is therefore smaller unless it is set.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
 from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vector
@@ -52,7 +53,7 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import law_of
+from problems.contact.friction import FrictionLaw, law_of
 from problems.contact.linearise import linearisation
 from problems.contact.node_to_segment import ContactRows
 from problems.contact.results import contact_forces, quantities
@@ -63,14 +64,25 @@ from problems.duality.newton import NewtonPath
 from problems.duality.newton_case import newton_case, newton_path
 from problems.duality.stepping import LoadPath, State, primal_qp
 from problems.fem.elasticity import Material, Plane
-from problems.fem.mesh import HalfDisc, Mesh, Nodes, join, joined_sides, nodal_lengths
+from problems.fem.mesh import (
+    HalfDisc,
+    Mesh,
+    Nodes,
+    dofs_of,
+    join,
+    joined_sides,
+    nodal_lengths,
+)
 from problems.feti.elastic import (
     AtSides,
+    Displaced,
     SubdividedBodies,
+    at_sides,
     in_parts,
     linearised_by,
     posed_on,
     subdivide,
+    tresca_problems,
 )
 from problems.feti.emission import ProblemInParts
 from problems.feti.own_bodies import OwnSolution
@@ -251,8 +263,7 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
     sides, load = mesh.boundaries, _loaded(mesh, _pressed(discs, "upper_flat", exact.P))
     if p["peak"]:
         load += _loaded(mesh, _pressed(discs, "lower_flat", -exact.P))
-        axis, flat = _on_axis(sides, "lower_"), sides["lower_flat"]
-        fixed = np.append(2 * axis, 2 * flat[flat.size // 2] + 1)  # no symmetry is bent
+        fixed = _free_of_reactions(sides)
     else:
         fixed = _guided(sides)
     bodies = assemble(
@@ -264,20 +275,65 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
 
 
 def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe two cylinders under P alone, in subdomains."""
+    """Describe two cylinders in subdomains, and before it what friction begins from."""
     p: Any = params
-    halves, laws = two_halves(params), (law_of(params),)
-    sides = joined_sides(halves.discs)
-    return in_parts(
-        half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
-        materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
-        names=NAMES, fixed=_guided(sides),
-        load=_pressed(halves.discs, "upper_flat", halves.exact.P),
-        pairs=(_pair(params, sides),),
-        linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
-        glue=p["glue"],
-        results=halves.results,
-    )  # fmt: skip
+    halves, law = two_halves(params), law_of(params)
+    discs, sides = halves.discs, joined_sides(halves.discs)
+    layout = half_discs_in_blocks(discs, halves.blocks(p["feti"]))
+    pairs, exact = (_pair(params, sides),), halves.exact
+    shear = _exact_shear(exact, params) if p["peak"] else None
+
+    def results(found: OwnSolution, at: AtSides) -> dict[str, Any]:
+        s, friction = at.solution, at.friction
+        told = pressure_quantities(at.bodies, at.primal, exact, s)
+        if shear is not None:
+            told |= shear_quantities(
+                at.bodies, at.primal, exact, s, friction, params, shear
+            )
+        if p["friction"] == "coulomb":
+            told["tresca_problems"] = tresca_problems(found)
+        return told
+
+    def posed(
+        fixed: Nodes,
+        loads: Sequence[tuple[Nodes, Vector]],
+        laws: tuple[FrictionLaw, ...],
+        displaced: Displaced | None = None,
+    ) -> ProblemInParts:
+        linearise = linearised_by(p["contact"], p["basis"], laws)
+        return in_parts(
+            layout, materials=halves.materials, plane=p["plane"],
+            units=(RADIUS, exact.P), names=NAMES, fixed=fixed, load=_added(loads),
+            pairs=pairs, linearise=lambda arcs, u: linearise(arcs, np.zeros_like(u)),
+            laws=laws, glue=p["glue"], displaced=displaced, iterate=p["iterate"],
+            results=results,
+        )  # fmt: skip
+
+    pressing = [_pressed(discs, "upper_flat", exact.P)]
+    if not p["peak"]:
+        return posed(_guided(sides), pressing, (law,))
+    pressing.append(_pressed(discs, "lower_flat", -exact.P))
+    loads, free = _loads(params), _free_of_reactions(sides)
+
+    def scaled(P: float, Q: float) -> list[tuple[Nodes, Vector]]:
+        shearing = _shearing(discs, Q * p["mu"] * exact.P) if Q else []
+        return [(at, P * force) for at, force in pressing] + shearing
+
+    def after(i: int, found: OwnSolution) -> ProblemInParts:
+        u, pressed = at_sides(found, pairs)
+        nothing = np.zeros_like(u)
+        if not i and _forgets_pressing(params):
+            u = nothing
+        (P, Q), before = loads[i], loads[max(i - 1, 0)][0]
+        slips_from = u if p["loading"] == "quasi-static" else nothing
+        at = Displaced(u, slips_from, P / before * pressed)
+        problem = posed(free, scaled(P, Q), (law,), at)
+        last = i + 1 == len(loads)
+        return problem if last else replace(problem, then=partial(after, i + 1))
+
+    kept = np.append(free, 2 * _on_axis(sides, "upper_"))
+    first = posed(kept, scaled(loads[0][0], 0.0), ())
+    return replace(first, then=partial(after, 0))
 
 
 def _guided(sides: Mapping[str, Nodes]) -> Nodes:
@@ -286,6 +342,12 @@ def _guided(sides: Mapping[str, Nodes]) -> Nodes:
         2 * _on_axis(sides, "upper_"), 2 * _on_axis(sides, "lower_"),
         2 * sides["lower_flat"] + 1,
     ])  # fmt: skip
+
+
+def _free_of_reactions(sides: Mapping[str, Nodes]) -> Nodes:
+    """Return the components that are held where Q acts, too: no symmetry is bent."""
+    flat = sides["lower_flat"]
+    return np.append(2 * _on_axis(sides, "lower_"), 2 * flat[flat.size // 2] + 1)
 
 
 def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
@@ -320,10 +382,45 @@ def sheared(mesh: Mesh) -> Vector:
     load = np.zeros(mesh.dofs)
     for name, Q in (("upper_flat", 1.0), ("lower_flat", -1.0)):
         flat = mesh.boundaries[name]
-        share, (x, y) = nodal_lengths(mesh.points[flat]), mesh.points[flat].T
-        load[2 * flat] = Q * share / share.sum()
-        load[2 * flat + 1] = Q * y[0] * share * x / (share @ x**2)
+        load[dofs_of(flat)] = _shear_of(mesh.points[flat], Q)
     return load
+
+
+def _shear_of(points: NDArray[np.float64], Q: float) -> Vector:
+    """Return the forces (2k,) of Q at the nodes of a flat side, x and y in turn."""
+    share, (x, y) = nodal_lengths(points), points.T
+    forces = Q * share / share.sum(), Q * y[0] * share * x / (share @ x**2)
+    return np.column_stack(forces).ravel()
+
+
+def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[tuple[Nodes, Vector]]:
+    """Return the components at both flat sides, and the forces of Q there, N/m."""
+    sides = joined_sides(discs)
+    of = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
+    return [
+        (dofs_of(sides[flat]), _shear_of(disc.position(disc.sides[flat]), part))
+        for disc, flat, part in of
+    ]
+
+
+def _added(loads: Sequence[tuple[Nodes, Vector]]) -> tuple[Nodes, Vector]:
+    """Add up forces at components: each component once."""
+    component, force = (np.concatenate(part) for part in zip(*loads, strict=True))
+    at, place = np.unique(component, return_inverse=True)
+    found = np.zeros(at.size)
+    np.add.at(found, place, force)
+    return at, found
+
+
+def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
+    """Return the parts of P and of μP that act in each step with friction."""
+    p: Any = params
+    if p["loading"] == "static":
+        return [(1.0, p["Q"])]
+    if p["programme"] == "proportional":
+        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a grows evenly
+        return [(part, part * p["Q"]) for part in parts]
+    return [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
 
 
 @lru_cache(maxsize=2)
@@ -343,25 +440,23 @@ def _friction_path(
     )  # fmt: skip
     if not p["peak"]:
         return path, exact
-    static, together = not path.quasi_static, p["programme"] == "proportional"
-    if static:
-        loads = [(1.0, p["Q"])]
-    elif together:
-        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a grows evenly
-        loads = [(part, part * p["Q"]) for part in parts]
-    else:
-        loads = [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
+    loads = _loads(p)
     part = loads[0][0]  # of P in the step before, whose normal forces grow with P
     pressing = replace(guided, f=part * bodies.f)
     smooth = linearisation(bodies, p["contact"], p["basis"])
     u, pressed = replace(path, bodies=pressing, linearise=smooth, laws=()).state(1)
-    if static or together:
+    if _forgets_pressing(p):
         u = np.zeros(mesh.dofs)
     for P, Q in loads:
         both = replace(bodies, f=P * bodies.f + Q * p["mu"] * sheared(mesh))
         path = replace(path, bodies=both, begin=State(u, P / part * pressed))
         (u, pressed), part = path.state(1), P
     return path, exact
+
+
+def _forgets_pressing(params: Mapping[str, Value]) -> bool:
+    """Whether slip begins at rest, not where P alone has pressed the cylinders."""
+    return params["loading"] == "static" or params["programme"] == "proportional"
 
 
 def _lower_half(h: float, a: float, halvings: int) -> HalfDisc:
@@ -440,7 +535,7 @@ def pressure_quantities(
 
 
 def shear_quantities(
-    bodies: Bodies,
+    bodies: Bodies | ContactSides,
     primal: QP,
     exact: LineContact,
     s: Solution,

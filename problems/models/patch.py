@@ -65,6 +65,7 @@ from problems.fem.stress import gauss_stress
 from problems.feti.elastic import (
     AtSides,
     SubdividedBodies,
+    at_rest,
     in_parts,
     linearised_by,
     own_meshes,
@@ -279,12 +280,14 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         )
         return {"stress_error": found.bodies.ranks.extreme(largest, np.max)}
 
+    load, pairs = _pressure(grids), (_pair(params, sides),)
     return in_parts(
         layout, materials=materials, plane=p["plane"], units=UNITS, names=NAMES,
-        fixed=_rollers(sides), load=_pressure(grids), pairs=(_pair(params, sides),),
+        fixed=_rollers(sides), load=load, pairs=pairs,
         linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
-        glue=p["glue"],
-        results=error,
+        glue=p["glue"], results=error, iterate=p["iterate"],
+        # as of `single_load`: friction may have to hold
+        displaced=at_rest(pairs, float(np.abs(load[1]).sum() / UNITS[1])),
     )  # fmt: skip
 
 

@@ -178,7 +178,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
 
 
 def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the dual of the plate, its supports being rows of B."""
+    """Describe the dual of the plate."""
     p: Any = params
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
@@ -189,6 +189,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
         load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
+        eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
     )  # fmt: skip
 

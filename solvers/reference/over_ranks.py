@@ -9,6 +9,9 @@ without bounds, as they are where supports hold all bodies.
    anew from the true residual until rounding is left (iterative refinement).
 2. Primal-dual active sets (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13):
    what a multiplier of the wrong sign holds is freed, what is beyond a bound is held.
+   They may come in circles. Where ten changes in a row have not lessened what is wrong,
+   only the last wrong component is changed, until there is less (Júdice and Pires 1994,
+   Comput. Oper. Res. 21: block principal pivoting, which ends after finitely many).
 
 What comes out is the solution for the active set that both signs confirm, to about
 rounding. Nothing of the solvers that are compared has a part in it.
@@ -30,7 +33,8 @@ from harness.distributed.vectors import DistributedColumns, distributed
 
 Mask = NDArray[np.bool_]
 
-MOST_FACES = 100  #: that are looked at
+MOST_FACES = 300  #: that are looked at
+PATIENCE = 10  #: changes in a row that need not lessen what is wrong
 WITHIN = 1e-6  #: of the projected residual, in each round of conjugate gradients
 ROUNDS = 3  #: of these, at most
 MOST_STEPS = 300  #: of conjugate gradients in a round
@@ -39,8 +43,10 @@ SIGNIFICANT = 1e-12  #: of the largest multiplier, or component: a wrong sign
 ACCEPTED = 1e-9  #: KKT residual of what is called a solution
 
 
-def reference_over_ranks(qp: QP) -> Solution:
+def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """Solve a share of a dual to about rounding; called by all ranks.
+
+    start : solution of a dual with other bounds alone, whose active set is tried first
 
     Raises
     ------
@@ -49,15 +55,23 @@ def reference_over_ranks(qp: QP) -> Solution:
 
     """
     task = _Task.of(qp)
-    lower, upper = task.lower == task.upper, np.zeros(task.q.size, dtype=bool)
-    point = task.at_rest()
+    point = task.at_rest() if start is None else _Point.of(start)
+    same = task.lower == task.upper
+    lower = (point.z < 0) | same
+    upper = (point.z > 0) & ~same & np.isfinite(task.upper)
+    fewest, patience = np.inf, PATIENCE
     for faces in range(1, MOST_FACES + 1):
         point = task.on_face(point.x, lower, upper)
         below, above = task.wanted(point, lower, upper)
-        changes = np.count_nonzero((below != lower) | (above != upper))
-        if not task.total(float(changes)):
+        wrong = (below != lower) | (above != upper)
+        changes = task.total(float(np.count_nonzero(wrong)))
+        if not changes:
             return _accepted(qp, task, point, faces)
-        lower, upper = below, above
+        patience = PATIENCE if changes < fewest else patience - 1
+        fewest = min(fewest, changes)
+        if patience < 0:
+            wrong = task.last(wrong)
+        lower, upper = np.where(wrong, below, lower), np.where(wrong, above, upper)
     raise ArithmeticError(
         f"the reference solve over ranks found no active set in {MOST_FACES} trials"
     )
@@ -85,6 +99,11 @@ class _Point(NamedTuple):
     x: Vector  #: (n,)
     y: Vector  #: (r,) multipliers of Gx = e, on every rank
     z: Vector  #: (n,) multipliers of bounds; negative at a lower one
+
+    @classmethod
+    def of(cls, s: Solution) -> _Point:
+        """Take this rank's part of a solution."""
+        return cls(np.asarray(s.x), np.asarray(s.y), np.asarray(s.z_box))
 
 
 @dataclass(eq=False)
@@ -116,6 +135,16 @@ class _Task:
     def total(self, part: float) -> float:
         """Add numbers over all ranks."""
         return float(self.G.ranks.total(np.array([part]))[0])
+
+    def last(self, which: Mask) -> Mask:
+        """Keep the last that is true: on the last rank that has any, elsewhere none."""
+        ranks = self.G.ranks
+        mine = np.flatnonzero(which)
+        holder = ranks.extreme(float(ranks.rank if mine.size else -1), np.max)
+        found = np.zeros_like(which)
+        if ranks.rank == holder:
+            found[mine[-1]] = True
+        return found
 
     def norm(self, v: Vector) -> float:
         return float(np.sqrt(self.total(float(v @ v))))
@@ -164,7 +193,10 @@ class _Task:
         for _ in range(MOST_STEPS):
             Fp = self.F(p)
             self.products += 1
-            alpha = wy / self.total(float(p @ Fp))
+            curvature = self.total(float(p @ Fp))
+            if not min(wy, curvature) > 0:  # rounding in the kernel of redundant rows
+                break
+            alpha = wy / curvature
             d += alpha * p
             w = w - alpha * project(Fp)
             if self.norm(w) <= enough:

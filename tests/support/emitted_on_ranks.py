@@ -80,22 +80,35 @@ def compared(name, everyone):
         "entries": [int(column.size), int(whole.B.nnz)],
         "torn": sum(e["component"].size for e in everyone) - int(whole.B.shape[1]),
         "bounds": [
-            _off(np.nan_to_num(joined(key, m)), np.nan_to_num(getattr(qp, key)))
-            for key in ("lb", "ub")
+            _bounds_off(joined(key, m), getattr(qp, key)) for key in ("lb", "ub")
         ],
         "errors": {
             "B": float(abs(B_whole - whole.B).max() / abs(whole.B).max()),
             "q": _off(joined("q", m), qp.q),
             "Fx": _off(joined("Fx", m), whole(probe(m))),
-            "A": max(float(abs(e["A"] - A[:, e["own"]]).max()) for e in everyone)
-            / float(abs(A).max()),
+            "A": max(_largest(e["A"] - A[:, e["own"]]) for e in everyone)
+            / max(_largest(A), 1e-300),
             "b": max(_off(e["b"], qp.b) for e in everyone),
         },
     }
 
 
+def _largest(M):
+    """Return the largest size of an entry; 0 where no subdomain floats."""
+    return float(abs(M).max()) if M.shape[0] else 0.0
+
+
 def _off(found, known):
-    return float(np.abs(found - known).max() / max(np.abs(known).max(), 1e-300))
+    largest = np.abs(known).max(initial=0.0)
+    return float(np.abs(found - known).max(initial=0.0) / max(largest, 1e-300))
+
+
+def _bounds_off(found, known):
+    """Compare what is finite; infinite if that is not the same of both."""
+    finite = np.isfinite(known)
+    if not np.array_equal(found[~finite], known[~finite]):
+        return float("inf")
+    return _off(found[finite], known[finite]) if finite.any() else 0.0
 
 
 def main():

@@ -18,10 +18,14 @@ HELD = (
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
     "plate/Sx=4/Sy=2/n=4/dual",
     "obstacle/n=10/shape=hemisphere/feti=3/dual",
+    "beam-ring/Nr=2/Nh=2/steps=1/friction=coulomb/mu=0.3/feti=3/dual",
+    "greco/n=8/feti=3/dual",
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
+ELIMINATED = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
+MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
 #: of a bound; K is the sum over subdomains on ranks, and the stored one elsewhere
 ROUNDING = 1e-4
 
@@ -36,7 +40,7 @@ def found(request):
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
             str(SUPPORT / "evaluated_on_ranks.py"),
-            *HELD, HELD_BY_CONTACT, PATCH, HERTZ,
+            *HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ, MINDLIN,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
@@ -44,7 +48,7 @@ def found(request):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, HERTZ])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, HERTZ, MINDLIN])
 def test_residuals_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         one = answer["by_one"]["values"]
@@ -72,14 +76,17 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         )
 
 
-def test_what_contact_alone_holds_is_certified_by_the_whole(found):
-    for answer in found[HELD_BY_CONTACT]:
+@pytest.mark.parametrize("case", [HELD_BY_CONTACT, ELIMINATED, MINDLIN])
+def test_what_contact_holds_or_is_eliminated_is_certified_by_the_whole(found, case):
+    for answer in found[case]:
         assert answer["by_ranks"]["bounds"] is None
         assert answer["by_ranks"]["notes"] == []
         assert answer["by_one"]["bound"] < 1
 
 
-@pytest.mark.parametrize("case", [*HELD[:2], HELD[3], HELD_BY_CONTACT, PATCH, HERTZ])
+@pytest.mark.parametrize(
+    "case", [*HELD[:2], *HELD[3:], HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN]
+)
 def test_quantities_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
         by_ranks, by_one = (
@@ -111,7 +118,7 @@ def test_an_exact_solution_is_recovered_across_subdomains(found):
         assert largest == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH, HERTZ])
+@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ])
 def test_sizes_are_those_of_the_whole(found, case):
     for answer in found[case]:
         assert answer["sizes"][0] == answer["sizes"][1]
