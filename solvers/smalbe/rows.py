@@ -41,12 +41,7 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
-from harness.distributed.vectors import (
-    DistributedColumns,
-    Ranks,
-    distributed,
-    inner_products,
-)
+from harness.distributed.vectors import DistributedColumns, Ranks, distributed
 from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
 from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
@@ -430,7 +425,7 @@ class PenaltyModel:
     def raised(self, s: Vector, sHs: float) -> BoxModel:
         """As `Model.raised`."""
         Cs = self.rows.C @ s
-        part, square = inner_products((Cs, Cs), (s, s))
+        part, square = float(Cs @ Cs), float(s @ s)
         rest = square - part
         missing = sHs - self.tau * square - self.w * part
         tau = self.tau + missing / rest if rest > 0 else np.inf
