@@ -24,6 +24,9 @@ T = TypeVar("T")
 
 ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others
 _PAUSE_SECONDS = 1e-3  #: between two looks whether they have come
+#: that mpiexec is given to hand on what was said: it drops what it has not read when
+#: it ends all
+_FORWARDED_SECONDS = 0.3
 _LONGEST = 500  #: bytes that are told of a failure
 
 
@@ -73,6 +76,7 @@ def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
     """Say on stderr which rank failed and how, and end all ranks."""
     traceback.print_exception(failure)
     say(_named(ranks.rank, ranks, in_a_line(failure)))
+    time.sleep(_FORWARDED_SECONDS)
     ranks.comm.Abort(1)
     raise SystemExit(1)
 
