@@ -195,7 +195,11 @@ def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
 
 
 def generated_with_coulomb_s_law(rng, count=3):
-    """Names of tiny cases with subdomains enough for three ranks."""
+    """Names of tiny cases with subdomains enough for three ranks.
+
+    Of cylinders without Q, supports hold the node in the middle of both, whose force of
+    friction is no unique one then.
+    """
     for _ in range(count):
         method = (
             f"glue={rng.choice(['orthonormal', 'chain', 'redundant'])}/"
@@ -214,7 +218,7 @@ def generated_with_coulomb_s_law(rng, count=3):
         )
         yield (
             f"hertz-cylinder/n=1/m={n[3] % 2 + 1}/feti={n[4] + 8}/"
-            f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0, 0.3, 0.7])}/"
+            f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0.3, 0.7])}/"
             f"{method}"
         )
         mu = rng.choice([0, 0.4, 1])
