@@ -56,9 +56,9 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """
     task = _Task.of(qp)
     point = task.at_rest() if start is None else _Point.of(start)
-    same = task.lower == task.upper
-    lower = (point.z < 0) | same
-    upper = (point.z > 0) & ~same & np.isfinite(task.upper)
+    held = (point.z != 0) | (task.lower == task.upper)
+    below = point.x - task.lower <= task.upper - point.x  # a sign may be rounding
+    lower, upper = held & below, held & ~below
     fewest, patience = np.inf, PATIENCE
     for faces in range(1, MOST_FACES + 1):
         point = task.on_face(point.x, lower, upper)

@@ -123,7 +123,7 @@ def test_what_follows_solutions_is_what_one_process_poses(ranks):
         assert max(*of["errors"].values(), *of["bounds"]) < SOLVED, (name, of)
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_reference_over_ranks_comes_out_of_circles(ranks):
     (of,) = emitted(ranks, [CIRCLES]).values()
 
@@ -188,7 +188,7 @@ def generated(rng, count=8):
 @pytest.mark.parametrize("seed", range(3))
 def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
     for case, of in emitted(
-        1 + seed, generated_with_coulomb_s_law(np.random.default_rng(seed))
+        1 + seed % 2, generated_with_coulomb_s_law(np.random.default_rng(seed))
     ).items():
         assert of["sizes"][0] == of["sizes"][1], case
         assert max(*of["errors"].values(), *of["bounds"]) < SOLVED, (case, of)
@@ -197,7 +197,11 @@ def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
 
 
 def generated_with_coulomb_s_law(rng, count=3):
-    """Names of tiny cases with subdomains enough for three ranks."""
+    """Names of tiny cases with subdomains enough for two ranks.
+
+    Of cylinders without Q, supports hold the node in the middle of both, whose force of
+    friction is no unique one then.
+    """
     for _ in range(count):
         method = (
             f"glue={rng.choice(['orthonormal', 'chain', 'redundant'])}/"
@@ -216,7 +220,7 @@ def generated_with_coulomb_s_law(rng, count=3):
         )
         yield (
             f"hertz-cylinder/n=1/m={n[3] % 2 + 1}/feti={n[4] + 8}/"
-            f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0, 0.3, 0.7])}/"
+            f"slave={rng.choice(['upper', 'lower'])}/Q={rng.choice([0.3, 0.7])}/"
             f"{method}"
         )
         mu = rng.choice([0, 0.4, 1])
