@@ -29,8 +29,12 @@ class Docstrings(griffe.Extension):
     def on_attribute(self, *, attr: griffe.Attribute, **_: Any) -> None:
         """Take the comment beside an attribute, or above it, for its docstring."""
         if attr.docstring is None and attr.lineno is not None and attr.endlineno:
-            lines = attr.parent.module.lines_collection[attr.filepath]  # type: ignore[union-attr]
-            if text := beside(lines, attr.lineno - 1, attr.endlineno - 1):
+            sources = attr.parent.module.lines_collection  # type: ignore[union-attr]
+            if attr.filepath not in sources:  # in the stub of a compiled module
+                return
+            if text := beside(
+                sources[attr.filepath], attr.lineno - 1, attr.endlineno - 1
+            ):
                 attr.docstring = griffe.Docstring(text, parent=attr)
 
 
