@@ -45,6 +45,7 @@ from harness import QP, Vector
 from harness.distributed.vectors import Ranks, Share
 from harness.operators import Arrays, Product, SerialisableOperator
 from problems.fem.mesh import Nodes
+from problems.feti.blocks import multiply
 from problems.feti.torn import Condensed, Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
@@ -94,8 +95,8 @@ class Packed:
             n = group.touched.size
             begin, end = end, end + n * group.members.size
             x, y = (v[begin:end].reshape(n, -1) for v in (X, Y))
-            if isinstance(block, np.ndarray):  # symmetric: yᵀ = xᵀ block, half is read
-                blas.dsymm(1.0, block.T, x.T, side=1, c=y.T, overwrite_c=1)
+            if isinstance(block, np.ndarray):
+                multiply(block, x, y)
             else:
                 y[:] = block @ x
         return Y

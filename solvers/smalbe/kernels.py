@@ -5,8 +5,11 @@ Few components of a dual have a bound, or are on one: only of these is asked whe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import blas
 
 from harness import Vector
 from harness.distributed.vectors import inner_products, on_slices
@@ -95,10 +98,26 @@ def reduced(
     return cut
 
 
-def conjugate(z: Vector, p: Vector, Hp: Vector) -> tuple[Vector, float]:
-    """Return z − (zᵀHp / pᵀHp) p, and pᵀHp."""
+def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
+    """Return z − (zᵀHp / pᵀHp) p."""
     along, curvature = inner_products((z, Hp), (p, Hp))
-    return combined(1.0, z, -along / curvature, p), curvature
+    return less(z, (along / curvature,), p)
+
+
+@on_slices
+def less(v: Vector, shares: Sequence[float], *vectors: Vector) -> Vector:
+    """Return v − Σ sᵢvᵢ."""
+    found = v.copy()
+    for share, one in zip(shares, vectors, strict=True):
+        found = blas.daxpy(one, found, a=-share)  # in place
+    return found
+
+
+@on_slices
+def scaled(s: float, v: Vector) -> Vector:
+    """Return sv."""
+    found: Vector = s * v
+    return found
 
 
 @on_slices

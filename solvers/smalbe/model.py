@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Vector
-from harness.distributed.vectors import inner_products
+from harness.distributed.vectors import inner_products, on_slices
 from solvers.smalbe import kernels
 from solvers.smalbe.kernels import Mask
 
@@ -149,9 +149,12 @@ def minimised(
     for _ in range(NEWTON_STEPS):
         dy = newton(here.slope, here.piece == 0)
         there = at(y + dy)
-        if (there.piece == here.piece).all():  # where Newton's method is exact
+        first, last, same = inner_products(
+            (here.slope, dy), (there.slope, dy), least=_equal(here.piece, there.piece)
+        )
+        if same:  # Newton's method is exact there
             return y + dy, there
-        t, here = _searched(at, y, dy, (here, there))
+        t, here = _searched(at, y, dy, there, (first, last))
         y = y + t * dy
     return None
 
@@ -160,11 +163,15 @@ def _searched(
     at: Callable[[Vector], Tilted],
     y: Vector,
     dy: Vector,
-    ends: tuple[Tilted, Tilted],
+    there: Tilted,
+    slopes: tuple[float, float],
 ) -> tuple[float, Tilted]:
-    """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0."""
-    there = ends[1]
-    first, slope = inner_products((ends[0].slope, dy), (there.slope, dy))
+    """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0.
+
+    there : s(y + dy)
+    slopes : at t = 0 and at t = 1
+    """
+    first, slope = slopes
     low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
     for _ in range(SEARCH_STEPS):
         if abs(slope) <= 0.1 * first or (slope > 0 and t == 1) or at_low <= at_high:
@@ -178,3 +185,9 @@ def _searched(
         else:
             high, at_high = t, slope
     return t, there
+
+
+@on_slices
+def _equal(one: NDArray[np.int8], other: NDArray[np.int8]) -> Vector:
+    """Return 1 where two pieces are the same, else 0."""
+    return (one == other).astype(float)

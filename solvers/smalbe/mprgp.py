@@ -103,29 +103,39 @@ class Directions:
     p: tuple[Vector, ...] = ()
     Hp: tuple[Vector, ...] = ()
 
-    def and_(self, p: Vector, Hp: Vector, curvature: float, most: int) -> Directions:
-        """Add one, with this pᵀHp; leave out the first if they are more than `most`."""
-        if not most:
-            return self
-        scale = 1 / math.sqrt(curvature)
-        return Directions(
-            self.free, (*self.p, scale * p)[-most:], (*self.Hp, scale * Hp)[-most:]
+    def next(
+        self, z: Vector, p: Vector, Hp: Vector, most: int
+    ) -> tuple[Directions, Vector]:
+        """Add p, and make z conjugate to it and to the others; over ranks, at once.
+
+        Of more than `most` directions the first is left out.
+        """
+        curvature, along, *others = inner_products(
+            (p, Hp), (z, Hp), *((z, Hq) for Hq in self.Hp)
         )
+        new = kernels.less(z, (along / curvature, *others), p, *self.p)
+        if not most:
+            return self, new
+        scale = 1 / math.sqrt(curvature)
+        kept = Directions(
+            self.free,
+            (*self.p, kernels.scaled(scale, p))[-most:],
+            (*self.Hp, kernels.scaled(scale, Hp))[-most:],
+        )
+        return kept, new
 
     def conjugate(self, p: Vector) -> Vector:
         """Return p without its part along them."""
-        along = inner_products(*((p, Hq) for Hq in self.Hp)) if self.p else ()
-        for share, q in zip(along, self.p, strict=True):
-            p = p - share * q
-        return p
+        if not self.p:
+            return p
+        along = inner_products(*((p, Hq) for Hq in self.Hp))
+        return kernels.less(p, along, *self.p)
 
     def minimising(self, g: Vector) -> tuple[Vector, Vector]:
         """Return s and Hs, for which x − s minimises the cost along all of them."""
         shares = inner_products(*((g, q) for q in self.p))
-        s, Hs = np.zeros_like(g), np.zeros_like(g)
-        for share, q, Hq in zip(shares, self.p, self.Hp, strict=True):
-            s, Hs = s + share * q, Hs + share * Hq
-        return s, Hs
+        back, none = [-share for share in shares], np.zeros_like(g)
+        return kernels.less(none, back, *self.p), kernels.less(none, back, *self.Hp)
 
 
 class Minimum(NamedTuple):
@@ -222,9 +232,7 @@ def mprgp(
         letters, at, B = step
         face = split(at, bounds)
         if letters == "c":
-            new, curvature = kernels.conjugate(z_of(face.phi), p, Hp)
-            known = known.and_(p, Hp, curvature, rules.kept)
-            p = known.conjugate(new)
+            known, p = known.next(z_of(face.phi), p, Hp, rules.kept)
             stay = stay._replace(inside=stay.inside + 1)
         else:
             z_of, known = precondition(face.free), Directions(face.free)
@@ -392,7 +400,7 @@ def _beyond(
         phi = np.where(free, z.g, 0.0)
         if phi @ phi <= stay.began:
             break
-        p, _ = kernels.conjugate(phi, p, Hp)
+        p = kernels.conjugate(phi, p, Hp)
         Hp, letters = task.H(p), letters + "b"
         curvature = float(p @ Hp)
         if curvature <= 0:
