@@ -136,17 +136,19 @@ class LocalFactor:
 
         """
         ranks, c, place = self.at.ranks, self.changing, self.at.place
-        T = scale * self.complement if less is None else scale * self.complement - less
+        T = scale * self.complement
+        if less is not None:
+            T -= less
         s = self.at.shared.size
-        S = np.zeros((s, s))
+        told = np.zeros(s**2 + 1)
+        S = told[:-1].reshape(s, s)
         try:
             L_cc = _cholesky(T[:c, :c])
             L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
             S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
-            fails = 0.0
         except np.linalg.LinAlgError:  # to be said by all ranks alike
-            fails = 1.0
-        told = ranks.total(np.append(S.ravel(), fails))
+            told[-1] = 1.0
+        told = ranks.total(told)
         try:
             if told[-1]:
                 raise np.linalg.LinAlgError

@@ -2,7 +2,7 @@ from scipy.sparse import csr_array
 
 from harness.qp import Vector
 
-class SparseRows:
+class CompressedRows:
     shape: tuple[int, int]
 
     def __init__(self, M: csr_array) -> None: ...

@@ -9,43 +9,47 @@ installed; `sparse.pyi` has the types.
 import numpy as np
 
 
-cdef class SparseRows:
+cdef class CompressedRows:
     """A matrix M (n, k) by rows (CSR)."""
 
     cdef readonly tuple shape
+    cdef object matrix  # which holds what is pointed to
     cdef Py_ssize_t n, k
-    cdef const double[::1] data
-    cdef const int[::1] indices
-    cdef const int[::1] indptr
+    cdef const double *data
+    cdef const int *indices
+    cdef const int *indptr
 
     def __init__(self, M):
-        self.shape = M.shape
-        self.n, self.k = M.shape
-        self.data = np.ascontiguousarray(M.data, dtype=np.float64)
-        self.indices = np.ascontiguousarray(M.indices, dtype=np.int32)
-        self.indptr = np.ascontiguousarray(M.indptr, dtype=np.int32)
-        if self.indptr.shape[0] != self.n + 1 or M.format != "csr":
+        cdef const double[::1] data = np.ascontiguousarray(M.data, dtype=np.float64)
+        cdef const int[::1] indices = np.ascontiguousarray(M.indices, dtype=np.int32)
+        cdef const int[::1] indptr = np.ascontiguousarray(M.indptr, dtype=np.int32)
+        self.shape, (self.n, self.k) = M.shape, M.shape
+        if M.format != "csr" or indptr.shape[0] != self.n + 1:
             raise ValueError(f"{M.format} matrix; expected one by rows")
+        self.matrix = data, indices, indptr
+        self.data = &data[0] if data.shape[0] else NULL
+        self.indices = &indices[0] if indices.shape[0] else NULL
+        self.indptr = &indptr[0]
 
     def __matmul__(self, const double[::1] x):
         """Return Mx (n,) of x (k,)."""
         self._expect(x.shape[0], self.k)
         found = np.empty(self.n)
         cdef double[::1] y = found
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            y[i] = self._row(i, x)
+        if self.n and self.k:
+            _times(self.n, self.data, self.indices, self.indptr, &x[0], &y[0])
+        else:
+            y[:] = 0
         return found
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
         """Return sv + tMx (n,) of v (n,) and x (k,)."""
         self._expect(v.shape[0], self.n)
-        self._expect(x.shape[0], self.k)
-        found = np.empty(self.n)
+        found = self @ x
         cdef double[::1] y = found
         cdef Py_ssize_t i
         for i in range(self.n):
-            y[i] = s * v[i] + t * self._row(i, x)
+            y[i] = s * v[i] + t * y[i]
         return found
 
     def weighted_difference(
@@ -53,13 +57,12 @@ cdef class SparseRows:
     ):
         """Return v − Mx (n,) of v (n,) and x (k,), each entry times its weight (n,)."""
         self._expect(v.shape[0], self.n)
-        self._expect(x.shape[0], self.k)
         self._expect(weights.shape[0], self.n)
-        found = np.empty(self.n)
+        found = self @ x
         cdef double[::1] y = found
         cdef Py_ssize_t i
         for i in range(self.n):
-            y[i] = weights[i] * (v[i] - self._row(i, x))
+            y[i] = weights[i] * (v[i] - y[i])
         return found
 
     def transposed_times(self, const double[::1] x):
@@ -67,23 +70,38 @@ cdef class SparseRows:
         self._expect(x.shape[0], self.n)
         found = np.zeros(self.k)
         cdef double[::1] y = found
-        cdef double x_i
-        cdef Py_ssize_t i
-        cdef int j
-        for i in range(self.n):
-            x_i = x[i]
-            for j in range(self.indptr[i], self.indptr[i + 1]):
-                y[self.indices[j]] += self.data[j] * x_i
+        if self.n and self.k:
+            _transposed_times(
+                self.n, self.data, self.indices, self.indptr, &x[0], &y[0]
+            )
         return found
-
-    cdef inline double _row(self, Py_ssize_t i, const double[::1] x) noexcept:
-        cdef double y_i = 0
-        cdef int j
-        for j in range(self.indptr[i], self.indptr[i + 1]):
-            y_i += self.data[j] * x[self.indices[j]]
-        return y_i
 
     cdef int _expect(self, Py_ssize_t got, Py_ssize_t expected) except -1:
         if got != expected:
             raise ValueError(f"vector of {got} components; expected {expected}")
         return 0
+
+
+cdef void _times(
+    Py_ssize_t n, const double *data, const int *indices, const int *indptr,
+    const double *x, double *y,
+) noexcept nogil:
+    cdef Py_ssize_t i
+    cdef int j
+    cdef double y_i
+    for i in range(n):
+        y_i = 0
+        for j in range(indptr[i], indptr[i + 1]):
+            y_i += data[j] * x[indices[j]]
+        y[i] = y_i
+
+
+cdef void _transposed_times(
+    Py_ssize_t n, const double *data, const int *indices, const int *indptr,
+    const double *x, double *y,
+) noexcept nogil:
+    cdef Py_ssize_t i
+    cdef int j
+    for i in range(n):
+        for j in range(indptr[i], indptr[i + 1]):
+            y[indices[j]] += data[j] * x[i]

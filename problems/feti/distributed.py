@@ -26,6 +26,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from harness import QP, InputError, Solution, Vector, no_rows
 from harness.digest import hex_digest
 from harness.distributed.factor import Touched, local_factor, touched_rows
+from harness.distributed.sparse import CompressedRows
 from harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
@@ -215,12 +216,11 @@ class RowsOverRanks:
     """
 
     at: Halo
-    own: csr_array  #: (o, M) of owned rows
-    transposed: csr_array  #: (M, o)
-    borrowed: csr_array  #: (t − o, M) of the neighbours' rows
-    borrowed_transposed: (
-        csr_array  #: (k, t − o) rows of its transpose, without zero ones
-    )
+    own: CompressedRows  #: (o, M) of owned rows
+    transposed: CompressedRows  #: (M, o)
+    borrowed: CompressedRows  #: (t − o, M) of the neighbours' rows
+    #: (k, t − o) rows of its transpose, without zero ones
+    borrowed_transposed: CompressedRows
     reached: Nodes  #: (k,) which ones they are
 
     @classmethod
@@ -228,10 +228,8 @@ class RowsOverRanks:
         """Split B (t, M) of all rows that a rank touches."""
         own, borrowed = csr_array(B[at.own]), csr_array(B[at.borrowed])
         reached = np.unique(borrowed.indices)
-        return cls(
-            at, own, csr_array(own.T), borrowed,
-            csr_array(borrowed[:, reached].T), reached,
-        )  # fmt: skip
+        parts = own, csr_array(own.T), borrowed, csr_array(borrowed[:, reached].T)
+        return cls(at, *map(CompressedRows, parts), reached)
 
     def transposed_times(self, x: Vector) -> Vector:
         """Return Bᵀx (M,) of this rank's slice x (o,)."""
@@ -239,7 +237,7 @@ class RowsOverRanks:
         with self.at.ranks.clocked("products"):
             X = self.transposed @ x
             X[self.reached] += self.borrowed_transposed @ arrived()
-        return np.asarray(X)
+        return X
 
     def times(self, X: Vector) -> Vector:
         """Return this rank's slice (o,) of Σ_ranks B X, with X (M,) of each."""

@@ -86,10 +86,10 @@ class Projected:
         """Apply H; one product with F."""
         C = self.rows.C
         Cv = C @ v
-        Fv = self.F(v - C.T @ Cv)
+        Fv = self.F(self.rows.combined(1.0, v, -1.0, Cv))
         scale = 1 / self.spectrum.norm
         shift = kernels.combined(rho, Cv, -scale, C @ Fv)
-        return kernels.combined(scale, Fv, 1.0, C.T @ shift)
+        return self.rows.combined(scale, Fv, 1.0, shift)
 
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.

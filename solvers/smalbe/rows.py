@@ -23,7 +23,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -41,6 +41,7 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
+from harness.distributed.sparse import CompressedRows
 from harness.distributed.vectors import DistributedColumns, Ranks, distributed
 from solvers.smalbe import compiled, kernels
 from solvers.smalbe.kernels import Mask
@@ -102,8 +103,11 @@ class Rows(ABC):
 
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
-        projected: Vector = v - self.C.T @ (self.C @ v)
-        return projected
+        return self.combined(1.0, v, -1.0, self.C @ v)
+
+    def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
+        """Return sv + tCᵀa."""
+        return kernels.combined(s, v, t, self.C.T @ a)
 
     @property
     def no_multipliers(self) -> Vector:
@@ -157,6 +161,12 @@ class SparseRows(Rows):
 
     def violation(self, nu: Vector) -> float:
         return self.gram.norm(self.unit @ nu)
+
+    def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
+        y, unit = self.gram.backward(a), self.unit
+        if isinstance(unit, _LocalRows):
+            return unit.T.combined(s, v, t, y)
+        return kernels.combined(s, v, t, unit.T @ y)
 
     @property
     def no_multipliers(self) -> Vector:
@@ -294,29 +304,29 @@ class _OverRanks:
 class _LocalRows:
     """The rows of distributed columns that a rank touches: products are additive.
 
-    Held once, column by column. Both products then go along the components, and jump
-    about among the rows alone, which are few and stay in the cache.
+    Held once, component by component. Both products then go along the components, and
+    jump about among the rows alone, which are few and stay in the cache.
     """
 
-    part: csc_array  #: (k, n_p)
+    transposed: CompressedRows  #: (n_p, k)
     ranks: Ranks
+
+    @classmethod
+    def of(cls, G: csc_array, ranks: Ranks) -> _LocalRows:
+        """Hold G (k, n_p)."""
+        return cls(CompressedRows(G.T), ranks)
 
     @property
     def shape(self) -> tuple[int, int]:
-        rows, columns = self.part.shape
+        columns, rows = self.transposed.shape
         return rows, columns
-
-    @cached_property
-    def transposed(self) -> csr_array:
-        """(n_p, k), the same entries."""
-        return self.part.T
 
     @property
     def T(self) -> _LocalRowsTransposed:
         return _LocalRowsTransposed(self)
 
     def __matmul__(self, v: Vector) -> Vector:
-        return distributed(self.part @ np.asarray(v), self.ranks)
+        return distributed(self.transposed.transposed_times(v), self.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +334,17 @@ class _LocalRowsTransposed:
     rows: _LocalRows
 
     def __matmul__(self, y: Vector) -> Vector:
-        return distributed(self.rows.transposed @ np.asarray(y), self.rows.ranks)
+        return distributed(self.rows.transposed @ y, self.rows.ranks)
+
+    def combined(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
+        """Return sv + tGᵀy, in one pass."""
+        found = self.rows.transposed.combined(s, v, t, y)
+        return distributed(found, self.rows.ranks)
+
+    def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
+        """Return v − Gᵀy times weights, in one pass."""
+        found = self.rows.transposed.weighted_difference(v, y, weights)
+        return distributed(found, self.rows.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,7 +466,10 @@ class PenaltyModel:
 
         def apply(v: Vector) -> Vector:
             v = np.where(free, v, 0.0)
-            return kernels.weighted_difference(v, G.T @ solve(G @ v), inverse)
+            y = solve(G @ v)
+            if isinstance(G, _LocalRows):
+                return G.T.weighted_difference(v, y, inverse)
+            return kernels.weighted_difference(v, G.T @ y, inverse)
 
         return apply
 
@@ -576,13 +599,13 @@ def rows_over_ranks(
         whole[rows] = np.asarray(factor.backward(a)) / at.touching
         return ranks.total(whole) / size
 
-    own = _LocalRows(csc_array(unit), ranks)
+    own = _LocalRows.of(csc_array(unit), ranks)
     return SparseRows(
         G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
         x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
         bounded=np.flatnonzero(here),
-        of_bounded=_LocalRows(of_bounded, ranks),
+        of_bounded=_LocalRows.of(of_bounded, ranks),
     )  # fmt: skip
 
 
