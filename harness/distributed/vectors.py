@@ -237,16 +237,20 @@ def inner_products(
 ) -> tuple[float, ...]:
     """Return xᵀy of each pair of vectors (n,); over ranks, in one reduction.
 
+    Vectors of pairs that are not distributed are the same on all ranks.
+
     least : (k,) of which the least is returned, too, after them; inf if there is none
     """
     one = pairs[0][0]
     products = [float(_slice(x) @ _slice(y)) for x, y in pairs]
     smallest = [] if least is None else [float(_slice(least).min(initial=np.inf))]
-    if not isinstance(one, DistributedVector):
+    over = next((v for v in (one, least) if isinstance(v, DistributedVector)), None)
+    if over is None:
         return (*products, *smallest)
-    found = one.ranks.everyones(np.array(products + smallest))
-    sums = found[:, : len(products)].sum(axis=0)
-    return (*sums.tolist(), *found[:, len(products) :].min(axis=0).tolist())
+    found = over.ranks.everyones(np.array(products + smallest))
+    if one is over:
+        products = found[:, : len(products)].sum(axis=0).tolist()
+    return (*products, *found[:, len(products) :].min(axis=0).tolist())
 
 
 def on_slices(function: Callable[P, R]) -> Callable[P, R]:

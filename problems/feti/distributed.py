@@ -14,7 +14,7 @@ several ranks have, one forms the explicit blocks, and sends them to the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -46,6 +46,10 @@ from problems.feti.operators import (
     uncoupled,
 )
 from problems.feti.torn import Condensed, Dense, Subdomains
+
+
+#: of what a kind of subdomains takes, what comes after the factor of its stiffness
+AFTER_FACTOR = 0.25
 
 
 class Parts(NamedTuple):
@@ -398,41 +402,95 @@ def _alike(
     return owned, inverse
 
 
+class Forming(NamedTuple):
+    """Who forms the blocks of one kind."""
+
+    have: list[int]  #: ranks that have the kind
+    factor: int  #: rank that factorises its stiffness
+    blocks: int  #: rank that forms the blocks with that factor, and sends them
+
+
+def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
+    """Share out what forms the blocks of each kind, once.
+
+    Largest first, each goes to the rank that has the least to do so far (Graham 1969).
+    Ranks that have more than others then give away what comes after the factor.
+
+    work : of each rank, what each of its kinds takes, by its name
+    """
+    have: dict[str, list[int]] = {}
+    for rank, one in enumerate(work):
+        for name in one:
+            have.setdefault(name, []).append(rank)
+    size = {name: work[ranks[0]][name] for name, ranks in have.items()}
+    loads, found = [0.0] * len(work), dict[str, Forming]()
+    for name in sorted(have, key=lambda name: (-size[name], name)):
+        rank = min(have[name], key=loads.__getitem__)
+        loads[rank] += size[name]
+        found[name] = Forming(have[name], rank, rank)
+    for name, (able, factor, _) in found.items():
+        rank, part = min(able, key=loads.__getitem__), AFTER_FACTOR * size[name]
+        if loads[rank] + 2 * part <= loads[factor]:
+            loads[rank] += part
+            loads[factor] -= part
+            found[name] = Forming(able, factor, rank)
+    return found
+
+
 def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]:
     """Form the blocks of equal groups on one of the ranks that have them.
 
-    Largest first, each goes to the rank that has the least to do so far (Graham 1969).
+    Who gives away what comes after some factors has all factors made until these are
+    sent; the others have all their blocks made until they take them.
     """
-    names = [_name(group) for group in groups]
-    work = {
-        n: g.kind.K.nnz * g.touched.size for n, g in zip(names, groups, strict=True)
-    }
-    have = ranks.comm.allgather(work)
-    loads, maker = [0] * ranks.size, dict[str, int]()
-    everyones = {name: size for one in have for name, size in one.items()}
-    for name in sorted(everyones, key=lambda name: (-everyones[name], name)):
-        able = [r for r, one in enumerate(have) if name in one]
-        maker[name] = min(able, key=loads.__getitem__)
-        loads[maker[name]] += everyones[name]
-    found, sent = dict[str, Condensed](), []
+    me, names = ranks.rank, [_name(group) for group in groups]
     ours = dict(zip(names, groups, strict=True))
-    for name, rank in maker.items():
-        if rank == ranks.rank:
-            group = ours[name]
-            found[name] = group.kind.condensed(group.touched)
-            blocks = np.stack(found[name])
-            to = [r for r, one in enumerate(have) if name in one and r != rank]
-            sent += [(ranks.comm.Isend(blocks, dest=r), blocks) for r in to]
-    for name, rank in maker.items():
-        if name in ours and rank != ranks.rank:
-            n = ours[name].touched.size
-            blocks = np.empty((2, n, n))
-            with ranks.clocked("waiting"):
-                ranks.comm.Recv(blocks, source=rank)
-            found[name] = Condensed(*blocks)
-    for request, _ in sent:
-        request.wait()
+    work = {name: g.kind.K.nnz * g.touched.size for name, g in ours.items()}
+    tasks = forming(ranks.comm.allgather(work))
+    given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
+    taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
+    kept = [n for n, t in tasks.items() if t.factor == me == t.blocks]
+
+    def blocks(some: list[str]) -> dict[str, Condensed]:
+        return {n: ours[n].kind.blocks(ours[n].touched, factors[n]) for n in some}
+
+    factors = {n: ours[n].kind.border_factor(ours[n].touched) for n in given + kept}
+    found = {} if given else blocks(kept)
+    sizes = [ours[n].kind.border(ours[n].touched).size for n in taken]
+    came = _exchanged(
+        ranks,
+        [(tasks[n].blocks, np.ascontiguousarray(factors[n].T)) for n in given],
+        [(tasks[n].factor, (h, h)) for n, h in zip(taken, sizes, strict=True)],
+    )
+    factors |= {n: L.T for n, L in zip(taken, came, strict=True)}
+    found |= blocks(kept + taken if given else taken)
+    made = {n: np.stack(found[n]) for n in found if len(tasks[n].have) > 1}
+    others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
+    came = _exchanged(
+        ranks,
+        [(r, made[n]) for n, t in tasks.items() if n in made for r in t.have if r != me],
+        [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
+    )
+    found |= {n: Condensed(*both) for n, both in zip(others, came, strict=True)}
     return [found[name] for name in names]
+
+
+def _exchanged(
+    ranks: Ranks,
+    out: Sequence[tuple[int, Dense]],
+    coming: Sequence[tuple[int, tuple[int, ...]]],
+) -> list[Dense]:
+    """Send arrays to ranks, and take arrays of known shapes from ranks."""
+    found = [np.empty(shape) for _, shape in coming]
+    posted = [
+        ranks.comm.Irecv(array, source=rank)
+        for array, (rank, _) in zip(found, coming, strict=True)
+    ]
+    posted += [ranks.comm.Isend(array, dest=rank) for rank, array in out]
+    with ranks.clocked("waiting"):
+        for request in posted:
+            request.Wait()
+    return found
 
 
 def _name(group: Group) -> str:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -52,6 +52,7 @@ from problems.feti.distributed import (
     Halo,
     RankOperator,
     balanced,
+    condensed_by_ranks,
     gathered_on_one,
     halo,
     owners,
@@ -407,7 +408,10 @@ class _Dual:
         """Put the operator together, without any factor."""
         rows, domains, ranks = self.own.rows, self.own.domains, self.own.ranks
         anew = Subdomains(tuple(map(replace, domains.kinds)), domains.kind)
-        local = DualOperator(rows.B, anew, self.explicit, rows.equalities)
+        local = DualOperator(
+            rows.B, anew, self.explicit, rows.equalities,
+            partial(condensed_by_ranks, ranks=ranks),
+        )  # fmt: skip
         lower, upper = self.bounds(self.own.problem.contact.bound)
         part = QP(
             P=RankOperator(local, self.at), q=distributed(self.q, ranks),

@@ -66,9 +66,27 @@ class Kind:
         where h are the boundary, b and the fixing components, and i all others. With h
         last, S_ρ = LLᵀ is the last block of the Cholesky factor of K_ρ.
         """
-        g = np.union1d(self.boundary, b)
-        h = np.union1d(g, self.fixing)
-        L = self._last_block(h)
+        return self.blocks(b, self.border_factor(b))
+
+    def border(self, b: Nodes) -> Nodes:
+        """Return h, ascending."""
+        return np.union1d(np.union1d(self.boundary, b), self.fixing)
+
+    def border_factor(self, b: Nodes) -> Dense:
+        """Return L (h, h) of S_ρ = LLᵀ, the greater part of the work of `condensed`."""
+        h = self.border(b)
+        i = np.setdiff1d(np.arange(self.K.shape[0]), h)
+        if i.size:
+            i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
+        order = np.concatenate([i, h])
+        K_rho = with_int32(self._fixed[order][:, order])
+        factor = analyze(K_rho, ordering_method="natural", use_long=False)
+        factor.cholesky_inplace(K_rho)
+        return np.asarray(factor.L()[i.size :, i.size :].toarray())
+
+    def blocks(self, b: Nodes, L: Dense) -> Condensed:
+        """Do what is left of `condensed`, with L of `border_factor`."""
+        g, h = np.union1d(self.boundary, b), self.border(b)
         at, fixed = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, at])[at]
         S = L @ L.T
@@ -78,17 +96,6 @@ class Kind:
             S_ib = S[inner][:, at]
             S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
         return Condensed(_symmetric(C), _symmetric(S_bb))
-
-    def _last_block(self, h: Nodes) -> Dense:
-        """Return the block of h of the Cholesky factor of K_ρ, with h last."""
-        i = np.setdiff1d(np.arange(self.K.shape[0]), h)
-        if i.size:
-            i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
-        order = np.concatenate([i, h])
-        K_rho = with_int32(self._fixed[order][:, order])
-        factor = analyze(K_rho, ordering_method="natural", use_long=False)
-        factor.cholesky_inplace(K_rho)
-        return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def elimination(self, h: Nodes) -> Elimination:
         """Eliminate all components but h; S on these multiplies columns."""

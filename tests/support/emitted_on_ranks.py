@@ -12,10 +12,12 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
+from harness.digest import hex_digest
 from harness.distributed.vectors import Ranks
 from harness.names import parse
 from problems import PROBLEMS
 from problems.feti.emission import OwnSubdomains, subdomains_of
+from problems.feti.torn import Kind
 from solvers.reference.over_ranks import reference_over_ranks
 from solvers.reference.solve import reference_solution
 
@@ -35,15 +37,41 @@ def told(name, ranks):
     own = rows[share.P.halo.own]
     mine = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
     B = share.P.local.B.tocoo()
+    Fx, factorised = forming(lambda: share.P @ probe(made.variables)[own])
     return ranks.comm.gather({
+        "factorised": factorised,
+        "formed": [
+            named(group.kind, group.touched)
+            for group in share.P.local.packed.groups if group.explicit
+        ],
         "sizes": [made.variables, made.equality_rows],
         "B": (rows[B.row], B.col, B.data),
         "number": mine.number, "own": own,
         **{key: np.asarray(getattr(share, key)) for key in ("q", "lb", "ub")},
         "A": share.A.part, "b": share.b,
-        "Fx": np.asarray(share.P @ probe(made.variables)[own]),
+        "Fx": np.asarray(Fx),
         "component": mine.component,
     })  # fmt: skip
+
+
+def named(kind, touched):
+    """Name what the blocks of a kind depend on."""
+    return hex_digest((kind.K.data.tobytes(), touched.tobytes()))
+
+
+def forming(act):
+    """Return what an act gives, and the kinds that this rank factorises in it."""
+    factor, names = Kind.border_factor, []
+
+    def noted(kind, touched):
+        names.append(named(kind, touched))
+        return factor(kind, touched)
+
+    Kind.border_factor = noted
+    try:
+        return act(), names
+    finally:
+        Kind.border_factor = factor
 
 
 def compared(name, everyone):
@@ -78,6 +106,8 @@ def compared(name, everyone):
         "sizes": [everyone[0]["sizes"], [m, qp.b.size]],
         "owners": np.bincount(np.concatenate([e["own"] for e in everyone])).tolist(),
         "entries": [int(column.size), int(whole.B.nnz)],
+        "factorised": [name for e in everyone for name in e["factorised"]],
+        "formed": [name for e in everyone for name in e["formed"]],
         "torn": sum(e["component"].size for e in everyone) - int(whole.B.shape[1]),
         "bounds": [
             _bounds_off(joined(key, m), getattr(qp, key)) for key in ("lb", "ub")

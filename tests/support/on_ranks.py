@@ -13,7 +13,12 @@ from scipy.sparse import csc_array
 import mortarbench as mb
 from harness.distributed import factor
 from harness.distributed.factor import DependentRowsError, local_factor, touched_rows
-from harness.distributed.vectors import DistributedVector, Ranks, distributed
+from harness.distributed.vectors import (
+    DistributedVector,
+    Ranks,
+    distributed,
+    inner_products,
+)
 from solvers.smalbe.rows import equality_rows
 from solvers.smalbe.solver import SMALBE
 from solvers.smalbe.spectrum import lanczos
@@ -59,6 +64,13 @@ def vectors(ranks):
         "least Ritz value": (ritz.values[-1], 1.0),
         "largest Ritz value": (ritz.values[0], 5.0),
         "clip": (np.clip(v, -1, 1).sum(), np.clip(a, -1, 1).sum()),
+    }
+    known, least = inner_products((a, b), (b, b), least=w)[1:]
+    pairs |= {
+        "known to all": (known, b @ b),
+        "least beside known": (least, b.min()),
+        "two at once": (sum(inner_products((v, w), (w, w))), a @ b + b @ b),
+        "least beside": (inner_products((v, w), least=w)[1], b.min()),
     }
     answered = []
     for name, ask in REFUSED.items():

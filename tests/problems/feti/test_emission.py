@@ -115,6 +115,12 @@ def test_shares_are_the_qp_of_one_process_row_by_row(found, case):
     assert max(of["bounds"]) < ROUNDING
 
 
+@pytest.mark.parametrize("case", CASES)
+def test_a_kind_that_several_ranks_have_is_factorised_by_one_of_them(found, case):
+    of = found[case]
+    assert sorted(of["factorised"]) == sorted(set(of["formed"]))
+
+
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_follows_solutions_is_what_one_process_poses(ranks):
     for name, of in emitted(ranks, LATER).items():

@@ -1,0 +1,53 @@
+"""Who forms the blocks of which kind."""
+
+import numpy as np
+
+from problems.feti.distributed import AFTER_FACTOR, forming
+
+
+def loads(work):
+    """Say what each rank does, if all do what `forming` says."""
+    done = np.zeros(len(work))
+    for name, task in forming(work).items():
+        size = work[task.factor][name]
+        done[task.factor] += (1 - AFTER_FACTOR) * size
+        done[task.blocks] += AFTER_FACTOR * size
+    return done
+
+
+def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
+    kinds = dict.fromkeys("abcdefghi", 4)
+
+    assert loads([kinds, kinds]).tolist() == [18, 18]
+    factors = [task.factor for task in forming([kinds, kinds]).values()]
+    assert sorted(np.bincount(factors)) == [4, 5]
+
+
+def test_only_ranks_that_have_a_kind_do_anything_for_it():
+    tasks = forming([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
+
+    assert tasks["a"] == ([0], 0, 0)
+    assert tasks["b"] == ([0, 1], 1, 1)
+    assert tasks["c"] == ([2], 2, 2)
+
+
+def test_one_rank_does_all():
+    assert loads([{"a": 3, "b": 5}]).tolist() == [8]
+
+
+def test_nobody_gets_more_to_do_than_who_gives_it_away():
+    rng = np.random.default_rng(7)
+    for _ in range(200):
+        names = rng.permutation(12)
+        size = rng.integers(1, 50, 12)
+        work = [
+            {str(k): int(size[k]) for k in names[: rng.integers(1, 13)]}
+            for _ in range(rng.integers(1, 5))
+        ]
+        tasks = forming(work)
+        whole = np.zeros(len(work))
+        for name, task in tasks.items():
+            assert {task.factor, task.blocks} <= set(task.have)
+            whole[task.factor] += work[task.factor][name]
+        assert set(tasks) == set().union(*work)
+        assert loads(work).max() <= whole.max()
