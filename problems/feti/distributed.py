@@ -42,11 +42,11 @@ from problems.feti.operators import (
     DualOperator,
     Group,
     gram_inverse,
+    scaled_columns,
     touched,
     uncoupled,
 )
 from problems.feti.torn import Condensed, Dense, Subdomains
-
 
 #: of what a kind of subdomains takes, what comes after the factor of its stiffness
 AFTER_FACTOR = 0.25
@@ -290,7 +290,7 @@ class RankOperator:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
         of, ranks = self.local.packed, self.halo.ranks
         blocks, weights = self.local.weighted_blocks(kind, scaling)
-        BW = csr_array(of.B @ diags_array(weights))
+        BW = scaled_columns(of.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ of.BT))
 
@@ -336,18 +336,20 @@ def _coupled(
 ) -> Nodes:
     """Find which of some rows (t,) the sum of all parts couples beyond rounding."""
     row, column = part.tocoo().coords
+    beside = np.flatnonzero((row != column) & some[row] & some[column])
+    row, column = row[beside], column[beside]
     size = np.sqrt(at.gathered(diagonal))
-    share = part.tocoo().data / (size[row] * size[column])
-    beside = (row != column) & some[row] & some[column] & (share != 0)
+    share = part.data[beside] / (size[row] * size[column])
     between = at.is_shared[row] & at.is_shared[column]
-    found = [at.rows[row[beside & ~between & (np.abs(share) > ROUNDING)]]]
-    told = [v[beside & between] for v in (at.rows[row], at.rows[column], share)]
+    found = at.rows[row[~between & (np.abs(share) > ROUNDING)]]
+    between &= share != 0
+    told = [v[between] for v in (at.rows[row], at.rows[column], share)]
     rows, columns, shares = map(
         np.concatenate, zip(*at.ranks.comm.allgather(told), strict=True)
     )
     pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
     total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
-    return np.concatenate([*found, pairs[0, total > ROUNDING]])
+    return np.concatenate([found, pairs[0, total > ROUNDING]])
 
 
 def _rank_by_rank(
@@ -405,6 +407,7 @@ def _alike(
 class Forming(NamedTuple):
     """Who forms the blocks of one kind."""
 
+    work: int  #: in some unit
     have: list[int]  #: ranks that have the kind
     factor: int  #: rank that factorises its stiffness
     blocks: int  #: rank that forms the blocks with that factor, and sends them
@@ -427,25 +430,42 @@ def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
     for name in sorted(have, key=lambda name: (-size[name], name)):
         rank = min(have[name], key=loads.__getitem__)
         loads[rank] += size[name]
-        found[name] = Forming(have[name], rank, rank)
-    for name, (able, factor, _) in found.items():
-        rank, part = min(able, key=loads.__getitem__), AFTER_FACTOR * size[name]
-        if loads[rank] + 2 * part <= loads[factor]:
+        found[name] = Forming(size[name], have[name], rank, rank)
+    for name, task in found.items():
+        rank, part = min(task.have, key=loads.__getitem__), AFTER_FACTOR * task.work
+        if loads[rank] + 2 * part <= loads[task.factor]:
             loads[rank] += part
-            loads[factor] -= part
-            found[name] = Forming(able, factor, rank)
+            loads[task.factor] -= part
+            found[name] = task._replace(blocks=rank)
     return found
+
+
+def meanwhile(tasks: Mapping[str, Forming], rank: int) -> int:
+    """Count the blocks that a rank forms until factors are given away.
+
+    Of those that it forms with factors of its own; all of them if none are given away.
+    """
+    factors: dict[int, float] = {}
+    for task in tasks.values():
+        made = (1 - AFTER_FACTOR) * task.work
+        factors[task.factor] = factors.get(task.factor, 0.0) + made
+    giving = [factors[t.factor] for t in tasks.values() if t.factor != t.blocks]
+    left = max(giving, default=np.inf) - factors.get(rank, 0.0)
+    own = [t.work for t in tasks.values() if t.factor == t.blocks == rank]
+    ends = AFTER_FACTOR * (np.cumsum(own) - np.array(own) / 2)
+    return int(np.count_nonzero(ends < left))
 
 
 def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]:
     """Form the blocks of equal groups on one of the ranks that have them.
 
-    Who gives away what comes after some factors has all factors made until these are
-    sent; the others have all their blocks made until they take them.
+    Factors that are given away are sent when those who give them have made all of
+    theirs. Who has made its own before has formed some blocks meanwhile.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     ours = dict(zip(names, groups, strict=True))
-    work = {name: g.kind.K.nnz * g.touched.size for name, g in ours.items()}
+    border = {name: g.kind.border(g.touched).size for name, g in ours.items()}
+    work = {name: ours[name].kind.K.nnz * h for name, h in border.items()}
     tasks = forming(ranks.comm.allgather(work))
     given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
     taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
@@ -455,20 +475,26 @@ def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]
         return {n: ours[n].kind.blocks(ours[n].touched, factors[n]) for n in some}
 
     factors = {n: ours[n].kind.border_factor(ours[n].touched) for n in given + kept}
-    found = {} if given else blocks(kept)
-    sizes = [ours[n].kind.border(ours[n].touched).size for n in taken]
+    before = meanwhile(tasks, me)
+    found = blocks(kept[:before])
     came = _exchanged(
         ranks,
         [(tasks[n].blocks, np.ascontiguousarray(factors[n].T)) for n in given],
-        [(tasks[n].factor, (h, h)) for n, h in zip(taken, sizes, strict=True)],
+        [(tasks[n].factor, (border[n], border[n])) for n in taken],
     )
     factors |= {n: L.T for n, L in zip(taken, came, strict=True)}
-    found |= blocks(kept + taken if given else taken)
+    found |= blocks(kept[before:] + taken)
     made = {n: np.stack(found[n]) for n in found if len(tasks[n].have) > 1}
     others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
     came = _exchanged(
         ranks,
-        [(r, made[n]) for n, t in tasks.items() if n in made for r in t.have if r != me],
+        [
+            (r, made[n])
+            for n, t in tasks.items()
+            if n in made
+            for r in t.have
+            if r != me
+        ],
         [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
     )
     found |= {n: Condensed(*both) for n, both in zip(others, came, strict=True)}
@@ -494,13 +520,8 @@ def _exchanged(
 
 
 def _name(group: Group) -> str:
-    """Name what the blocks of a group depend on by its content."""
-    kind = group.kind
-    parts = (
-        kind.K.data, kind.K.indices, kind.K.indptr, kind.R, kind.fixing, kind.boundary,
-        group.touched,
-    )  # fmt: skip
-    return hex_digest((np.ascontiguousarray(part).tobytes() for part in parts), 32)
+    """Name what the blocks of a group depend on."""
+    return f"{group.kind.name} {hex_digest((group.touched.tobytes(),), 32)}"
 
 
 def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
@@ -524,7 +545,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     )
     local = DualOperator(
         csr_array(B[at.rows][:, columns]),
-        Subdomains(tuple(domains.kinds[k] for k in kinds), kind),
+        Subdomains(tuple(replace(domains.kinds[k], name=str(k)) for k in kinds), kind),
         operator.explicit[kinds],
         operator.equalities,
         partial(condensed_by_ranks, ranks=ranks),

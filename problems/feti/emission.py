@@ -221,11 +221,12 @@ class OwnSubdomains:
     def domains(self) -> Subdomains:
         """Its subdomains on their own."""
         found = self._classified[0]
-        if not self.problem.eliminated:
-            return found
-        free = np.zeros(int(found.start[-1]), dtype=bool)
-        free[self.kept] = True
-        return without(found, free)
+        if self.problem.eliminated:
+            free = np.zeros(int(found.start[-1]), dtype=bool)
+            free[self.kept] = True
+            found = without(found, free)
+        kinds = [replace(kind, name=_name_of(kind)) for kind in found.kinds]
+        return Subdomains(tuple(kinds), found.kind)
 
     def _leaders(
         self, own: list[tuple[int, Hashable, Points]]
@@ -493,7 +494,7 @@ def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
     taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
     counts = [own.f.size, explicit[domains.kind].sum(), taken]
     torn_dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
-    kinds = ranks.comm.allgather({_name_of(kind) for kind in domains.kinds})
+    kinds = ranks.comm.allgather({kind.name for kind in domains.kinds})
     return {
         "subdomains": own.rank.size, "kinds": len(set().union(*kinds)),
         "torn_dofs": int(torn_dofs), "multipliers": rows.total,
@@ -515,7 +516,7 @@ def _digest(own: OwnSubdomains) -> str:
     in turn, with what every rank has of the contact.
     """
     domains, rows, contact = own.domains, own.rows, own.problem.contact
-    names = [_name_of(kind).encode() for kind in domains.kinds]
+    names = [kind.name.encode() for kind in domains.kinds]
     B = csc_array(rows.B)
     B.sort_indices()
     told = []

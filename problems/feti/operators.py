@@ -193,7 +193,7 @@ class DualOperator:
 
         """
         blocks, weights = self.weighted_blocks(kind, scaling)
-        BW = csr_array(self.packed.B @ diags_array(weights))
+        BW = scaled_columns(self.packed.B, weights)
         gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
         WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
@@ -320,6 +320,11 @@ def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
         unit = np.eye(n, min(COLUMNS, n - first), -first)
         found[part] = (block @ unit)[i[part], j[part] - first]
     return found
+
+
+def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
+    """Multiply the columns of B (m, M) with weights (M,)."""
+    return csr_array((B.data * weights[B.indices], B.indices, B.indptr), shape=B.shape)
 
 
 def uncoupled(gram: csr_array, equalities: int) -> csr_array:

@@ -47,6 +47,7 @@ class Kind:
     #: Dirichlet preconditioners condense onto, glued or free
     boundary: Nodes
     stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
+    name: str = ""  #: the same on all ranks that have it, and there only
 
     def inverse(self, b: Dense) -> Dense:
         """Apply K⁺ to columns (n_k, k)."""

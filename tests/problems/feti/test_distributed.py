@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from problems.feti.distributed import AFTER_FACTOR, forming
+from problems.feti.distributed import AFTER_FACTOR, forming, meanwhile
 
 
 def loads(work):
@@ -23,12 +23,22 @@ def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
     assert sorted(np.bincount(factors)) == [4, 5]
 
 
+def test_blocks_fill_the_time_until_factors_are_given_away():
+    tasks = forming([dict.fromkeys("abcdefghi", 4)] * 2)
+    factors = np.bincount([task.factor for task in tasks.values()])
+    more, less = factors.argmax(), factors.argmin()
+
+    assert meanwhile(tasks, more) == 0
+    assert meanwhile(tasks, less) == 3  # blocks take a third of a factor
+
+
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
     tasks = forming([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
 
-    assert tasks["a"] == ([0], 0, 0)
-    assert tasks["b"] == ([0, 1], 1, 1)
-    assert tasks["c"] == ([2], 2, 2)
+    assert tasks["a"] == (8, [0], 0, 0)
+    assert tasks["b"] == (8, [0, 1], 1, 1)
+    assert tasks["c"] == (40, [2], 2, 2)
+    assert [meanwhile(tasks, rank) for rank in range(3)] == [1, 1, 1]
 
 
 def test_one_rank_does_all():
