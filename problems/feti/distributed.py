@@ -486,15 +486,10 @@ def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]
     found |= blocks(kept[before:] + taken)
     made = {n: np.stack(found[n]) for n in found if len(tasks[n].have) > 1}
     others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
+    to = [(r, n) for n in tasks if n in made for r in tasks[n].have if r != me]
     came = _exchanged(
         ranks,
-        [
-            (r, made[n])
-            for n, t in tasks.items()
-            if n in made
-            for r in t.have
-            if r != me
-        ],
+        [(r, made[n]) for r, n in to],
         [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
     )
     found |= {n: Condensed(*both) for n, both in zip(others, came, strict=True)}
