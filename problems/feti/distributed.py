@@ -232,8 +232,11 @@ class RowsOverRanks:
         """Split B (t, M) of all rows that a rank touches."""
         own, borrowed = csr_array(B[at.own]), csr_array(B[at.borrowed])
         reached = np.unique(borrowed.indices)
-        parts = own, csr_array(own.T), borrowed, csr_array(borrowed[:, reached].T)
-        return cls(at, *map(CompressedRows, parts), reached)
+        return cls(
+            at, CompressedRows(own), CompressedRows(csr_array(own.T)),
+            CompressedRows(borrowed),
+            CompressedRows(csr_array(borrowed[:, reached].T)), reached,
+        )  # fmt: skip
 
     def transposed_times(self, x: Vector) -> Vector:
         """Return Bᵀx (M,) of this rank's slice x (o,)."""

@@ -190,4 +190,4 @@ def _searched(
 @on_slices
 def _equal(one: NDArray[np.int8], other: NDArray[np.int8]) -> Vector:
     """Return 1 where two pieces are the same, else 0."""
-    return (one == other).astype(float)
+    return np.where(one == other, 1.0, 0.0)
