@@ -66,6 +66,8 @@ cdef extern from "vectors.h" nogil:
     bint same(const double *a, const double *b, Py_ssize_t n)
     void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
                     Py_ssize_t n)
+    void combination(double s, const double *U, const double *c, const double *v,
+                     double *y, Py_ssize_t k, Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
     void lengths(const double *x, const double *g, double *p, double *Hp,
@@ -101,11 +103,23 @@ cdef extern from "vectors.h" nogil:
                            Py_ssize_t n)
     void add_gram(const double *s, const double *V, const int *row, double *S,
                   Py_ssize_t k)
+    void scaled(const double *root, const double *G, double tau, double *S,
+                Py_ssize_t k, Py_ssize_t stride)
     int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
+    void restored(const double *nu, const double *shift, const double *lower,
+                  const double *upper, const double *lb, const double *ub, double *x,
+                  double *free, Py_ssize_t n)
+    void held_by(const double *nu, const double *lower, const double *upper,
+                 const double *g, double *z, Py_ssize_t n)
+    void masked(const double *free, const double *a, double *t, Py_ssize_t n)
+    double worst_residual(const double *q, const double *diagonal, const double *x,
+                          const double *y, const double *z, const double *Fx,
+                          const double *lb, const double *ub, const double *e,
+                          const double *rows, Py_ssize_t m, Py_ssize_t n, double *room)
 
 
 # --- numbers ------------------------------------------------------------------------
@@ -535,7 +549,7 @@ cdef class Model:
     cdef const double *U
     cdef Room holder, room  # of U, and of the others
     cdef double *w  # (k,)
-    cdef double *root  # of w
+    cdef double *root  # of w, and zeros up to a multiple of four
     cdef Gram gram
 
     @staticmethod
@@ -547,7 +561,7 @@ cdef class Model:
         """
         cdef Model B = Model.__new__(Model)
         cdef Py_ssize_t i, k = 0
-        B.room = Room(2 * found)
+        B.room = Room(2 * found + 3)
         B.w, B.root = B.room.at, B.room.at + found
         for i in range(found):
             B.w[k] = w[i] + shift
@@ -812,8 +826,8 @@ cdef class Solver:
         if not self.r:
             self.F.apply(v, out, self.inverse_norm)
             return 0
-        memcpy(Pv, v, n * sizeof(double))
-        without(self.C, self.r, Pv, self.Cv, n)
+        rows_times(self.C, v, self.Cv, self.r, n)
+        combination(-1.0, self.C, self.Cv, v, Pv, self.r, n)
         self.F.apply(Pv, out, self.inverse_norm)
         rows_times(self.C, out, self.Cw, self.r, n)
         for i in range(self.r):
@@ -876,34 +890,25 @@ cdef class Solver:
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k, stride
-        cdef double *S = self.core
-        cdef double *U_F
         B.enter(piece)
-        U_F, stride = B.gram.values, B.gram.stride
-        for i in range(k):
-            for j in range(i, k):
-                S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
-            for j in range(k, stride):
-                S[i * stride + j] = 0.0
-            S[i * stride + i] += B.tau
-        if not cholesky(S, self.inverse, k, stride):
+        scaled(B.root, B.gram.values, B.tau, self.core, B.k, B.gram.stride)
+        if not cholesky(self.core, self.inverse, B.k, B.gram.stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
     cdef void tilt(self, Model B, const double *x, const double *g, const double *lower,
-                   const double *upper, const double *y, double *s, double *piece,
-                   double *slope) noexcept:
-        """Find s(y), its piece and the slope Us − W⁻¹y."""
-        cdef Py_ssize_t i, n = self.n
+                   const double *upper, const double *y, double *s,
+                   double *piece) noexcept:
+        """Find s(y) and its piece."""
         cdef double *t = self.t
-        if not B.k:
-            tilted(x, g, B.tau, lower, upper, s, NULL, n)
-            return
-        memcpy(t, g, n * sizeof(double))
-        add_combination(1.0, B.U, y, t, B.k, n)
-        tilted(x, t, B.tau, lower, upper, s, piece, n)
-        rows_times(B.U, s, slope, B.k, n)
+        combination(1.0, B.U, y, g, t, B.k, self.n)
+        tilted(x, t, B.tau, lower, upper, s, piece, self.n)
+
+    cdef void slope_at(self, Model B, const double *s, const double *y,
+                       double *slope) noexcept:
+        """Find the slope Us(y) − W⁻¹y."""
+        cdef Py_ssize_t i
+        rows_times(B.U, s, slope, B.k, self.n)
         for i in range(B.k):
             slope[i] -= y[i] / B.w[i]
 
@@ -921,10 +926,11 @@ cdef class Solver:
         cdef double *piece_there = self.piece2
         cdef double begun, now, low, high, at_low, at_high, t, share
         if not k:
-            self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+            tilted(x, g, B.tau, lower, upper, s, NULL, n)
             return 0
         memset(y, 0, k * sizeof(double))
-        self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+        tilted(x, g, B.tau, lower, upper, s, piece, n)
+        rows_times(B.U, s, slope, k, n)
         for newton in range(NEWTON_STEPS):
             self.factor(B, piece)
             for i in range(k):
@@ -934,9 +940,10 @@ cdef class Solver:
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
             begun = dot(slope, dy, k)
-            self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
+            self.tilt(B, x, g, lower, upper, there, s, piece_there)
             if same(piece, piece_there, n):
                 return 0  # where Newton's method is exact
+            self.slope_at(B, s, there, slope_there)
             now = dot(slope_there, dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
             for search in range(SEARCH_STEPS):
@@ -946,7 +953,8 @@ cdef class Solver:
                 t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
                 for i in range(k):
                     there[i] = y[i] + t * dy[i]
-                self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
+                self.tilt(B, x, g, lower, upper, there, s, piece_there)
+                self.slope_at(B, s, there, slope_there)
                 now = dot(slope_there, dy, k)
                 if now > 0:
                     low, at_low = t, now
@@ -1002,14 +1010,13 @@ cdef class Solver:
         cdef double *z = self.z
         if not self.preconditioned or not M.k:
             return self.phi  # directions have no length
-        memcpy(z, self.phi, n * sizeof(double))
         rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         solve(self.core, self.inverse, self.c, M.gram.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        add_combination(-1.0, M.U, self.c, z, M.k, n)
+        combination(-1.0, M.U, self.c, self.phi, z, M.k, n)
         scale_free(1 / M.tau, self.free, z, n)
         return z
 
@@ -1475,43 +1482,40 @@ cdef class Solver:
         As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
         they are too nearly dependent on the free components for normal equations.
         """
-        cdef Py_ssize_t i, j, k, n = self.n, r = self.r
+        cdef Py_ssize_t i, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result, multipliers, lb, ub = np.zeros((3, n)), np.empty(r), _whole(lb), _whole(ub)
+        cdef bint any_left = False
+        result, multipliers, lb, ub = np.zeros((3, n)), np.zeros(r), _whole(lb), _whole(ub)
         cdef Room room = Room(r * r)
         cdef double *S = room.at
         cdef const double *v = numbers(nu)
-        cdef const double *least = numbers(lb)
-        cdef const double *most = numbers(ub)
         cdef const double *at_mu = numbers(mu)
         cdef double *a = numbers(multipliers)
         cdef double *x = numbers(result)
         cdef double *z_box = x + n
         cdef double *Fx = z_box + n
         cdef double *rest = self.s
-        cdef double *at = self.Hs  # −2 at the lower bound, 1 at the upper, −1 at both
+        cdef double *free = self.piece
+        cdef double *t = self.t
         cdef double *da = self.Cv
-        cdef double s
-        for i in range(n):
-            at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
-            s = self.x_tilde[i] + v[i]
-            s = least[i] if at[i] < 0 else (most[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, least[i]), most[i])  # l − x̃ + x̃ may differ from l
+        restored(v, self.x_tilde, self.lower, self.upper, numbers(lb), numbers(ub), x,
+                 free, n)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
+            any_left = any_left or rest[i] != 0
+        if not any_left:  # a minimum of the cost without any constraint
+            return result[0], multipliers, result[1], result[2]
         if r:
             rows_times(self.C, rest, da, r, n)
             for i in range(r):
                 a[i] = self.norm * at_mu[i] - da[i]
-                da[i] = 0.0
             add_combination(1.0, self.C, a, rest, r, n)
-            for k in range(n):
-                if at[k] == 0:
-                    for i in range(r):
-                        da[i] += self.C[i * n + k] * rest[k]
-                        for j in range(i + 1):
-                            S[i * r + j] += self.C[i * n + k] * self.C[j * n + k]
+            for i in range(r):
+                masked(free, self.C + i * n, t, n)
+                rows_times(self.C, t, S + i * r, i + 1, n)
+            masked(free, rest, t, n)
+            rows_times(self.C, t, da, r, n)
             dpotrf(b"U", &order, S, &order, &info)
             for i in range(r):
                 if info or S[i * r + i] < 1e-4:
@@ -1520,11 +1524,7 @@ cdef class Solver:
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, self.C, da, rest, r, n)
-        for i in range(n):
-            if at[i] < 0:
-                z_box[i] = -fmax(rest[i], 0.0)
-            if at[i] == 1 or at[i] == -1:
-                z_box[i] -= fmin(rest[i], 0.0)
+        held_by(v, self.lower, self.upper, rest, z_box, n)
         return result[0], multipliers, result[1], result[2]
 
 
@@ -1540,79 +1540,14 @@ def residual_bound(
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef Py_ssize_t i, j, n = len(at_x), m = len(at_y)
-    held = tuple(map(_whole, (cost, told_diagonal, right, lower, upper, at_x, at_y, at_z,
-                              told_Fx, told_rows)))
-    cdef const double *q = numbers(held[0])
-    cdef const double *diagonal = numbers(held[1])
-    cdef const double *e = numbers(held[2])
-    cdef const double *lb = numbers(held[3])
-    cdef const double *ub = numbers(held[4])
-    cdef const double *x = numbers(held[5])
-    cdef const double *y = numbers(held[6])
-    cdef const double *z_box = numbers(held[7])
-    cdef const double *Fx = numbers(held[8])
-    cdef const double *rows = numbers(held[9])
-    cdef double xFx = 0.0, qx = 0.0, held_by = 0.0, energy, most, worst = 0.0, S = 0.0
-    cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
+    cdef Py_ssize_t n = len(at_x), m = len(at_y)
+    held = tuple(map(_whole, (cost, told_diagonal, at_x, at_y, at_z, told_Fx, lower, upper,
+                              right, told_rows)))
     cdef Room room = Room(2 * n)
-    cdef double *forces = room.at
-    cdef double *size = forces + n
     if not len(held[1]) or not n:
         return INFINITY
-    memcpy(forces, z_box, n * sizeof(double))
-    for i in range(m):
-        add(y[i], rows + i * n, forces, n)
-        held_by += e[i] * y[i]
-    for i in range(n):
-        if not lb[i] <= x[i] <= ub[i]:
-            return INFINITY
-        xFx += x[i] * Fx[i]
-        qx += q[i] * x[i]
-        if z_box[i]:
-            step = ub[i] if z_box[i] > 0 else lb[i]
-            held_by += step * z_box[i]
-            worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
-        if diagonal[i] > 0:
-            least = fmin(least, diagonal[i])
-        S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(q[i]), fabs(forces[i])))
-    most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held_by))
-    energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
-    if not energy > 0:
-        return INFINITY
-    worst = fmax(worst, fabs(xFx + qx + held_by)) / energy
-    if isfinite(least):
-        S = fmax(S, sqrt(energy * least))
-    for i in range(n):
-        step = fabs(Fx[i] + q[i] + forces[i])
-        total += step
-        if step == 0:
-            continue
-        worst = fmax(worst, step / S)
-        own = step / fmax(fmax(fabs(Fx[i]), fabs(q[i])), fabs(forces[i]))
-        if diagonal[i] > 0:
-            known = fmax(fabs(x[i]), step / diagonal[i])
-            terms = x[i] - lb[i] if Fx[i] + q[i] + forces[i] > 0 else ub[i] - x[i]
-            own = fmin(own, step * fmin(known, terms) / energy)
-        worst = fmax(worst, own)
-    for j in range(n if m else 0):
-        step = INFINITY
-        if diagonal[j] > 0:
-            step = sqrt(energy / diagonal[j])
-        if q[j]:
-            step = fmin(step, energy / fabs(q[j]))
-        size[j] = 0.0
-        if isfinite(step):
-            size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
-    for i in range(m):
-        violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
-        for j in range(n):
-            violated += rows[i * n + j] * x[j]
-            terms += fabs(rows[i * n + j] * x[j])
-            known += fabs(rows[i * n + j]) * size[j]
-        total += violated
-        if violated:
-            worst = fmax(worst, fabs(violated) / known)
-            if fabs(e[i]) > 1e-9 * known:
-                worst = fmax(worst, 1e-4 * fabs(violated) / terms)
-    return worst if isfinite(total) and isfinite(worst) else INFINITY
+    return worst_residual(
+        numbers(held[0]), numbers(held[1]), numbers(held[2]), numbers(held[3]),
+        numbers(held[4]), numbers(held[5]), numbers(held[6]), numbers(held[7]),
+        numbers(held[8]), numbers(held[9]), m, n, room.at,
+    )

@@ -343,43 +343,57 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     }
 }
 
-/* y = y + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over y. */
+/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over v, which may be
+   y. */
 INLINE void
-add_rows(in U, const double *c, out y, Py_ssize_t rows, Py_ssize_t n)
+add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_ssize_t n)
 {
     Py_ssize_t j = 0;
     for (; j + 4 <= n; j += 4) {
         four sum = EACH(0);
         for (Py_ssize_t i = 0; i < rows; i++)
             sum += FOUR(U + i * n + j) * EACH(c[i]);
-        *(four *) (y + j) += sum;
+        *(four *) (y + j) = FOUR(v + j) + sum;
     }
-    for (; j < n; j++)
+    for (; j < n; j++) {
+        double sum = 0;
         for (Py_ssize_t i = 0; i < rows; i++)
-            y[j] += c[i] * U[i * n + j];
+            sum += c[i] * U[i * n + j];
+        y[j] = v[j] + sum;
+    }
 }
 
-/* y = y + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over y. */
-TWICE static void add_combination(double s, in U, in c, out y, Py_ssize_t k,
-                                  Py_ssize_t n)
+/* y = v + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over v, which may
+   be y. The last rows first: after `rows_times` these are in the nearest cache. */
+TWICE static void combination(double s, in U, in c, const double *v, double *y,
+                              Py_ssize_t k, Py_ssize_t n)
 {
     double sc[8];
-    for (Py_ssize_t i = 0, rows; i < k; i += rows) {
-        rows = k - i < 8 ? k - i : 8;
+    if (!k && v != y)
+        memcpy(y, v, n * sizeof(double));
+    for (Py_ssize_t last = k, rows; last; last -= rows, v = y) {
+        rows = last < 8 ? last : 8;
+        in V = U + (last - rows) * n;
         for (Py_ssize_t j = 0; j < rows; j++)
-            sc[j] = s * c[i + j];
-        in V = U + i * n;
+            sc[j] = s * c[last - rows + j];
         switch (rows) { /* the number of rows known, the loop over them is none */
-        case 1: add_rows(V, sc, y, 1, n); break;
-        case 2: add_rows(V, sc, y, 2, n); break;
-        case 3: add_rows(V, sc, y, 3, n); break;
-        case 4: add_rows(V, sc, y, 4, n); break;
-        case 5: add_rows(V, sc, y, 5, n); break;
-        case 6: add_rows(V, sc, y, 6, n); break;
-        case 7: add_rows(V, sc, y, 7, n); break;
-        default: add_rows(V, sc, y, 8, n);
+        case 1: add_rows(V, sc, v, y, 1, n); break;
+        case 2: add_rows(V, sc, v, y, 2, n); break;
+        case 3: add_rows(V, sc, v, y, 3, n); break;
+        case 4: add_rows(V, sc, v, y, 4, n); break;
+        case 5: add_rows(V, sc, v, y, 5, n); break;
+        case 6: add_rows(V, sc, v, y, 6, n); break;
+        case 7: add_rows(V, sc, v, y, 7, n); break;
+        default: add_rows(V, sc, v, y, 8, n);
         }
     }
+}
+
+/* y = y + s Uᵀc. */
+static inline void
+add_combination(double s, in U, in c, double *y, Py_ssize_t k, Py_ssize_t n)
+{
+    combination(s, U, c, y, y, k, n);
 }
 
 typedef long long __attribute__((may_alias)) ordered; /* as doubles ≥ 0 are */
@@ -405,9 +419,9 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
         four room = to - FOUR(lower + j);
         if (upper) {
             room = CHOSEN(q > zero, room, FOUR(upper + j) - to);
-            nearer |= (room <= most * ABSOLUTE(q)) & (q != zero);
+            nearer |= room < most * ABSOLUTE(q);
         } else {
-            nearer |= (room <= most * q) & (q > zero);
+            nearer |= (room < most * q) & (q > zero);
         }
         curvature += q * FOUR(Hp + j);
         slope += q * FOUR(g + j);
@@ -461,10 +475,10 @@ INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, i
                          out told)
 {
     double feasible = INFINITY;
-    Py_ssize_t turned = 0;
+    Py_ssize_t turned = 0, block = F ? BLOCK : 64; /* short: few divisions */
     told[2] = told[3] = 0;
-    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
-        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+    for (Py_ssize_t i = 0; i < n; i += block) {
+        Py_ssize_t size = n - i < block ? n - i : block;
         if (turning) {
             Py_ssize_t to = i + size + reach(F) < n ? i + size + reach(F) : n;
             turn_at(x + turned, g + turned, lower + turned, upper ? upper + turned : NULL,
@@ -764,6 +778,19 @@ TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict 
     return count;
 }
 
+/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in squares of `stride` numbers a side, a
+   multiple of four; `root` and G have zeros from column k on. */
+TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
+                         Py_ssize_t stride)
+{
+    for (Py_ssize_t i = 0; i < k; i++) {
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < stride; j += 4)
+            *(four *) (S + i * stride + j)
+                = EACH(root[i]) * FOUR(root + j) * FOUR(G + i * stride + j);
+        S[i * stride + i] += tau;
+    }
+}
+
 /* S = RᵀR (k, k) in a square of `stride` numbers a side, a multiple of four, zeros from
    column k on: R above the diagonal of S, 1/Rᵢᵢ in `inverse`, zeros for what is beyond k;
    0 where S is not positive definite. */
@@ -830,8 +857,9 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
 INLINE void tilted_block(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
+    double length = 1 / tau;
     for (Py_ssize_t i = 0; i < n; i++) {
-        double target = x[i] - g[i] / tau;
+        double target = x[i] - length * g[i];
         double low = target <= lower[i] ? 1.0 : 0.0;
         double high = target >= upper[i] ? 1.0 - low : 0.0;
         target = target >= upper[i] ? upper[i] : target;
@@ -889,4 +917,124 @@ TWICE static int turn_round(out s, Py_ssize_t n)
         s[i] = -s[i];
     }
     return any != 0;
+}
+
+#define LARGER(a, b) ((a) > (b) ? (a) : (b))
+#define SMALLER(a, b) ((a) < (b) ? (a) : (b))
+
+/* x = shift + ν, within lb and ub, and on them where ν is on its bounds (the sum may
+   differ from that in the last bit); `free` is 1 where ν is on none, 0 elsewhere. */
+TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, out x,
+                           out free, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        int down = nu[i] <= lower[i], up = nu[i] >= upper[i];
+        double to = up ? ub[i] : shift[i] + nu[i];
+        to = down ? lb[i] : to;
+        to = LARGER(to, lb[i]);
+        x[i] = SMALLER(to, ub[i]);
+        free[i] = down | up ? 0.0 : 1.0;
+    }
+}
+
+/* The multipliers z of the bounds that ν is on, where the gradient without them is g. */
+TWICE static void held_by(in nu, in lower, in upper, in g, out z, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double push = LARGER(g[i], 0), pull = SMALLER(g[i], 0);
+        z[i] = (nu[i] <= lower[i] ? -push : 0) - (nu[i] >= upper[i] ? pull : 0);
+    }
+}
+
+/* t = free a. */
+TWICE static void masked(in free, in a, out t, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        t[i] = free[i] * a[i];
+}
+
+/* The sizes of variables that an energy knows of, as `harness.verify.kkt` says; zero
+   where it knows of none. */
+INLINE void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssize_t n)
+{
+    for (Py_ssize_t j = 0; j < n; j++) {
+        double step = diagonal[j] > 0 ? sqrt(energy / diagonal[j]) : INFINITY;
+        double other = q[j] != 0 ? energy / fabs(q[j]) : INFINITY;
+        step = SMALLER(step, other);
+        other = SMALLER(fabs(x[j]), 1e3 * step);
+        size[j] = step < INFINITY ? LARGER(other, step) : 0;
+    }
+}
+
+/* An upper bound of the worst residual, see `residual_bound` in `compiled.pyx`; room for
+   2n numbers. */
+TWICE static double
+worst_residual(in q, in diagonal, in x, in y, in z, in Fx, in lb, in ub, in e, in rows,
+               Py_ssize_t m, Py_ssize_t n, out room)
+{
+    double *restrict forces = room, *restrict size = room + n;
+    double xFx = 0, qx = 0, held = 0, most = 0, largest = 0, least = INFINITY, all = 0;
+    Py_ssize_t outside = 0;
+    memcpy(forces, z, n * sizeof(double));
+    add_combination(1, rows, y, forces, m, n);
+    for (Py_ssize_t i = 0; i < m; i++)
+        held += e[i] * y[i];
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double step = z[i] > 0 ? ub[i] : lb[i], size_of_all;
+        step = z[i] != 0 ? step : 0;
+        outside |= !(lb[i] <= x[i]) | !(x[i] <= ub[i]);
+        xFx += x[i] * Fx[i];
+        qx += q[i] * x[i];
+        held += step * z[i];
+        most = LARGER(most, fabs(z[i] * (x[i] - step)));
+        least = diagonal[i] > 0 && diagonal[i] < least ? diagonal[i] : least;
+        size_of_all = LARGER(fabs(Fx[i]), fabs(q[i]));
+        size_of_all = LARGER(size_of_all, fabs(forces[i]));
+        largest = LARGER(largest, size_of_all);
+        size[i] = size_of_all;
+    }
+    double terms = LARGER(LARGER(fabs(xFx), fabs(qx)), fabs(held));
+    double energy = LARGER(1e4 * fabs(xFx / 2 + qx), terms / 1e4);
+    energy = SMALLER(terms, energy);
+    if (outside || !(energy > 0))
+        return INFINITY;
+    double worst = LARGER(most, fabs(xFx + qx + held)) / energy;
+    if (least < INFINITY)
+        largest = LARGER(largest, sqrt(energy * least));
+    for (Py_ssize_t i = 0; i < n; i++) {
+        forces[i] += Fx[i] + q[i];
+        all += fabs(forces[i]);
+    }
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double r = fabs(forces[i]), own;
+        worst = LARGER(worst, r / largest);
+        if (!(r > worst * size[i]))
+            continue;
+        own = r / size[i];
+        if (diagonal[i] > 0) {
+            double known = LARGER(fabs(x[i]), r / diagonal[i]);
+            double way = forces[i] > 0 ? x[i] - lb[i] : ub[i] - x[i];
+            known = SMALLER(known, way);
+            own = SMALLER(own, r * known / energy);
+        }
+        worst = LARGER(worst, own);
+    }
+    if (m)
+        known_sizes(energy, q, diagonal, x, size, n);
+    for (Py_ssize_t i = 0; i < m; i++) {
+        in row = rows + i * n;
+        double violated = -e[i], told = fabs(e[i]), known = told;
+        for (Py_ssize_t j = 0; j < n; j++) {
+            violated += row[j] * x[j];
+            told += fabs(row[j] * x[j]);
+            known += fabs(row[j]) * size[j];
+        }
+        all += fabs(violated);
+        if (violated == 0)
+            continue;
+        worst = LARGER(worst, fabs(violated) / known);
+        if (fabs(e[i]) > 1e-9 * known)
+            worst = LARGER(worst, 1e-4 * fabs(violated) / told);
+    }
+    return isfinite(all) && isfinite(worst) ? worst : INFINITY;
 }
