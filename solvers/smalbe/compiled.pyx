@@ -101,11 +101,16 @@ cdef extern from "vectors.h" nogil:
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
+    void transposed(const double *U, double *columns, Py_ssize_t k, Py_ssize_t n,
+                    Py_ssize_t stride)
+    double inward_energy(const double *x, const double *g, const double *lower,
+                         const double *upper, const double *diagonal, double norm,
+                         double noise, Py_ssize_t n)
     void add_gram(const double *s, const double *V, const int *row, double *S,
                   Py_ssize_t k)
     void scaled(const double *root, const double *G, double tau, double *S,
                 Py_ssize_t k, Py_ssize_t stride)
-    int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
+    int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
@@ -497,16 +502,14 @@ cdef class Gram:
     @staticmethod
     cdef Gram of(Model B):
         cdef Gram made = Gram.__new__(Gram)
-        cdef Py_ssize_t i, j, stride = (B.k + 3) & ~3
+        cdef Py_ssize_t stride = B.stride
         made.k, made.n, made.stride, made.flips = B.k, B.n, stride, B.n + 1
         made.room = Room(stride * (stride + B.n) + 2 * B.n + 2)
         made.values = made.room.at
         made.columns = made.values + stride * stride
         made.held = made.columns + stride * B.n
         made.where = <int *> (made.held + B.n)
-        for j in range(B.k):
-            for i in range(B.n):
-                made.columns[i * stride + j] = B.U[j * B.n + i]
+        transposed(B.U, made.columns, B.k, B.n, stride)
         return made
 
     cdef void enter(self, const double *piece) noexcept:
@@ -544,30 +547,33 @@ cdef class Gram:
 cdef class Model:
     """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
 
-    cdef Py_ssize_t n, k
+    cdef Py_ssize_t n, k, stride  # stride: k or more, a multiple of four
     cdef double tau
     cdef const double *U
     cdef Room holder, room  # of U, and of the others
     cdef double *w  # (k,)
-    cdef double *root  # of w, and zeros up to a multiple of four
+    cdef double *root  # of w, and zeros (stride,)
     cdef Gram gram
 
     @staticmethod
     cdef Model above_tail(const double *U, Room holder, Py_ssize_t found, Py_ssize_t n,
-                          const double *w, double shift, double tau):
+                          const double *w, double shift, double tau, Py_ssize_t stride):
         """Add `shift` to w (found,), and leave out the rows where that is not positive.
+
+        These are the last as a rule, and U stays as it is.
 
         holder : of U (found, n)
         """
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0
-        B.room = Room(2 * found + 3)
+        cdef Py_ssize_t i, k = 0, last = -1
+        B.room = Room(found + stride)
         B.w, B.root = B.room.at, B.room.at + found
         for i in range(found):
             B.w[k] = w[i] + shift
-            k += B.w[k] > 0
+            if B.w[k] > 0:
+                k, last = k + 1, i
         B.U, B.holder = U, holder
-        if k < found:
+        if last >= k:
             B.holder = Room(k * n)
             B.U, k = B.holder.at, 0
             for i in range(found):
@@ -576,7 +582,7 @@ cdef class Model:
                     k += 1
         for i in range(k):
             B.root[i] = sqrt(B.w[i])
-        B.tau, B.k, B.n = tau, k, n
+        B.tau, B.k, B.n, B.stride = tau, k, n, stride
         return B
 
     @staticmethod
@@ -591,9 +597,9 @@ cdef class Model:
         if not self.k:
             return Model.of_norm(tau, self.n)
         B = Model.above_tail(self.U, self.holder, self.k, self.n, self.w, self.tau - tau,
-                             tau)
-        if B.k == self.k:
-            B.gram = self.gram  # of the same rows
+                             tau, self.stride)
+        if B.U == self.U:
+            B.gram = self.gram  # of these rows, and perhaps some more
         return B
 
     cdef int enter(self, const double *piece) except -1:
@@ -690,7 +696,7 @@ cdef class Solver:
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef bint in_two  # whether CG steps go through memory twice: φ, `free` not stored
     cdef int expansion
-    cdef Py_ssize_t found  # directions of the model: Ritz vectors, then C
+    cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
     cdef tuple held  # the arrays that are read
     cdef Room vectors, room  # of these directions, and of all that is written
     cdef const double *C
@@ -724,6 +730,8 @@ cdef class Solver:
     cdef double *g0
     cdef double *Cv
     cdef double *Cw
+    cdef double *Cx  # where it is known, see `violation`
+    cdef bint knows_Cx
     cdef double *y
     cdef double *dy
     cdef double *y2
@@ -731,7 +739,7 @@ cdef class Solver:
     cdef double *slope2
     cdef double *c
     cdef double *core
-    cdef double *inverse  # of the diagonal of the factor of the core
+    cdef double *inverse  # of the pivots of the core
     cdef double told[4]
     cdef double tail, phi_square, beta_square, reduced_square
     cdef Model preconditioner, B, known
@@ -774,7 +782,7 @@ cdef class Solver:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
         k = (self.found + 3) & ~3
-        self.room = Room(19 * n + 2 * self.r + (7 + k) * k)
+        self.room = Room(19 * n + 3 * self.r + (7 + k) * k)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -790,7 +798,8 @@ cdef class Solver:
         self.slope2, self.c, self.inverse = at + 4 * k, at + 5 * k, at + 6 * k
         self.Cv = at + 7 * k
         self.Cw = self.Cv + self.r
-        self.core = self.Cw + self.r
+        self.Cx = self.Cw + self.r
+        self.core = self.Cx + self.r
 
     cdef int find_upper_end(self, values, residuals, vectors) except -1:
         """Choose what a model holds, as `Projected.upper_end` does."""
@@ -808,13 +817,13 @@ cdef class Solver:
         self.found = kept + self.r
         self.vectors = Room(self.found * (n + 1))
         self.above = self.vectors.at + self.found * n
-        memcpy(self.vectors.at, numbers(vectors), kept * n * sizeof(double))
-        memcpy(self.vectors.at + kept * n, self.C, self.r * n * sizeof(double))
-        self.C = self.vectors.at + kept * n  # read once, not twice, from farther caches
-        for i in range(self.found):
+        memcpy(self.vectors.at, self.C, self.r * n * sizeof(double))
+        memcpy(self.vectors.at + self.r * n, numbers(vectors), kept * n * sizeof(double))
+        self.C = self.vectors.at  # read once, not twice, from farther caches
+        for i in range(self.r):
             self.above[i] = -self.tail
-            if i < kept:
-                self.above[i] += (value[i] + residual[i]) / self.norm
+        for i in range(kept):
+            self.above[self.r + i] = (value[i] + residual[i]) / self.norm - self.tail
         return 0
 
     # the operator
@@ -875,6 +884,13 @@ cdef class Solver:
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
 
+    cdef double violation(self):
+        """Find ‖Cx‖ at the iterate; CG steps have brought Cx along."""
+        if not self.knows_Cx:
+            rows_times(self.C, self.x, self.Cx, self.r, self.n)
+            self.knows_Cx = True
+        return sqrt(dot(self.Cx, self.Cx, self.r))
+
     # the model
 
     cdef Model model(self, double rho):
@@ -882,17 +898,17 @@ cdef class Solver:
         cdef Py_ssize_t i, k = self.found
         if self.known is None or self.known_rho != rho:
             for i in range(k):
-                self.c[i] = self.above[i] + (rho if i >= k - self.r else 0.0)
+                self.c[i] = self.above[i] + (rho if i < self.r else 0.0)
             self.known = Model.above_tail(self.vectors.at, self.vectors, k, self.n,
-                                          self.c, 0.0, self.tail)
+                                          self.c, 0.0, self.tail, (k + 3) & ~3)
             self.known_rho = rho
         return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
         B.enter(piece)
-        scaled(B.root, B.gram.values, B.tau, self.core, B.k, B.gram.stride)
-        if not cholesky(self.core, self.inverse, B.k, B.gram.stride):
+        scaled(B.root, B.gram.values, B.tau, self.core, B.k, B.stride)
+        if not eliminated(self.core, self.inverse, B.k, B.stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
@@ -935,7 +951,7 @@ cdef class Solver:
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, self.inverse, dy, B.gram.stride)
+            solve(self.core, self.inverse, dy, B.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
@@ -1013,7 +1029,7 @@ cdef class Solver:
         rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.inverse, self.c, M.gram.stride)
+        solve(self.core, self.inverse, self.c, M.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         combination(-1.0, M.U, self.c, self.phi, z, M.k, n)
@@ -1037,7 +1053,7 @@ cdef class Solver:
                 self.phi if stored else NULL, self.free if stored else NULL, self.n,
                 self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
-        self.reduced_square = self.told[2]
+        self.reduced_square, self.knows_Cx = self.told[2], False
 
     cdef double searched(self, double *s, double *Hs) except? -1:
         """Find the length along s of the least cost, in the box where 1 is not beyond.
@@ -1093,6 +1109,7 @@ cdef class Solver:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
+        self.knows_Cx = False
         if self.expansion in (PROJCG, MIXED) and isfinite(cg):
             for i in range(n):
                 step = self.x[i] - cg * self.p[i]
@@ -1286,11 +1303,14 @@ cdef class Solver:
 
         Returns γ of p ← φ − γp where that is put off, 0 else.
         """
-        cdef double curvature = self.told[3], z_Hp
+        cdef double length = self.told[0], curvature = self.told[3], z_Hp
         cdef const double *z
+        cdef bint knows_Cx = self.knows_Cx
         if not self.in_two:
             self.directions.add(self.p, self.Hp, curvature)
-        self.to(self.told[0], self.p, self.Hp)
+        self.to(length, self.p, self.Hp)
+        add(-length, self.Cv, self.Cx, self.r)  # Cp, of the product Hp
+        self.knows_Cx = knows_Cx
         z_Hp = self.told[3]
         if self.in_two:
             return z_Hp / curvature
@@ -1307,7 +1327,7 @@ cdef class Solver:
         """Whether an inner run may end."""
         cdef double size = sqrt(self.phi_square + self.beta_square)
         if self.r and size < until.coarse:
-            if size < until.M * self.infeasibility(self.x):
+            if size < until.M * self.violation():
                 return True
         return size <= until.small and self.small(tol, energy, b_size)
 
@@ -1335,23 +1355,15 @@ cdef class Solver:
 
     cdef double energy_error(self):
         """Estimate the relative energy error, as `Projected.energy_error` does."""
-        cdef double energy = 0.0, most = 0.0, total = 0.0, part, noise
+        cdef double energy = 0.0, most = 0.0, total
         cdef Py_ssize_t i
         if not self.diagonal:
             return 0.0
         for i in range(self.n):
             energy += self.q[i] * (self.x_tilde[i] + self.x[i])
-            most = fmax(most, fabs(self.q[i]))
-        noise = 1e3 * 2.0 ** -52 * most
-        for i in range(self.n):
-            if not (
-                (self.g[i] < 0 and self.x[i] < self.upper[i])
-                or (self.g[i] > 0 and self.x[i] > self.lower[i])
-            ):
-                continue
-            part = self.norm * self.g[i]
-            if self.diagonal[i] > 0 and fabs(part) > noise:
-                total += part * part / self.diagonal[i]
+            most = fabs(self.q[i]) if fabs(self.q[i]) > most else most
+        total = inward_energy(self.x, self.g, self.lower, self.upper, self.diagonal,
+                              self.norm, 1e3 * 2.0 ** -52 * most, self.n)
         return sqrt(total / fabs(energy)) if energy else 0.0
 
     # the outer loop
@@ -1397,7 +1409,7 @@ cdef class Solver:
         memcpy(self.g, numbers(at.g), n * sizeof(double))
         if at.rho != self.rho or not at.outer:
             self.directions.begin(self.free)
-        self.rho, self.most_products = at.rho, 0
+        self.rho, self.most_products, self.knows_Cx = at.rho, 0, False
         multipliers = np.array(at.mu)
         cdef double *mu = numbers(multipliers)
         cdef double b_size = sqrt(dot(self.b, self.b, n))

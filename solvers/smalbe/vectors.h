@@ -740,6 +740,15 @@ TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in fre
     told[1] = phi_Hp;
 }
 
+/* Uᵀ by rows of `stride` numbers, those from column k on as they are. */
+TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
+                             Py_ssize_t stride)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        for (Py_ssize_t j = 0; j < k; j++)
+            columns[i * stride + j] = U[j * n + i];
+}
+
 /* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, those rows of V (n, k), k a multiple of four; only
    the upper triangle of S (k, k) means something. */
 TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_t k)
@@ -791,23 +800,20 @@ TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
     }
 }
 
-/* S = RᵀR (k, k) in a square of `stride` numbers a side, a multiple of four, zeros from
-   column k on: R above the diagonal of S, 1/Rᵢᵢ in `inverse`, zeros for what is beyond k;
-   0 where S is not positive definite. */
-TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
+/* S = RᵀD⁻¹R (k, k) with the diagonal D of R, by Gaussian elimination in a square of
+   `stride` numbers a side, a multiple of four, zeros from column k on: R takes the place
+   of S, 1/Dᵢᵢ is in `inverse`, zeros are beyond k; 0 where S is not positive definite. */
+TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
         double *r = S + i * stride;
-        Py_ssize_t first = i & ~(Py_ssize_t) 3;
         if (!(r[i] > 0))
             return 0;
-        inverse[i] = 1 / sqrt(r[i]);
-        for (Py_ssize_t j = first; j < i; j++)
+        inverse[i] = 1 / r[i];
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < i; j++)
             r[j] = 0; /* means nothing, and would grow from face to face */
-        for (Py_ssize_t j = first; j < stride; j += 4)
-            *(four *) (r + j) *= EACH(inverse[i]);
         for (Py_ssize_t j = i + 1; j < k; j++) {
-            four s = EACH(r[j]);
+            four s = EACH(r[j] * inverse[i]);
             for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < stride; l += 4)
                 *(four *) (S + j * stride + l) -= s * FOUR(r + l);
         }
@@ -819,8 +825,8 @@ TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t s
     return 1;
 }
 
-/* y = S⁻¹y with its `cholesky`, four components at once; y has `stride` of them, of which
-   those from k on become zero. */
+/* y = S⁻¹y with S as it was `eliminated`, four components at once; y has `stride` of
+   them, of which those from k on become zero. */
 TWICE static void solve(const double *R, const double *inverse, double *y,
                         Py_ssize_t stride)
 {
@@ -836,7 +842,7 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
                                  + FOUR(r2 + j) * EACH(a2) + FOUR(r3 + j) * EACH(a3);
         *(four *) (y + i) = (four){a0, a1, a2, a3};
     }
-    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* Ry = a */
+    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* D⁻¹Ry = a */
         const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
         const double *r3 = r2 + stride, *d = inverse + i;
         four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0;
@@ -846,11 +852,11 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
             t2 += FOUR(r2 + j) * FOUR(y + j);
             t3 += FOUR(r3 + j) * FOUR(y + j);
         }
-        double a3 = (y[i + 3] - total(t3)) * d[3];
-        double a2 = (y[i + 2] - total(t2) - r2[i + 3] * a3) * d[2];
-        double a1 = (y[i + 1] - total(t1) - r1[i + 2] * a2 - r1[i + 3] * a3) * d[1];
-        double a0 = y[i] - total(t0) - r0[i + 1] * a1 - r0[i + 2] * a2 - r0[i + 3] * a3;
-        *(four *) (y + i) = (four){a0 * d[0], a1, a2, a3};
+        double a3 = y[i + 3] - total(t3) * d[3];
+        double a2 = y[i + 2] - (total(t2) + r2[i + 3] * a3) * d[2];
+        double a1 = y[i + 1] - (total(t1) + r1[i + 2] * a2 + r1[i + 3] * a3) * d[1];
+        double a0 = total(t0) + r0[i + 1] * a1 + r0[i + 2] * a2 + r0[i + 3] * a3;
+        *(four *) (y + i) = (four){y[i] - a0 * d[0], a1, a2, a3};
     }
 }
 
@@ -964,6 +970,21 @@ INLINE void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssi
         other = SMALLER(fabs(x[j]), 1e3 * step);
         size[j] = step < INFINITY ? LARGER(other, step) : 0;
     }
+}
+
+/* Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components where the gradient leads into the box, and is
+   more than `noise`. */
+TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
+                                  double noise, Py_ssize_t n)
+{
+    double total = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double r = norm * g[i], d = diagonal[i] > 0 ? diagonal[i] : 1;
+        int inward = ((g[i] < 0) & (x[i] < upper[i])) | ((g[i] > 0) & (x[i] > lower[i]));
+        int told = (diagonal[i] > 0) & (fabs(r) > noise) & inward;
+        total += told ? r * r / d : 0;
+    }
+    return total;
 }
 
 /* An upper bound of the worst residual, see `residual_bound` in `compiled.pyx`; room for
