@@ -62,7 +62,8 @@ cdef extern from "vectors.h" nogil:
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
     void copy_scaled(double s, const double *a, double *b, Py_ssize_t n)
-    void scale_free(double s, const double *free, double *z, Py_ssize_t n)
+    double scale_free(double s, const double *free, const double *v, double *z,
+                      Py_ssize_t n)
     bint same(const double *a, const double *b, Py_ssize_t n)
     void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
                     Py_ssize_t n)
@@ -70,7 +71,7 @@ cdef extern from "vectors.h" nogil:
                      double *y, Py_ssize_t k, Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
-    void lengths(const double *x, const double *g, double *p, double *Hp,
+    void lengths(const double *x, const double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
     void leave(double alpha, double beta, bint release, double *x, double *g,
                const double *p, const double *Hp, const double *lower,
@@ -741,7 +742,7 @@ cdef class Solver:
     cdef double *core
     cdef double *inverse  # of the pivots of the core
     cdef double told[4]
-    cdef double tail, phi_square, beta_square, reduced_square
+    cdef double tail, phi_square, beta_square, reduced_square, z_Hp
     cdef Model preconditioner, B, known
     cdef Directions directions
     cdef double known_rho
@@ -1020,7 +1021,8 @@ cdef class Solver:
         return 0
 
     cdef const double *preconditioned_gradient(self) noexcept:
-        """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
+        """Return z = B_FF⁻¹φ, of which zᵀHp is kept; φ where there is no preconditioner.
+        """
         cdef Py_ssize_t i, n = self.n
         cdef Model M = self.preconditioner
         cdef double *z = self.z
@@ -1033,7 +1035,7 @@ cdef class Solver:
         for i in range(M.k):
             self.c[i] *= M.root[i]
         combination(-1.0, M.U, self.c, self.phi, z, M.k, n)
-        scale_free(1 / M.tau, self.free, z, n)
+        self.z_Hp = scale_free(1 / M.tau, self.free, self.Hp, z, n)
         return z
 
     # MPRGP
@@ -1316,7 +1318,7 @@ cdef class Solver:
             return z_Hp / curvature
         z = self.preconditioned_gradient()
         if z != self.phi:
-            z_Hp = dot(z, self.Hp, self.n)
+            z_Hp = self.z_Hp
         turn(z, z_Hp / curvature, self.p, self.n)
         self.directions.conjugate(self.p)
         return 0

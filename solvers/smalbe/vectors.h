@@ -274,11 +274,15 @@ TWICE static void copy_scaled(double s, in a, out b, Py_ssize_t n)
         b[i] = s * a[i];
 }
 
-/* z = s z on the free components, zero on the others. */
-TWICE static void scale_free(double s, in free, out z, Py_ssize_t n)
+/* z = s z on the free components, zero on the others; returns zᵀv. */
+TWICE static double scale_free(double s, in free, in v, out z, Py_ssize_t n)
 {
-    for (Py_ssize_t i = 0; i < n; i++)
+    double along = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
         z[i] *= s * free[i];
+        along += z[i] * v[i];
+    }
+    return along;
 }
 
 /* Whether a and b have the same components. */
@@ -294,52 +298,45 @@ TWICE static int same(in a, in b, Py_ssize_t n)
     return 1;
 }
 
-/* c = U v for U (k, n) by rows, four of which share a pass over v. Two sums a row, for
-   one would wait for itself. */
+/* The products c of `rows` rows U by rows with v, in one pass over v. Two sums a row where
+   these are few, for one would wait for itself. */
+INLINE void some_rows_times(in U, in v, out c, Py_ssize_t rows, Py_ssize_t n)
+{
+    four t[8], s[8];
+    Py_ssize_t j = 0;
+    for (Py_ssize_t i = 0; i < rows; i++)
+        t[i] = s[i] = EACH(0);
+    if (rows < 8)
+        for (; j + 8 <= n; j += 8)
+            for (Py_ssize_t i = 0; i < rows; i++) {
+                t[i] += FOUR(U + i * n + j) * FOUR(v + j);
+                s[i] += FOUR(U + i * n + j + 4) * FOUR(v + j + 4);
+            }
+    for (; j + 4 <= n; j += 4)
+        for (Py_ssize_t i = 0; i < rows; i++)
+            t[i] += FOUR(U + i * n + j) * FOUR(v + j);
+    for (Py_ssize_t i = 0; i < rows; i++) {
+        c[i] = total(t[i] + s[i]);
+        for (Py_ssize_t l = j; l < n; l++)
+            c[i] += U[i * n + l] * v[l];
+    }
+}
+
+/* c = U v for U (k, n) by rows. */
 TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
 {
     Py_ssize_t i = 0;
-    for (; i + 4 <= k; i += 4) {
-        in u0 = U + i * n, u1 = u0 + n, u2 = u1 + n, u3 = u2 + n;
-        four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0, s0 = t0, s1 = t0, s2 = t0, s3 = t0;
-        Py_ssize_t j = 0;
-        for (; j + 8 <= n; j += 8) {
-            four w = FOUR(v + j), z = FOUR(v + j + 4);
-            t0 += FOUR(u0 + j) * w, s0 += FOUR(u0 + j + 4) * z;
-            t1 += FOUR(u1 + j) * w, s1 += FOUR(u1 + j + 4) * z;
-            t2 += FOUR(u2 + j) * w, s2 += FOUR(u2 + j + 4) * z;
-            t3 += FOUR(u3 + j) * w, s3 += FOUR(u3 + j + 4) * z;
-        }
-        double c0 = total(t0 + s0), c1 = total(t1 + s1);
-        double c2 = total(t2 + s2), c3 = total(t3 + s3);
-        for (; j < n; j++) {
-            c0 += u0[j] * v[j];
-            c1 += u1[j] * v[j];
-            c2 += u2[j] * v[j];
-            c3 += u3[j] * v[j];
-        }
-        c[i] = c0, c[i + 1] = c1, c[i + 2] = c2, c[i + 3] = c3;
-    }
-    for (; i + 2 <= k; i += 2) {
-        in u0 = U + i * n, u1 = u0 + n;
-        four t0 = EACH(0), t1 = t0;
-        Py_ssize_t j = 0;
-        for (; j + 4 <= n; j += 4) {
-            t0 += FOUR(u0 + j) * FOUR(v + j);
-            t1 += FOUR(u1 + j) * FOUR(v + j);
-        }
-        double c0 = total(t0), c1 = total(t1);
-        for (; j < n; j++) {
-            c0 += u0[j] * v[j];
-            c1 += u1[j] * v[j];
-        }
-        c[i] = c0, c[i + 1] = c1;
-    }
-    if (i < k) {
-        double rest = 0;
-        for (Py_ssize_t j = 0; j < n; j++)
-            rest += U[i * n + j] * v[j];
-        c[i] = rest;
+    for (; i + 8 <= k; i += 8)
+        some_rows_times(U + i * n, v, c + i, 8, n);
+    U += i * n, c += i;
+    switch (k - i) { /* the number of rows known, the loop over them is none */
+    case 1: some_rows_times(U, v, c, 1, n); break;
+    case 2: some_rows_times(U, v, c, 2, n); break;
+    case 3: some_rows_times(U, v, c, 3, n); break;
+    case 4: some_rows_times(U, v, c, 4, n); break;
+    case 5: some_rows_times(U, v, c, 5, n); break;
+    case 6: some_rows_times(U, v, c, 6, n); break;
+    case 7: some_rows_times(U, v, c, 7, n); break;
     }
 }
 
@@ -404,7 +401,8 @@ typedef long long __attribute__((vector_size(32))) mask;
     ((four) ((mask) (a) & (mask){LLONG_MAX, LLONG_MAX, LLONG_MAX, LLONG_MAX}))
 
 /* What a step x - αp meets in a block: the α at which it is on the first bound, where
-   that is below `least`, pᵀHp and gᵀp, which are added to told[3] and told[2].
+   that is below `least`; pᵀHp and gᵀp are added to told[3] and told[2], unless that is
+   NULL.
 
    Few blocks have a component that is on its bound before the first of those before:
    whether one is needs no division. */
@@ -423,14 +421,18 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
         } else {
             nearer |= (room < most * q) & (q > zero);
         }
-        curvature += q * FOUR(Hp + j);
-        slope += q * FOUR(g + j);
+        if (told) {
+            curvature += q * FOUR(Hp + j);
+            slope += q * FOUR(g + j);
+        }
     }
-    told[3] += total(curvature);
-    told[2] += total(slope);
-    for (Py_ssize_t j = whole; j < n; j++) {
-        told[3] += p[j] * Hp[j];
-        told[2] += g[j] * p[j];
+    if (told) {
+        told[3] += total(curvature);
+        told[2] += total(slope);
+        for (Py_ssize_t j = whole; j < n; j++) {
+            told[3] += p[j] * Hp[j];
+            told[2] += g[j] * p[j];
+        }
     }
     Py_ssize_t from = nearer[0] | nearer[1] | nearer[2] | nearer[3] ? 0 : whole;
     double room[BLOCK];
@@ -467,26 +469,25 @@ turn_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
     }
 }
 
-/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. With F, Hp = s F p
-   is found first, in the same go through memory; and before, where p is `turning`,
-   p = φ − γp, as far as the product needs it. */
+/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. Hp = s F p is found
+   first, in the same go through memory; and before, where p is `turning`, p = φ − γp, as
+   far as the product needs it. */
 INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, in x,
                          in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
                          out told)
 {
     double feasible = INFINITY;
-    Py_ssize_t turned = 0, block = F ? BLOCK : 64; /* short: few divisions */
+    Py_ssize_t turned = 0;
     told[2] = told[3] = 0;
-    for (Py_ssize_t i = 0; i < n; i += block) {
-        Py_ssize_t size = n - i < block ? n - i : block;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
         if (turning) {
             Py_ssize_t to = i + size + reach(F) < n ? i + size + reach(F) : n;
             turn_at(x + turned, g + turned, lower + turned, upper ? upper + turned : NULL,
                     gamma, p + turned, to - turned);
             turned = to;
         }
-        if (F)
-            some_rows(F, i, i + size, s, p, Hp + i);
+        some_rows(F, i, i + size, s, p, Hp + i);
         feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
                                  upper ? upper + i : NULL, size, feasible, told);
     }
@@ -494,14 +495,31 @@ INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, i
     told[1] = feasible;
 }
 
-/* upper : NULL where no component has a bound above */
-TWICE static void lengths(in x, in g, double *p, out Hp, in lower, in upper,
-                          Py_ssize_t n, out told)
+/* α of x - αp: told = the minimising, the largest feasible where that is less, else inf,
+   gᵀp, pᵀHp.
+
+   upper : NULL where no component has a bound above */
+TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
+                          out told)
 {
-    if (upper)
-        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, upper, n, told);
-    else
-        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, NULL, n, told);
+    double slope = 0, curvature = 0, feasible;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        slope += g[i] * p[i];
+        curvature += p[i] * Hp[i];
+    }
+    told[0] = feasible = curvature > 0 ? slope / curvature : INFINITY;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        if (upper)
+            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, upper + i, size,
+                                     feasible, NULL);
+        else
+            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, NULL, size,
+                                     feasible, NULL);
+    }
+    told[1] = feasible < told[0] ? feasible : INFINITY;
+    told[2] = slope;
+    told[3] = curvature;
 }
 
 TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *p,
@@ -755,12 +773,16 @@ TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_
 {
     in v0 = V + row[0] * k, v1 = V + row[1] * k, v2 = V + row[2] * k;
     in v3 = V + row[3] * k;
-    for (Py_ssize_t i = 0; i < k; i++) {
+    for (Py_ssize_t i = 0; i < k; i += 2) { /* two rows of S share the vectors */
         four a0 = EACH(s[0] * v0[i]), a1 = EACH(s[1] * v1[i]), a2 = EACH(s[2] * v2[i]);
-        four a3 = EACH(s[3] * v3[i]);
-        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < k; j += 4)
-            *(four *) (S + i * k + j) += a0 * FOUR(v0 + j) + a1 * FOUR(v1 + j)
-                                         + a2 * FOUR(v2 + j) + a3 * FOUR(v3 + j);
+        four a3 = EACH(s[3] * v3[i]), b0 = EACH(s[0] * v0[i + 1]);
+        four b1 = EACH(s[1] * v1[i + 1]), b2 = EACH(s[2] * v2[i + 1]);
+        four b3 = EACH(s[3] * v3[i + 1]);
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < k; j += 4) {
+            four w0 = FOUR(v0 + j), w1 = FOUR(v1 + j), w2 = FOUR(v2 + j), w3 = FOUR(v3 + j);
+            *(four *) (S + i * k + j) += a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3;
+            *(four *) (S + (i + 1) * k + j) += b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3;
+        }
     }
 }
 
