@@ -487,54 +487,65 @@ cdef struct Until:
     double M
 
 
-cdef class Gram:
-    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last.
+cdef class Basis:
+    """Orthonormal rows U (k, n), and U_F U_Fᵀ of the face F for which it was asked last.
 
-    Its upper triangle.
+    Only components from `first` on, `size` of them, have bounds, and are looked at in a
+    face; all others are free in each.
     """
 
-    cdef Py_ssize_t n, k, stride, flips
+    cdef Py_ssize_t n, k, stride, first, size, flips
+    cdef bint is_split
     cdef Room room
-    cdef int *where  # (n + 3,)
-    cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *columns  # Uᵀ (n, stride)
+    cdef int *where  # (size + 3,)
+    cdef double *U
+    cdef double *bounded  # (k, size) the columns of those with bounds
+    cdef double *columns  # the same by columns (size, stride)
+    cdef double *others  # U_f U_fᵀ of the others; as `gram` by rows of `stride` numbers
+    cdef double *gram  # (k, k) upper triangle
     cdef double *held
 
     @staticmethod
-    cdef Gram of(Model B):
-        cdef Gram made = Gram.__new__(Gram)
-        cdef Py_ssize_t stride = B.stride
-        made.k, made.n, made.stride, made.flips = B.k, B.n, stride, B.n + 1
-        made.room = Room(stride * (stride + B.n) + 2 * B.n + 2)
-        made.values = made.room.at
-        made.columns = made.values + stride * stride
-        made.held = made.columns + stride * B.n
-        made.where = <int *> (made.held + B.n)
-        transposed(B.U, made.columns, B.k, B.n, stride)
+    cdef Basis zeros(Py_ssize_t k, Py_ssize_t n, Py_ssize_t first, Py_ssize_t size):
+        cdef Basis made = Basis.__new__(Basis)
+        cdef Py_ssize_t stride = (k + 3) & ~3
+        made.k, made.n, made.stride, made.first, made.size = k, n, stride, first, size
+        made.flips = size + 1
+        made.room = Room(k * n + k * size + stride * (2 * stride + size) + 2 * size + 2)
+        made.U = made.room.at
+        made.bounded = made.U + k * n
+        made.columns = made.bounded + k * size
+        made.others = made.columns + stride * size
+        made.gram = made.others + stride * stride
+        made.held = made.gram + stride * stride
+        made.where = <int *> (made.held + size)
         return made
 
-    cdef void enter(self, const double *piece) noexcept:
-        """Have it be that of the face where `piece` is zero.
+    cdef void split(self) noexcept:
+        """Find what belongs to the components with bounds, and to the others."""
+        cdef Py_ssize_t i, j, stride = self.stride
+        if self.is_split:
+            return
+        self.is_split = True
+        for j in range(self.k):
+            memcpy(self.bounded + j * self.size, self.U + j * self.n + self.first,
+                   self.size * sizeof(double))
+        transposed(self.bounded, self.columns, self.k, self.size, stride)
+        if self.size == self.n:
+            return
+        for j in range(self.k):
+            self.others[j * stride + j] = 1.0
+        for i in range(self.size):
+            self.where[i], self.held[i] = i, 1.0
+        self.change(self.size, self.others)
+        for i in range(self.k):
+            for j in range(i):
+                self.others[i * stride + j] = self.others[j * stride + i]
 
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew, by what is held or by
-        what is not, whichever is less.
-        """
-        cdef Py_ssize_t i, c, q, count, k = self.k, stride = self.stride
+    cdef void change(self, Py_ssize_t count, double *gram) noexcept:
+        """Take the components in `where` that are held now from it, add the others."""
+        cdef Py_ssize_t c, q
         cdef double sign[4]
-        cdef bint is_held
-        if self.flips > self.n:
-            self.flips = count = 0
-            for i in range(self.n):
-                count += piece[i] != 0
-            is_held = 2 * count > self.n
-            memset(self.values, 0, stride * stride * sizeof(double))
-            for i in range(k):
-                self.values[i * stride + i] = not is_held
-            for i in range(self.n):
-                self.held[i] = is_held
-        count = changed(piece, self.held, self.n, self.where)
-        self.flips += count
         for c in range(0, count, 4):
             for q in range(4):
                 sign[q] = 0.0
@@ -542,48 +553,71 @@ cdef class Gram:
                     sign[q] = 1 - 2 * self.held[self.where[c + q]]
                 else:
                     self.where[c + q] = 0
-            add_gram(sign, self.columns, self.where + c, self.values, stride)
+            add_gram(sign, self.columns, self.where + c, gram, self.stride)
+
+    cdef void enter(self, const double *piece) noexcept:
+        """Have `gram` be that of the face where `piece` (size,) is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
+        """
+        cdef Py_ssize_t i, count, stride = self.stride
+        cdef bint is_held
+        self.split()
+        if self.flips > self.size:
+            self.flips = count = 0
+            for i in range(self.size):
+                count += piece[i] != 0
+            is_held = 2 * count > self.size
+            memcpy(self.gram, self.others, stride * stride * sizeof(double))
+            if not is_held:
+                memset(self.gram, 0, stride * stride * sizeof(double))
+                for i in range(self.k):
+                    self.gram[i * stride + i] = 1.0
+            for i in range(self.size):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.size, self.where)
+        self.flips += count
+        self.change(count, self.gram)
 
 
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis."""
 
-    cdef Py_ssize_t n, k, stride  # stride: k or more, a multiple of four
+    cdef Py_ssize_t n, k
     cdef double tau
+    cdef Basis basis  # None for k = 0
     cdef const double *U
-    cdef Room holder, room  # of U, and of the others
+    cdef Room room
     cdef double *w  # (k,)
-    cdef double *root  # of w, and zeros (stride,)
-    cdef Gram gram
+    cdef double *root  # of w, and zeros, as many as a row of `basis.gram` is long
 
     @staticmethod
-    cdef Model above_tail(const double *U, Room holder, Py_ssize_t found, Py_ssize_t n,
-                          const double *w, double shift, double tau, Py_ssize_t stride):
+    cdef Model above_tail(Basis basis, Py_ssize_t found, const double *w, double shift,
+                          double tau):
         """Add `shift` to w (found,), and leave out the rows where that is not positive.
 
-        These are the last as a rule, and U stays as it is.
-
-        holder : of U (found, n)
+        These are the last as a rule, and the basis serves as it is.
         """
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0, last = -1
-        B.room = Room(found + stride)
+        cdef Py_ssize_t i, k = 0, last = -1, n = basis.n
+        cdef Basis chosen = basis
+        B.room = Room(found + basis.stride)
         B.w, B.root = B.room.at, B.room.at + found
         for i in range(found):
             B.w[k] = w[i] + shift
             if B.w[k] > 0:
                 k, last = k + 1, i
-        B.U, B.holder = U, holder
         if last >= k:
-            B.holder = Room(k * n)
-            B.U, k = B.holder.at, 0
+            chosen, k = Basis.zeros(k, n, basis.first, basis.size), 0
             for i in range(found):
                 if w[i] + shift > 0:
-                    memcpy(B.holder.at + k * n, U + i * n, n * sizeof(double))
+                    memcpy(chosen.U + k * n, basis.U + i * n, n * sizeof(double))
                     k += 1
         for i in range(k):
             B.root[i] = sqrt(B.w[i])
-        B.tau, B.k, B.n, B.stride = tau, k, n, stride
+        B.basis, B.U, B.tau, B.k, B.n = chosen, chosen.U, tau, k, n
         return B
 
     @staticmethod
@@ -594,21 +628,9 @@ cdef class Model:
 
     cdef Model with_tail(self, double tau):
         """Change τ and leave w + τ as it is, where that is above τ."""
-        cdef Model B
         if not self.k:
             return Model.of_norm(tau, self.n)
-        B = Model.above_tail(self.U, self.holder, self.k, self.n, self.w, self.tau - tau,
-                             tau, self.stride)
-        if B.U == self.U:
-            B.gram = self.gram  # of these rows, and perhaps some more
-        return B
-
-    cdef int enter(self, const double *piece) except -1:
-        """Have the Gram matrix of the face where `piece` is zero."""
-        if self.gram is None:
-            self.gram = Gram.of(self)
-        self.gram.enter(piece)
-        return 0
+        return Model.above_tail(self.basis, self.k, self.w, self.tau - tau, tau)
 
 
 cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
@@ -699,14 +721,15 @@ cdef class Solver:
     cdef int expansion
     cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
     cdef tuple held  # the arrays that are read
-    cdef Room vectors, room  # of these directions, and of all that is written
+    cdef Basis basis  # these directions, None where there are none
+    cdef Room room  # of all that is written
     cdef const double *C
     cdef const double *GC
     cdef const double *q
     cdef const double *diagonal  # NULL where an operator does not tell
     cdef const double *x_tilde
     cdef const double *b
-    cdef double *above  # (found,) their eigenvalues above the tail
+    cdef Room above  # (found,) their eigenvalues above the tail
     cdef const double *lower
     cdef const double *upper
     cdef const double *upper_if_any  # NULL where all are inf
@@ -739,6 +762,7 @@ cdef class Solver:
     cdef double *slope
     cdef double *slope2
     cdef double *c
+    cdef double *fixed
     cdef double *core
     cdef double *inverse  # of the pivots of the core
     cdef double told[4]
@@ -783,7 +807,7 @@ cdef class Solver:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
         k = (self.found + 3) & ~3
-        self.room = Room(19 * n + 3 * self.r + (7 + k) * k)
+        self.room = Room(19 * n + 3 * self.r + (8 + k) * k)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -797,14 +821,14 @@ cdef class Solver:
         at += 7 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
         self.slope2, self.c, self.inverse = at + 4 * k, at + 5 * k, at + 6 * k
-        self.Cv = at + 7 * k
+        self.fixed, self.Cv = at + 7 * k, at + 8 * k
         self.Cw = self.Cv + self.r
         self.Cx = self.Cw + self.r
         self.core = self.Cx + self.r
 
     cdef int find_upper_end(self, values, residuals, vectors) except -1:
         """Choose what a model holds, as `Projected.upper_end` does."""
-        cdef Py_ssize_t i, found = len(values), kept, n = self.n
+        cdef Py_ssize_t i, found = len(values), kept, n = self.n, first = 0, last = n
         cdef const double *value = numbers(values)
         cdef const double *residual = numbers(residuals)
         kept = max(found - (1 if residual[found - 1] <= 1e-10 * value[0] else 2), 0)
@@ -816,16 +840,25 @@ cdef class Solver:
             kept = 0
         self.tail = fmax((value[kept] + residual[kept]) / self.norm, TAIL)
         self.found = kept + self.r
-        self.vectors = Room(self.found * (n + 1))
-        self.above = self.vectors.at + self.found * n
-        memcpy(self.vectors.at, self.C, self.r * n * sizeof(double))
-        memcpy(self.vectors.at + self.r * n, numbers(vectors), kept * n * sizeof(double))
-        self.C = self.vectors.at  # read once, not twice, from farther caches
-        for i in range(self.r):
-            self.above[i] = -self.tail
-        for i in range(kept):
-            self.above[self.r + i] = (value[i] + residual[i]) / self.norm - self.tail
+        self.above = Room(self.found)
+        for i in range(self.found):
+            self.above.at[i] = -self.tail
+            if i >= self.r:
+                self.above.at[i] += (value[i - self.r] + residual[i - self.r]) / self.norm
+        if not self.found:
+            return 0
+        while first < n and not self.has_bound(first):
+            first += 1
+        while last > first and not self.has_bound(last - 1):
+            last -= 1
+        self.basis = Basis.zeros(self.found, n, first, last - first)
+        memcpy(self.basis.U, self.C, self.r * n * sizeof(double))
+        memcpy(self.basis.U + self.r * n, numbers(vectors), kept * n * sizeof(double))
+        self.C = self.basis.U  # read once, not twice, from farther caches
         return 0
+
+    cdef bint has_bound(self, Py_ssize_t i) noexcept:
+        return self.lower[i] > -INFINITY or self.upper[i] < INFINITY
 
     # the operator
 
@@ -897,37 +930,51 @@ cdef class Solver:
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
         cdef Py_ssize_t i, k = self.found
+        if not k:
+            return Model.of_norm(self.tail, self.n)
         if self.known is None or self.known_rho != rho:
             for i in range(k):
-                self.c[i] = self.above[i] + (rho if i < self.r else 0.0)
-            self.known = Model.above_tail(self.vectors.at, self.vectors, k, self.n,
-                                          self.c, 0.0, self.tail, (k + 3) & ~3)
+                self.c[i] = self.above.at[i] + (rho if i < self.r else 0.0)
+            self.known = Model.above_tail(self.basis, k, self.c, 0.0, self.tail)
             self.known_rho = rho
         return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
-        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        B.enter(piece)
-        scaled(B.root, B.gram.values, B.tau, self.core, B.k, B.stride)
-        if not eliminated(self.core, self.inverse, B.k, B.stride):
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero.
+
+        piece : of the components that have bounds
+        """
+        B.basis.enter(piece)
+        scaled(B.root, B.basis.gram, B.tau, self.core, B.k, B.basis.stride)
+        if not eliminated(self.core, self.inverse, B.k, B.basis.stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
     cdef void tilt(self, Model B, const double *x, const double *g, const double *lower,
                    const double *upper, const double *y, double *s,
                    double *piece) noexcept:
-        """Find s(y) and its piece."""
-        cdef double *t = self.t
-        combination(1.0, B.U, y, g, t, B.k, self.n)
-        tilted(x, t, B.tau, lower, upper, s, piece, self.n)
+        """Find s(y) and its piece, of the components with bounds."""
+        cdef Basis U = B.basis
+        cdef Py_ssize_t o = U.first
+        combination(1.0, U.bounded, y, g + o, self.t, B.k, U.size)
+        tilted(x + o, self.t, B.tau, lower + o, upper + o, s + o, piece, U.size)
 
     cdef void slope_at(self, Model B, const double *s, const double *y,
                        double *slope) noexcept:
-        """Find the slope Us(y) − W⁻¹y."""
+        """Find the slope Us(y) − W⁻¹y.
+
+        Components without bounds have s = −(g + Uᵀy)/τ; `fixed` is U times the first
+        part of it.
+        """
+        cdef Basis U = B.basis
         cdef Py_ssize_t i
-        rows_times(B.U, s, slope, B.k, self.n)
+        rows_times(U.bounded, s + U.first, slope, B.k, U.size)
         for i in range(B.k):
             slope[i] -= y[i] / B.w[i]
+        if U.size < U.n:
+            rows_times(U.others, y, self.c, B.k, U.stride)
+            for i in range(B.k):
+                slope[i] += self.fixed[i] - self.c[i] / B.tau
 
     cdef int step_of_model(self, Model B, const double *x, const double *g,
                            const double *lower, const double *upper,
@@ -939,27 +986,38 @@ cdef class Solver:
         cdef double *there = self.y2
         cdef double *slope = self.slope
         cdef double *slope_there = self.slope2
-        cdef double *piece = self.piece
-        cdef double *piece_there = self.piece2
+        cdef Basis U = B.basis
+        cdef double *piece
+        cdef double *piece_there
         cdef double begun, now, low, high, at_low, at_high, t, share
         if not k:
             tilted(x, g, B.tau, lower, upper, s, NULL, n)
             return 0
-        memset(y, 0, k * sizeof(double))
-        tilted(x, g, B.tau, lower, upper, s, piece, n)
-        rows_times(B.U, s, slope, k, n)
+        U.split()
+        piece, piece_there = self.piece + U.first, self.piece2 + U.first
+        memset(y, 0, U.stride * sizeof(double))
+        memset(there, 0, U.stride * sizeof(double))
+        tilted(x, g, B.tau, lower, upper, s, self.piece, n)
+        rows_times(U.U, s, slope, k, n)
+        if U.size < n:
+            rows_times(U.bounded, s + U.first, self.fixed, k, U.size)
+            for i in range(k):
+                self.fixed[i] = slope[i] - self.fixed[i]
         for newton in range(NEWTON_STEPS):
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, self.inverse, dy, B.stride)
+            solve(self.core, self.inverse, dy, U.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
             begun = dot(slope, dy, k)
             self.tilt(B, x, g, lower, upper, there, s, piece_there)
-            if same(piece, piece_there, n):
-                return 0  # where Newton's method is exact
+            if same(piece, piece_there, U.size):  # where Newton's method is exact
+                if U.size < n:
+                    combination(1.0, U.U, there, g, self.t, k, n)
+                    tilted(x, self.t, B.tau, lower, upper, s, NULL, n)
+                return 0
             self.slope_at(B, s, there, slope_there)
             now = dot(slope_there, dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
@@ -979,7 +1037,7 @@ cdef class Solver:
                     high, at_high = t, now
             memcpy(y, there, k * sizeof(double))
             memcpy(slope, slope_there, k * sizeof(double))
-            memcpy(piece, piece_there, n * sizeof(double))
+            memcpy(piece, piece_there, U.size * sizeof(double))
         t = 0.0
         for i in range(k):
             t = fmax(t, B.w[i])
@@ -1017,7 +1075,8 @@ cdef class Solver:
         if self.preconditioned and self.preconditioner.k:
             for i in range(self.n):
                 self.piece[i] = 1 - self.free[i]
-            self.factor(self.preconditioner, self.piece)
+            self.factor(self.preconditioner,
+                        self.piece + self.preconditioner.basis.first)
         return 0
 
     cdef const double *preconditioned_gradient(self) noexcept:
@@ -1031,7 +1090,7 @@ cdef class Solver:
         rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.inverse, self.c, M.stride)
+        solve(self.core, self.inverse, self.c, M.basis.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
         combination(-1.0, M.U, self.c, self.phi, z, M.k, n)
