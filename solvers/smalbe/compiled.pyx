@@ -356,11 +356,19 @@ cdef enum:
 
 
 cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
-    """Whether all Ritz values of the first FEW steps are of one size."""
+    """Whether all Ritz values of the first FEW steps are of one size.
+
+    The diagonal holds Rayleigh quotients, which lie between the least and the largest.
+    """
     cdef double theta[FEW]
     cdef double between[FEW]
-    cdef double none
-    cdef int order = FEW, one = 1, info = 0
+    cdef double none, least = diagonal[0], largest = diagonal[0]
+    cdef int order = FEW, one = 1, info = 0, i
+    for i in range(1, FEW):
+        least = diagonal[i] if diagonal[i] < least else least
+        largest = diagonal[i] if diagonal[i] > largest else largest
+    if least < largest / FLAT:
+        return False
     memcpy(theta, diagonal, FEW * sizeof(double))
     memcpy(between, off, FEW * sizeof(double))
     dstev(b"N", &order, theta, between, &none, &one, &none, &info)
