@@ -168,6 +168,18 @@ def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
 
 
+cdef const double *read(a, list held) except NULL:
+    """Return where an array has its components, or a copy of them; that is held."""
+    cdef const double *at
+    try:
+        at = numbers(a)
+    except ValueError:  # other numbers, or with gaps
+        a = _whole(a)
+        at = numbers(a)
+    held.append(a)
+    return at
+
+
 cdef copied(const double *v, Py_ssize_t n):
     """Make an array of it."""
     told = np.empty(n)
@@ -444,13 +456,14 @@ def lanczos(Product F, C, start, int steps):
 def homogenised(Product F, C, x_tilde, q, lb, ub, double norm):
     """Return b (n,) and the bounds of ν = x − x̃, as `_normalised` finds them."""
     cdef Py_ssize_t i, n = F.n, r = len(C)
-    q, lb, ub, found = _whole(q), _whole(lb), _whole(ub), np.zeros((3, n))
+    cdef list held = []
     cdef Room room = Room(r)
+    found = np.zeros((3, n))
     cdef const double *rows = numbers(C)
     cdef const double *shift = numbers(x_tilde)
-    cdef const double *cost = numbers(q)
-    cdef const double *low = numbers(lb)
-    cdef const double *high = numbers(ub)
+    cdef const double *cost = read(q, held)
+    cdef const double *low = read(lb, held)
+    cdef const double *high = read(ub, held)
     cdef double *b = numbers(found)
     cdef double square = 0.0
     cdef bint moved = False
@@ -728,7 +741,7 @@ cdef class Solver:
     cdef bint in_two  # whether CG steps go through memory twice: φ, `free` not stored
     cdef int expansion
     cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
-    cdef tuple held  # the arrays that are read
+    cdef list held  # the arrays that are read
     cdef Basis basis  # these directions, None where there are none
     cdef Room room  # of all that is written
     cdef const double *C
@@ -786,15 +799,12 @@ cdef class Solver:
         self.problem, self.F, self.n = problem, F, n
         self.r, self.m = rows.GC.shape[1], rows.GC.shape[0]
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
-        self.held = (
-            _whole(rows.C), _whole(rows.GC), _whole(rows.x_tilde), _whole(problem.b),
-            _whole(problem.q), _whole(problem.diagonal), _whole(bounds[0]),
-            _whole(bounds[1]),
-        )
-        self.C, self.GC = numbers(self.held[0]), numbers(self.held[1])
-        self.x_tilde, self.b = numbers(self.held[2]), numbers(self.held[3])
-        self.q, self.diagonal = numbers(self.held[4]), numbers(self.held[5])
-        self.lower, self.upper = numbers(self.held[6]), numbers(self.held[7])
+        self.held = []
+        self.C, self.GC = read(rows.C, self.held), read(rows.GC, self.held)
+        self.x_tilde, self.b = read(rows.x_tilde, self.held), read(problem.b, self.held)
+        self.q, self.lower = read(problem.q, self.held), read(bounds[0], self.held)
+        self.upper = read(bounds[1], self.held)
+        self.diagonal = read(problem.diagonal, self.held)
         if not len(problem.diagonal):
             self.diagonal = NULL
         for i in range(n):
@@ -1566,7 +1576,8 @@ cdef class Solver:
         cdef Py_ssize_t i, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
-        result, multipliers, lb, ub = np.zeros((3, n)), np.zeros(r), _whole(lb), _whole(ub)
+        cdef list held = []
+        result, multipliers = np.zeros((3, n)), np.zeros(r)
         cdef Room room = Room(r * r)
         cdef double *S = room.at
         cdef const double *v = numbers(nu)
@@ -1579,8 +1590,8 @@ cdef class Solver:
         cdef double *free = self.piece
         cdef double *t = self.t
         cdef double *da = self.Cv
-        restored(v, self.x_tilde, self.lower, self.upper, numbers(lb), numbers(ub), x,
-                 free, n)
+        restored(v, self.x_tilde, self.lower, self.upper, read(lb, held), read(ub, held),
+                 x, free, n)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
@@ -1622,13 +1633,12 @@ def residual_bound(
     where this is small, so are the residuals. inf where nothing can be said.
     """
     cdef Py_ssize_t n = len(at_x), m = len(at_y)
-    held = tuple(map(_whole, (cost, told_diagonal, at_x, at_y, at_z, told_Fx, lower, upper,
-                              right, told_rows)))
+    cdef list held = []
     cdef Room room = Room(2 * n)
-    if not len(held[1]) or not n:
+    if not len(told_diagonal) or not n:
         return INFINITY
     return worst_residual(
-        numbers(held[0]), numbers(held[1]), numbers(held[2]), numbers(held[3]),
-        numbers(held[4]), numbers(held[5]), numbers(held[6]), numbers(held[7]),
-        numbers(held[8]), numbers(held[9]), m, n, room.at,
+        read(cost, held), read(told_diagonal, held), read(at_x, held), read(at_y, held),
+        read(at_z, held), read(told_Fx, held), read(lower, held), read(upper, held),
+        read(right, held), read(told_rows, held), m, n, room.at,
     )
