@@ -1,6 +1,7 @@
 """What a solve of SMALBE costs beside its products: tables of docs/performance.md.
 
     python -m benchmarks.smalbe_costs dense|sparse|kept
+    python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
 * dense: preparing and solving duals, in units of their products with F. The bound of a
   solve is 1.5 times its products, by `smalbe` or by BLAS' `dsymv`, whichever is
@@ -8,10 +9,12 @@
 * sparse: a product with all work shared out, in units of one product and five passes
   w += v over vectors.
 * kept: the same solves with and without keeping directions of CG.
+* race: solvers on a case, preparing and solving; answers are verified.
 
 All that is compared runs in turn in one process, in seconds of its own processor time
-(those of other processes are not in it). Each is given by the median of the runs, and
-by the median of their fastest tenth, which others on the same processor change less.
+(those of other processes are not in it; set OMP_NUM_THREADS=1, or threads add up). Each
+is given by the median of the runs, and by the median of their fastest tenth, which
+others on the same processor change less.
 """
 
 from __future__ import annotations
@@ -24,8 +27,10 @@ from time import process_time
 import numpy as np
 from scipy.linalg.blas import dsymv
 
-from harness import QP, Solution
+import mortarbench as mb
+from harness import QP, Solution, kkt_residuals
 from harness.plugin import Solver
+from harness.record import VERIFIED_FACTOR
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -193,5 +198,28 @@ def _kept(form: str, qp: QP, tol: float) -> None:
         )
 
 
+def race(case: str, solvers: str, rounds: str, tolerances: str = "1e-6,1e-8") -> None:
+    """Solve a case by several solvers in turn, to each tolerance."""
+    qp = mb.build(case).qp
+    for tol in map(float, tolerances.split(",")):
+        told = in_turn(
+            int(rounds),
+            **{
+                name: timed(lambda name=name, tol=tol: SOLVERS[name].prepare(qp, tol)())
+                for name in solvers.split(",")
+            },
+        )
+        for name, (typical, fast) in told.items():
+            s = SOLVERS[name].prepare(qp, tol)()
+            verified = kkt_residuals(qp, s).worst <= VERIFIED_FACTOR * tol
+            print(
+                f"{case} {tol:.0e} {name}: {1e3 * typical:.3g} ms, fastest tenth "
+                f"{1e3 * fast:.3g} ms, {s.counts.get('P_products', 'no')} products"
+                f"{'' if verified else ', NOT VERIFIED'}",
+                flush=True,
+            )
+
+
 if __name__ == "__main__":
-    {"dense": dense, "sparse": sparse, "kept": kept}[sys.argv[1]]()
+    chosen = {"dense": dense, "sparse": sparse, "kept": kept, "race": race}
+    chosen[sys.argv[1]](*sys.argv[2:])

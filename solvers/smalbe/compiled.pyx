@@ -62,13 +62,16 @@ cdef extern from "vectors.h" nogil:
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
     void copy_scaled(double s, const double *a, double *b, Py_ssize_t n)
-    void scale_free(double s, const double *free, double *z, Py_ssize_t n)
+    double scale_free(double s, const double *free, const double *v, double *z,
+                      Py_ssize_t n)
     bint same(const double *a, const double *b, Py_ssize_t n)
     void rows_times(const double *U, const double *v, double *c, Py_ssize_t k,
                     Py_ssize_t n)
+    void combination(double s, const double *U, const double *c, const double *v,
+                     double *y, Py_ssize_t k, Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
-    void lengths(const double *x, const double *g, double *p, double *Hp,
+    void lengths(const double *x, const double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, Py_ssize_t n, double *told)
     void leave(double alpha, double beta, bint release, double *x, double *g,
                const double *p, const double *Hp, const double *lower,
@@ -99,13 +102,30 @@ cdef extern from "vectors.h" nogil:
                         double *told)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
+    void transposed(const double *U, double *columns, Py_ssize_t k, Py_ssize_t n,
+                    Py_ssize_t stride)
+    double inward_energy(const double *x, const double *g, const double *lower,
+                         const double *upper, const double *diagonal, double norm,
+                         double noise, Py_ssize_t n)
     void add_gram(const double *s, const double *V, const int *row, double *S,
                   Py_ssize_t k)
-    int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
+    void scaled(const double *root, const double *G, double tau, double *S,
+                Py_ssize_t k, Py_ssize_t stride)
+    int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
     Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
     void tilted(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
+    void restored(const double *nu, const double *shift, const double *lower,
+                  const double *upper, const double *lb, const double *ub, double *x,
+                  double *free, Py_ssize_t n)
+    void held_by(const double *nu, const double *lower, const double *upper,
+                 const double *g, double *z, Py_ssize_t n)
+    void masked(const double *free, const double *a, double *t, Py_ssize_t n)
+    double worst_residual(const double *q, const double *diagonal, const double *x,
+                          const double *y, const double *z, const double *Fx,
+                          const double *lb, const double *ub, const double *e,
+                          const double *rows, Py_ssize_t m, Py_ssize_t n, double *room)
 
 
 # --- numbers ------------------------------------------------------------------------
@@ -146,6 +166,18 @@ cdef double *numbers(a) except NULL:
 
 def _whole(a):
     return np.ascontiguousarray(a, dtype=float)
+
+
+cdef const double *read(a, list held) except NULL:
+    """Return where an array has its components, or a copy of them; that is held."""
+    cdef const double *at
+    try:
+        at = numbers(a)
+    except ValueError:  # other numbers, or with gaps
+        a = _whole(a)
+        at = numbers(a)
+    held.append(a)
+    return at
 
 
 cdef copied(const double *v, Py_ssize_t n):
@@ -336,11 +368,19 @@ cdef enum:
 
 
 cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
-    """Whether all Ritz values of the first FEW steps are of one size."""
+    """Whether all Ritz values of the first FEW steps are of one size.
+
+    The diagonal holds Rayleigh quotients, which lie between the least and the largest.
+    """
     cdef double theta[FEW]
     cdef double between[FEW]
-    cdef double none
-    cdef int order = FEW, one = 1, info = 0
+    cdef double none, least = diagonal[0], largest = diagonal[0]
+    cdef int order = FEW, one = 1, info = 0, i
+    for i in range(1, FEW):
+        least = diagonal[i] if diagonal[i] < least else least
+        largest = diagonal[i] if diagonal[i] > largest else largest
+    if least < largest / FLAT:
+        return False
     memcpy(theta, diagonal, FEW * sizeof(double))
     memcpy(between, off, FEW * sizeof(double))
     dstev(b"N", &order, theta, between, &none, &one, &none, &info)
@@ -416,13 +456,14 @@ def lanczos(Product F, C, start, int steps):
 def homogenised(Product F, C, x_tilde, q, lb, ub, double norm):
     """Return b (n,) and the bounds of ν = x − x̃, as `_normalised` finds them."""
     cdef Py_ssize_t i, n = F.n, r = len(C)
-    q, lb, ub, found = _whole(q), _whole(lb), _whole(ub), np.zeros((3, n))
+    cdef list held = []
     cdef Room room = Room(r)
+    found = np.zeros((3, n))
     cdef const double *rows = numbers(C)
     cdef const double *shift = numbers(x_tilde)
-    cdef const double *cost = numbers(q)
-    cdef const double *low = numbers(lb)
-    cdef const double *high = numbers(ub)
+    cdef const double *cost = read(q, held)
+    cdef const double *low = read(lb, held)
+    cdef const double *high = read(ub, held)
     cdef double *b = numbers(found)
     cdef double square = 0.0
     cdef bint moved = False
@@ -467,56 +508,65 @@ cdef struct Until:
     double M
 
 
-cdef class Gram:
-    """U_F U_Fᵀ of orthonormal rows U (k, n), of the face F for which it was asked last.
+cdef class Basis:
+    """Orthonormal rows U (k, n), and U_F U_Fᵀ of the face F for which it was asked last.
 
-    Its upper triangle.
+    Only components from `first` on, `size` of them, have bounds, and are looked at in a
+    face; all others are free in each.
     """
 
-    cdef Py_ssize_t n, k, stride, flips
+    cdef Py_ssize_t n, k, stride, first, size, flips
+    cdef bint is_split
     cdef Room room
-    cdef int *where  # (n + 3,)
-    cdef double *values  # (k, k), rows of `stride` numbers
-    cdef double *columns  # Uᵀ (n, stride)
+    cdef int *where  # (size + 3,)
+    cdef double *U
+    cdef double *bounded  # (k, size) the columns of those with bounds
+    cdef double *columns  # the same by columns (size, stride)
+    cdef double *others  # U_f U_fᵀ of the others; as `gram` by rows of `stride` numbers
+    cdef double *gram  # (k, k) upper triangle
     cdef double *held
 
     @staticmethod
-    cdef Gram of(Model B):
-        cdef Gram made = Gram.__new__(Gram)
-        cdef Py_ssize_t i, j, stride = (B.k + 3) & ~3
-        made.k, made.n, made.stride, made.flips = B.k, B.n, stride, B.n + 1
-        made.room = Room(stride * (stride + B.n) + 2 * B.n + 2)
-        made.values = made.room.at
-        made.columns = made.values + stride * stride
-        made.held = made.columns + stride * B.n
-        made.where = <int *> (made.held + B.n)
-        for j in range(B.k):
-            for i in range(B.n):
-                made.columns[i * stride + j] = B.U[j * B.n + i]
+    cdef Basis zeros(Py_ssize_t k, Py_ssize_t n, Py_ssize_t first, Py_ssize_t size):
+        cdef Basis made = Basis.__new__(Basis)
+        cdef Py_ssize_t stride = (k + 3) & ~3
+        made.k, made.n, made.stride, made.first, made.size = k, n, stride, first, size
+        made.flips = size + 1
+        made.room = Room(k * n + k * size + stride * (2 * stride + size) + 2 * size + 2)
+        made.U = made.room.at
+        made.bounded = made.U + k * n
+        made.columns = made.bounded + k * size
+        made.others = made.columns + stride * size
+        made.gram = made.others + stride * stride
+        made.held = made.gram + stride * stride
+        made.where = <int *> (made.held + size)
         return made
 
-    cdef void enter(self, const double *piece) noexcept:
-        """Have it be that of the face where `piece` is zero.
+    cdef void split(self) noexcept:
+        """Find what belongs to the components with bounds, and to the others."""
+        cdef Py_ssize_t i, j, stride = self.stride
+        if self.is_split:
+            return
+        self.is_split = True
+        for j in range(self.k):
+            memcpy(self.bounded + j * self.size, self.U + j * self.n + self.first,
+                   self.size * sizeof(double))
+        transposed(self.bounded, self.columns, self.k, self.size, stride)
+        if self.size == self.n:
+            return
+        for j in range(self.k):
+            self.others[j * stride + j] = 1.0
+        for i in range(self.size):
+            self.where[i], self.held[i] = i, 1.0
+        self.change(self.size, self.others)
+        for i in range(self.k):
+            for j in range(i):
+                self.others[i * stride + j] = self.others[j * stride + i]
 
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew, by what is held or by
-        what is not, whichever is less.
-        """
-        cdef Py_ssize_t i, c, q, count, k = self.k, stride = self.stride
+    cdef void change(self, Py_ssize_t count, double *gram) noexcept:
+        """Take the components in `where` that are held now from it, add the others."""
+        cdef Py_ssize_t c, q
         cdef double sign[4]
-        cdef bint is_held
-        if self.flips > self.n:
-            self.flips = count = 0
-            for i in range(self.n):
-                count += piece[i] != 0
-            is_held = 2 * count > self.n
-            memset(self.values, 0, stride * stride * sizeof(double))
-            for i in range(k):
-                self.values[i * stride + i] = not is_held
-            for i in range(self.n):
-                self.held[i] = is_held
-        count = changed(piece, self.held, self.n, self.where)
-        self.flips += count
         for c in range(0, count, 4):
             for q in range(4):
                 sign[q] = 0.0
@@ -524,45 +574,71 @@ cdef class Gram:
                     sign[q] = 1 - 2 * self.held[self.where[c + q]]
                 else:
                     self.where[c + q] = 0
-            add_gram(sign, self.columns, self.where + c, self.values, stride)
+            add_gram(sign, self.columns, self.where + c, gram, self.stride)
+
+    cdef void enter(self, const double *piece) noexcept:
+        """Have `gram` be that of the face where `piece` (size,) is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
+        """
+        cdef Py_ssize_t i, count, stride = self.stride
+        cdef bint is_held
+        self.split()
+        if self.flips > self.size:
+            self.flips = count = 0
+            for i in range(self.size):
+                count += piece[i] != 0
+            is_held = 2 * count > self.size
+            memcpy(self.gram, self.others, stride * stride * sizeof(double))
+            if not is_held:
+                memset(self.gram, 0, stride * stride * sizeof(double))
+                for i in range(self.k):
+                    self.gram[i * stride + i] = 1.0
+            for i in range(self.size):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.size, self.where)
+        self.flips += count
+        self.change(count, self.gram)
 
 
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n)."""
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis."""
 
     cdef Py_ssize_t n, k
     cdef double tau
+    cdef Basis basis  # None for k = 0
     cdef const double *U
-    cdef Room holder, room  # of U, and of the others
+    cdef Room room
     cdef double *w  # (k,)
-    cdef double *root  # of w
-    cdef Gram gram
+    cdef double *root  # of w, and zeros, as many as a row of `basis.gram` is long
 
     @staticmethod
-    cdef Model above_tail(const double *U, Room holder, Py_ssize_t found, Py_ssize_t n,
-                          const double *w, double shift, double tau):
+    cdef Model above_tail(Basis basis, Py_ssize_t found, const double *w, double shift,
+                          double tau):
         """Add `shift` to w (found,), and leave out the rows where that is not positive.
 
-        holder : of U (found, n)
+        These are the last as a rule, and the basis serves as it is.
         """
         cdef Model B = Model.__new__(Model)
-        cdef Py_ssize_t i, k = 0
-        B.room = Room(2 * found)
+        cdef Py_ssize_t i, k = 0, last = -1, n = basis.n
+        cdef Basis chosen = basis
+        B.room = Room(found + basis.stride)
         B.w, B.root = B.room.at, B.room.at + found
         for i in range(found):
             B.w[k] = w[i] + shift
-            k += B.w[k] > 0
-        B.U, B.holder = U, holder
-        if k < found:
-            B.holder = Room(k * n)
-            B.U, k = B.holder.at, 0
+            if B.w[k] > 0:
+                k, last = k + 1, i
+        if last >= k:
+            chosen, k = Basis.zeros(k, n, basis.first, basis.size), 0
             for i in range(found):
                 if w[i] + shift > 0:
-                    memcpy(B.holder.at + k * n, U + i * n, n * sizeof(double))
+                    memcpy(chosen.U + k * n, basis.U + i * n, n * sizeof(double))
                     k += 1
         for i in range(k):
             B.root[i] = sqrt(B.w[i])
-        B.tau, B.k, B.n = tau, k, n
+        B.basis, B.U, B.tau, B.k, B.n = chosen, chosen.U, tau, k, n
         return B
 
     @staticmethod
@@ -573,21 +649,9 @@ cdef class Model:
 
     cdef Model with_tail(self, double tau):
         """Change τ and leave w + τ as it is, where that is above τ."""
-        cdef Model B
         if not self.k:
             return Model.of_norm(tau, self.n)
-        B = Model.above_tail(self.U, self.holder, self.k, self.n, self.w, self.tau - tau,
-                             tau)
-        if B.k == self.k:
-            B.gram = self.gram  # of the same rows
-        return B
-
-    cdef int enter(self, const double *piece) except -1:
-        """Have the Gram matrix of the face where `piece` is zero."""
-        if self.gram is None:
-            self.gram = Gram.of(self)
-        self.gram.enter(piece)
-        return 0
+        return Model.above_tail(self.basis, self.k, self.w, self.tau - tau, tau)
 
 
 cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
@@ -676,16 +740,17 @@ cdef class Solver:
     cdef bint reduced, plain, preconditioned, newton_proportions
     cdef bint in_two  # whether CG steps go through memory twice: φ, `free` not stored
     cdef int expansion
-    cdef Py_ssize_t found  # directions of the model: Ritz vectors, then C
-    cdef tuple held  # the arrays that are read
-    cdef Room vectors, room  # of these directions, and of all that is written
+    cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
+    cdef list held  # the arrays that are read
+    cdef Basis basis  # these directions, None where there are none
+    cdef Room room  # of all that is written
     cdef const double *C
     cdef const double *GC
     cdef const double *q
     cdef const double *diagonal  # NULL where an operator does not tell
     cdef const double *x_tilde
     cdef const double *b
-    cdef double *above  # (found,) their eigenvalues above the tail
+    cdef Room above  # (found,) their eigenvalues above the tail
     cdef const double *lower
     cdef const double *upper
     cdef const double *upper_if_any  # NULL where all are inf
@@ -710,16 +775,19 @@ cdef class Solver:
     cdef double *g0
     cdef double *Cv
     cdef double *Cw
+    cdef double *Cx  # where it is known, see `violation`
+    cdef bint knows_Cx
     cdef double *y
     cdef double *dy
     cdef double *y2
     cdef double *slope
     cdef double *slope2
     cdef double *c
+    cdef double *fixed
     cdef double *core
-    cdef double *inverse  # of the diagonal of the factor of the core
+    cdef double *inverse  # of the pivots of the core
     cdef double told[4]
-    cdef double tail, phi_square, beta_square, reduced_square
+    cdef double tail, phi_square, beta_square, reduced_square, z_Hp
     cdef Model preconditioner, B, known
     cdef Directions directions
     cdef double known_rho
@@ -731,15 +799,12 @@ cdef class Solver:
         self.problem, self.F, self.n = problem, F, n
         self.r, self.m = rows.GC.shape[1], rows.GC.shape[0]
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
-        self.held = (
-            _whole(rows.C), _whole(rows.GC), _whole(rows.x_tilde), _whole(problem.b),
-            _whole(problem.q), _whole(problem.diagonal), _whole(bounds[0]),
-            _whole(bounds[1]),
-        )
-        self.C, self.GC = numbers(self.held[0]), numbers(self.held[1])
-        self.x_tilde, self.b = numbers(self.held[2]), numbers(self.held[3])
-        self.q, self.diagonal = numbers(self.held[4]), numbers(self.held[5])
-        self.lower, self.upper = numbers(self.held[6]), numbers(self.held[7])
+        self.held = []
+        self.C, self.GC = read(rows.C, self.held), read(rows.GC, self.held)
+        self.x_tilde, self.b = read(rows.x_tilde, self.held), read(problem.b, self.held)
+        self.q, self.lower = read(problem.q, self.held), read(bounds[0], self.held)
+        self.upper = read(bounds[1], self.held)
+        self.diagonal = read(problem.diagonal, self.held)
         if not len(problem.diagonal):
             self.diagonal = NULL
         for i in range(n):
@@ -760,7 +825,7 @@ cdef class Solver:
             values, residuals, vectors, _ = spectrum.ritz
             self.find_upper_end(_whole(values), _whole(residuals), _whole(vectors))
         k = (self.found + 3) & ~3
-        self.room = Room(19 * n + 2 * self.r + (7 + k) * k)
+        self.room = Room(19 * n + 3 * self.r + (8 + k) * k)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -774,13 +839,14 @@ cdef class Solver:
         at += 7 * n
         self.y, self.dy, self.y2, self.slope = at, at + k, at + 2 * k, at + 3 * k
         self.slope2, self.c, self.inverse = at + 4 * k, at + 5 * k, at + 6 * k
-        self.Cv = at + 7 * k
+        self.fixed, self.Cv = at + 7 * k, at + 8 * k
         self.Cw = self.Cv + self.r
-        self.core = self.Cw + self.r
+        self.Cx = self.Cw + self.r
+        self.core = self.Cx + self.r
 
     cdef int find_upper_end(self, values, residuals, vectors) except -1:
         """Choose what a model holds, as `Projected.upper_end` does."""
-        cdef Py_ssize_t i, found = len(values), kept, n = self.n
+        cdef Py_ssize_t i, found = len(values), kept, n = self.n, first = 0, last = n
         cdef const double *value = numbers(values)
         cdef const double *residual = numbers(residuals)
         kept = max(found - (1 if residual[found - 1] <= 1e-10 * value[0] else 2), 0)
@@ -792,16 +858,25 @@ cdef class Solver:
             kept = 0
         self.tail = fmax((value[kept] + residual[kept]) / self.norm, TAIL)
         self.found = kept + self.r
-        self.vectors = Room(self.found * (n + 1))
-        self.above = self.vectors.at + self.found * n
-        memcpy(self.vectors.at, numbers(vectors), kept * n * sizeof(double))
-        memcpy(self.vectors.at + kept * n, self.C, self.r * n * sizeof(double))
-        self.C = self.vectors.at + kept * n  # read once, not twice, from farther caches
+        self.above = Room(self.found)
         for i in range(self.found):
-            self.above[i] = -self.tail
-            if i < kept:
-                self.above[i] += (value[i] + residual[i]) / self.norm
+            self.above.at[i] = -self.tail
+            if i >= self.r:
+                self.above.at[i] += (value[i - self.r] + residual[i - self.r]) / self.norm
+        if not self.found:
+            return 0
+        while first < n and not self.has_bound(first):
+            first += 1
+        while last > first and not self.has_bound(last - 1):
+            last -= 1
+        self.basis = Basis.zeros(self.found, n, first, last - first)
+        memcpy(self.basis.U, self.C, self.r * n * sizeof(double))
+        memcpy(self.basis.U + self.r * n, numbers(vectors), kept * n * sizeof(double))
+        self.C = self.basis.U  # read once, not twice, from farther caches
         return 0
+
+    cdef bint has_bound(self, Py_ssize_t i) noexcept:
+        return self.lower[i] > -INFINITY or self.upper[i] < INFINITY
 
     # the operator
 
@@ -812,8 +887,8 @@ cdef class Solver:
         if not self.r:
             self.F.apply(v, out, self.inverse_norm)
             return 0
-        memcpy(Pv, v, n * sizeof(double))
-        without(self.C, self.r, Pv, self.Cv, n)
+        rows_times(self.C, v, self.Cv, self.r, n)
+        combination(-1.0, self.C, self.Cv, v, Pv, self.r, n)
         self.F.apply(Pv, out, self.inverse_norm)
         rows_times(self.C, out, self.Cw, self.r, n)
         for i in range(self.r):
@@ -861,51 +936,63 @@ cdef class Solver:
             square += self.Cv[i] * self.Cv[i]
         return sqrt(square)
 
+    cdef double violation(self):
+        """Find ‖Cx‖ at the iterate; CG steps have brought Cx along."""
+        if not self.knows_Cx:
+            rows_times(self.C, self.x, self.Cx, self.r, self.n)
+            self.knows_Cx = True
+        return sqrt(dot(self.Cx, self.Cx, self.r))
+
     # the model
 
     cdef Model model(self, double rho):
         """Model H for that ρ by the Ritz pairs, as `Projected.model` does."""
         cdef Py_ssize_t i, k = self.found
+        if not k:
+            return Model.of_norm(self.tail, self.n)
         if self.known is None or self.known_rho != rho:
             for i in range(k):
-                self.c[i] = self.above[i] + (rho if i >= k - self.r else 0.0)
-            self.known = Model.above_tail(self.vectors.at, self.vectors, k, self.n,
-                                          self.c, 0.0, self.tail)
+                self.c[i] = self.above.at[i] + (rho if i < self.r else 0.0)
+            self.known = Model.above_tail(self.basis, k, self.c, 0.0, self.tail)
             self.known_rho = rho
         return self.known
 
     cdef int factor(self, Model B, const double *piece) except -1:
-        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero."""
-        cdef Py_ssize_t i, j, k = B.k, stride
-        cdef double *S = self.core
-        cdef double *U_F
-        B.enter(piece)
-        U_F, stride = B.gram.values, B.gram.stride
-        for i in range(k):
-            for j in range(i, k):
-                S[i * stride + j] = B.root[i] * B.root[j] * U_F[i * stride + j]
-            for j in range(k, stride):
-                S[i * stride + j] = 0.0
-            S[i * stride + i] += B.tau
-        if not cholesky(S, self.inverse, k, stride):
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` is zero.
+
+        piece : of the components that have bounds
+        """
+        B.basis.enter(piece)
+        scaled(B.root, B.basis.gram, B.tau, self.core, B.k, B.basis.stride)
+        if not eliminated(self.core, self.inverse, B.k, B.basis.stride):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
     cdef void tilt(self, Model B, const double *x, const double *g, const double *lower,
-                   const double *upper, const double *y, double *s, double *piece,
-                   double *slope) noexcept:
-        """Find s(y), its piece and the slope Us − W⁻¹y."""
-        cdef Py_ssize_t i, n = self.n
-        cdef double *t = self.t
-        if not B.k:
-            tilted(x, g, B.tau, lower, upper, s, NULL, n)
-            return
-        memcpy(t, g, n * sizeof(double))
-        add_combination(1.0, B.U, y, t, B.k, n)
-        tilted(x, t, B.tau, lower, upper, s, piece, n)
-        rows_times(B.U, s, slope, B.k, n)
+                   const double *upper, const double *y, double *s,
+                   double *piece) noexcept:
+        """Find s(y) and its piece, of the components with bounds."""
+        cdef Basis U = B.basis
+        cdef Py_ssize_t o = U.first
+        combination(1.0, U.bounded, y, g + o, self.t, B.k, U.size)
+        tilted(x + o, self.t, B.tau, lower + o, upper + o, s + o, piece, U.size)
+
+    cdef void slope_at(self, Model B, const double *s, const double *y,
+                       double *slope) noexcept:
+        """Find the slope Us(y) − W⁻¹y.
+
+        Components without bounds have s = −(g + Uᵀy)/τ; `fixed` is U times the first
+        part of it.
+        """
+        cdef Basis U = B.basis
+        cdef Py_ssize_t i
+        rows_times(U.bounded, s + U.first, slope, B.k, U.size)
         for i in range(B.k):
             slope[i] -= y[i] / B.w[i]
+        if U.size < U.n:
+            rows_times(U.others, y, self.c, B.k, U.stride)
+            for i in range(B.k):
+                slope[i] += self.fixed[i] - self.c[i] / B.tau
 
     cdef int step_of_model(self, Model B, const double *x, const double *g,
                            const double *lower, const double *upper,
@@ -917,26 +1004,39 @@ cdef class Solver:
         cdef double *there = self.y2
         cdef double *slope = self.slope
         cdef double *slope_there = self.slope2
-        cdef double *piece = self.piece
-        cdef double *piece_there = self.piece2
+        cdef Basis U = B.basis
+        cdef double *piece
+        cdef double *piece_there
         cdef double begun, now, low, high, at_low, at_high, t, share
         if not k:
-            self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+            tilted(x, g, B.tau, lower, upper, s, NULL, n)
             return 0
-        memset(y, 0, k * sizeof(double))
-        self.tilt(B, x, g, lower, upper, y, s, piece, slope)
+        U.split()
+        piece, piece_there = self.piece + U.first, self.piece2 + U.first
+        memset(y, 0, U.stride * sizeof(double))
+        memset(there, 0, U.stride * sizeof(double))
+        tilted(x, g, B.tau, lower, upper, s, self.piece, n)
+        rows_times(U.U, s, slope, k, n)
+        if U.size < n:
+            rows_times(U.bounded, s + U.first, self.fixed, k, U.size)
+            for i in range(k):
+                self.fixed[i] = slope[i] - self.fixed[i]
         for newton in range(NEWTON_STEPS):
             self.factor(B, piece)
             for i in range(k):
                 dy[i] = B.root[i] * slope[i]
-            solve(self.core, self.inverse, dy, B.gram.stride)
+            solve(self.core, self.inverse, dy, U.stride)
             for i in range(k):
                 dy[i] *= B.root[i] * B.tau
                 there[i] = y[i] + dy[i]
             begun = dot(slope, dy, k)
-            self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
-            if same(piece, piece_there, n):
-                return 0  # where Newton's method is exact
+            self.tilt(B, x, g, lower, upper, there, s, piece_there)
+            if same(piece, piece_there, U.size):  # where Newton's method is exact
+                if U.size < n:
+                    combination(1.0, U.U, there, g, self.t, k, n)
+                    tilted(x, self.t, B.tau, lower, upper, s, NULL, n)
+                return 0
+            self.slope_at(B, s, there, slope_there)
             now = dot(slope_there, dy, k)
             low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
             for search in range(SEARCH_STEPS):
@@ -946,7 +1046,8 @@ cdef class Solver:
                 t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
                 for i in range(k):
                     there[i] = y[i] + t * dy[i]
-                self.tilt(B, x, g, lower, upper, there, s, piece_there, slope_there)
+                self.tilt(B, x, g, lower, upper, there, s, piece_there)
+                self.slope_at(B, s, there, slope_there)
                 now = dot(slope_there, dy, k)
                 if now > 0:
                     low, at_low = t, now
@@ -954,7 +1055,7 @@ cdef class Solver:
                     high, at_high = t, now
             memcpy(y, there, k * sizeof(double))
             memcpy(slope, slope_there, k * sizeof(double))
-            memcpy(piece, piece_there, n * sizeof(double))
+            memcpy(piece, piece_there, U.size * sizeof(double))
         t = 0.0
         for i in range(k):
             t = fmax(t, B.w[i])
@@ -992,25 +1093,26 @@ cdef class Solver:
         if self.preconditioned and self.preconditioner.k:
             for i in range(self.n):
                 self.piece[i] = 1 - self.free[i]
-            self.factor(self.preconditioner, self.piece)
+            self.factor(self.preconditioner,
+                        self.piece + self.preconditioner.basis.first)
         return 0
 
     cdef const double *preconditioned_gradient(self) noexcept:
-        """Return B_FF⁻¹φ; φ itself where there is no preconditioner."""
+        """Return z = B_FF⁻¹φ, of which zᵀHp is kept; φ where there is no preconditioner.
+        """
         cdef Py_ssize_t i, n = self.n
         cdef Model M = self.preconditioner
         cdef double *z = self.z
         if not self.preconditioned or not M.k:
             return self.phi  # directions have no length
-        memcpy(z, self.phi, n * sizeof(double))
         rows_times(M.U, self.phi, self.c, M.k, n)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        solve(self.core, self.inverse, self.c, M.gram.stride)
+        solve(self.core, self.inverse, self.c, M.basis.stride)
         for i in range(M.k):
             self.c[i] *= M.root[i]
-        add_combination(-1.0, M.U, self.c, z, M.k, n)
-        scale_free(1 / M.tau, self.free, z, n)
+        combination(-1.0, M.U, self.c, self.phi, z, M.k, n)
+        self.z_Hp = scale_free(1 / M.tau, self.free, self.Hp, z, n)
         return z
 
     # MPRGP
@@ -1030,7 +1132,7 @@ cdef class Solver:
                 self.phi if stored else NULL, self.free if stored else NULL, self.n,
                 self.told)
         self.phi_square, self.beta_square = self.told[0], self.told[1]
-        self.reduced_square = self.told[2]
+        self.reduced_square, self.knows_Cx = self.told[2], False
 
     cdef double searched(self, double *s, double *Hs) except? -1:
         """Find the length along s of the least cost, in the box where 1 is not beyond.
@@ -1086,6 +1188,7 @@ cdef class Solver:
         """Expand the active set; returns the letter of the step, 0 where none leads on."""
         cdef Py_ssize_t i, n = self.n
         cdef double step
+        self.knows_Cx = False
         if self.expansion in (PROJCG, MIXED) and isfinite(cg):
             for i in range(n):
                 step = self.x[i] - cg * self.p[i]
@@ -1279,17 +1382,20 @@ cdef class Solver:
 
         Returns γ of p ← φ − γp where that is put off, 0 else.
         """
-        cdef double curvature = self.told[3], z_Hp
+        cdef double length = self.told[0], curvature = self.told[3], z_Hp
         cdef const double *z
+        cdef bint knows_Cx = self.knows_Cx
         if not self.in_two:
             self.directions.add(self.p, self.Hp, curvature)
-        self.to(self.told[0], self.p, self.Hp)
+        self.to(length, self.p, self.Hp)
+        add(-length, self.Cv, self.Cx, self.r)  # Cp, of the product Hp
+        self.knows_Cx = knows_Cx
         z_Hp = self.told[3]
         if self.in_two:
             return z_Hp / curvature
         z = self.preconditioned_gradient()
         if z != self.phi:
-            z_Hp = dot(z, self.Hp, self.n)
+            z_Hp = self.z_Hp
         turn(z, z_Hp / curvature, self.p, self.n)
         self.directions.conjugate(self.p)
         return 0
@@ -1300,7 +1406,7 @@ cdef class Solver:
         """Whether an inner run may end."""
         cdef double size = sqrt(self.phi_square + self.beta_square)
         if self.r and size < until.coarse:
-            if size < until.M * self.infeasibility(self.x):
+            if size < until.M * self.violation():
                 return True
         return size <= until.small and self.small(tol, energy, b_size)
 
@@ -1328,23 +1434,15 @@ cdef class Solver:
 
     cdef double energy_error(self):
         """Estimate the relative energy error, as `Projected.energy_error` does."""
-        cdef double energy = 0.0, most = 0.0, total = 0.0, part, noise
+        cdef double energy = 0.0, most = 0.0, total
         cdef Py_ssize_t i
         if not self.diagonal:
             return 0.0
         for i in range(self.n):
             energy += self.q[i] * (self.x_tilde[i] + self.x[i])
-            most = fmax(most, fabs(self.q[i]))
-        noise = 1e3 * 2.0 ** -52 * most
-        for i in range(self.n):
-            if not (
-                (self.g[i] < 0 and self.x[i] < self.upper[i])
-                or (self.g[i] > 0 and self.x[i] > self.lower[i])
-            ):
-                continue
-            part = self.norm * self.g[i]
-            if self.diagonal[i] > 0 and fabs(part) > noise:
-                total += part * part / self.diagonal[i]
+            most = fabs(self.q[i]) if fabs(self.q[i]) > most else most
+        total = inward_energy(self.x, self.g, self.lower, self.upper, self.diagonal,
+                              self.norm, 1e3 * 2.0 ** -52 * most, self.n)
         return sqrt(total / fabs(energy)) if energy else 0.0
 
     # the outer loop
@@ -1390,7 +1488,7 @@ cdef class Solver:
         memcpy(self.g, numbers(at.g), n * sizeof(double))
         if at.rho != self.rho or not at.outer:
             self.directions.begin(self.free)
-        self.rho, self.most_products = at.rho, 0
+        self.rho, self.most_products, self.knows_Cx = at.rho, 0, False
         multipliers = np.array(at.mu)
         cdef double *mu = numbers(multipliers)
         cdef double b_size = sqrt(dot(self.b, self.b, n))
@@ -1475,43 +1573,41 @@ cdef class Solver:
         As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
         they are too nearly dependent on the free components for normal equations.
         """
-        cdef Py_ssize_t i, j, k, n = self.n, r = self.r
+        cdef Py_ssize_t i, n = self.n, r = self.r
         cdef int order = r, one = 1, info = 0
-        result, multipliers, lb, ub = np.zeros((3, n)), np.empty(r), _whole(lb), _whole(ub)
+        cdef bint any_left = False
+        cdef list held = []
+        result, multipliers = np.zeros((3, n)), np.zeros(r)
         cdef Room room = Room(r * r)
         cdef double *S = room.at
         cdef const double *v = numbers(nu)
-        cdef const double *least = numbers(lb)
-        cdef const double *most = numbers(ub)
         cdef const double *at_mu = numbers(mu)
         cdef double *a = numbers(multipliers)
         cdef double *x = numbers(result)
         cdef double *z_box = x + n
         cdef double *Fx = z_box + n
         cdef double *rest = self.s
-        cdef double *at = self.Hs  # −2 at the lower bound, 1 at the upper, −1 at both
+        cdef double *free = self.piece
+        cdef double *t = self.t
         cdef double *da = self.Cv
-        cdef double s
-        for i in range(n):
-            at[i] = (v[i] >= self.upper[i]) - 2.0 * (v[i] <= self.lower[i])
-            s = self.x_tilde[i] + v[i]
-            s = least[i] if at[i] < 0 else (most[i] if at[i] > 0 else s)
-            x[i] = fmin(fmax(s, least[i]), most[i])  # l − x̃ + x̃ may differ from l
+        restored(v, self.x_tilde, self.lower, self.upper, read(lb, held), read(ub, held),
+                 x, free, n)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
+            any_left = any_left or rest[i] != 0
+        if not any_left:  # a minimum of the cost without any constraint
+            return result[0], multipliers, result[1], result[2]
         if r:
             rows_times(self.C, rest, da, r, n)
             for i in range(r):
                 a[i] = self.norm * at_mu[i] - da[i]
-                da[i] = 0.0
             add_combination(1.0, self.C, a, rest, r, n)
-            for k in range(n):
-                if at[k] == 0:
-                    for i in range(r):
-                        da[i] += self.C[i * n + k] * rest[k]
-                        for j in range(i + 1):
-                            S[i * r + j] += self.C[i * n + k] * self.C[j * n + k]
+            for i in range(r):
+                masked(free, self.C + i * n, t, n)
+                rows_times(self.C, t, S + i * r, i + 1, n)
+            masked(free, rest, t, n)
+            rows_times(self.C, t, da, r, n)
             dpotrf(b"U", &order, S, &order, &info)
             for i in range(r):
                 if info or S[i * r + i] < 1e-4:
@@ -1520,11 +1616,7 @@ cdef class Solver:
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, self.C, da, rest, r, n)
-        for i in range(n):
-            if at[i] < 0:
-                z_box[i] = -fmax(rest[i], 0.0)
-            if at[i] == 1 or at[i] == -1:
-                z_box[i] -= fmin(rest[i], 0.0)
+        held_by(v, self.lower, self.upper, rest, z_box, n)
         return result[0], multipliers, result[1], result[2]
 
 
@@ -1540,79 +1632,13 @@ def residual_bound(
     With the least scale of energy that it may use, and nothing excused as rounding:
     where this is small, so are the residuals. inf where nothing can be said.
     """
-    cdef Py_ssize_t i, j, n = len(at_x), m = len(at_y)
-    held = tuple(map(_whole, (cost, told_diagonal, right, lower, upper, at_x, at_y, at_z,
-                              told_Fx, told_rows)))
-    cdef const double *q = numbers(held[0])
-    cdef const double *diagonal = numbers(held[1])
-    cdef const double *e = numbers(held[2])
-    cdef const double *lb = numbers(held[3])
-    cdef const double *ub = numbers(held[4])
-    cdef const double *x = numbers(held[5])
-    cdef const double *y = numbers(held[6])
-    cdef const double *z_box = numbers(held[7])
-    cdef const double *Fx = numbers(held[8])
-    cdef const double *rows = numbers(held[9])
-    cdef double xFx = 0.0, qx = 0.0, held_by = 0.0, energy, most, worst = 0.0, S = 0.0
-    cdef double least = INFINITY, own, step, violated, known, terms, total = 0.0
+    cdef Py_ssize_t n = len(at_x), m = len(at_y)
+    cdef list held = []
     cdef Room room = Room(2 * n)
-    cdef double *forces = room.at
-    cdef double *size = forces + n
-    if not len(held[1]) or not n:
+    if not len(told_diagonal) or not n:
         return INFINITY
-    memcpy(forces, z_box, n * sizeof(double))
-    for i in range(m):
-        add(y[i], rows + i * n, forces, n)
-        held_by += e[i] * y[i]
-    for i in range(n):
-        if not lb[i] <= x[i] <= ub[i]:
-            return INFINITY
-        xFx += x[i] * Fx[i]
-        qx += q[i] * x[i]
-        if z_box[i]:
-            step = ub[i] if z_box[i] > 0 else lb[i]
-            held_by += step * z_box[i]
-            worst = fmax(worst, fabs(z_box[i] * (x[i] - step)))
-        if diagonal[i] > 0:
-            least = fmin(least, diagonal[i])
-        S = fmax(fmax(S, fabs(Fx[i])), fmax(fabs(q[i]), fabs(forces[i])))
-    most = fmax(fmax(fabs(xFx), fabs(qx)), fabs(held_by))
-    energy = fmin(most, fmax(1e4 * fabs(xFx / 2 + qx), most / 1e4))
-    if not energy > 0:
-        return INFINITY
-    worst = fmax(worst, fabs(xFx + qx + held_by)) / energy
-    if isfinite(least):
-        S = fmax(S, sqrt(energy * least))
-    for i in range(n):
-        step = fabs(Fx[i] + q[i] + forces[i])
-        total += step
-        if step == 0:
-            continue
-        worst = fmax(worst, step / S)
-        own = step / fmax(fmax(fabs(Fx[i]), fabs(q[i])), fabs(forces[i]))
-        if diagonal[i] > 0:
-            known = fmax(fabs(x[i]), step / diagonal[i])
-            terms = x[i] - lb[i] if Fx[i] + q[i] + forces[i] > 0 else ub[i] - x[i]
-            own = fmin(own, step * fmin(known, terms) / energy)
-        worst = fmax(worst, own)
-    for j in range(n if m else 0):
-        step = INFINITY
-        if diagonal[j] > 0:
-            step = sqrt(energy / diagonal[j])
-        if q[j]:
-            step = fmin(step, energy / fabs(q[j]))
-        size[j] = 0.0
-        if isfinite(step):
-            size[j] = fmax(fmin(fabs(x[j]), 1e3 * step), step)
-    for i in range(m):
-        violated, known, terms = -e[i], fabs(e[i]), fabs(e[i])
-        for j in range(n):
-            violated += rows[i * n + j] * x[j]
-            terms += fabs(rows[i * n + j] * x[j])
-            known += fabs(rows[i * n + j]) * size[j]
-        total += violated
-        if violated:
-            worst = fmax(worst, fabs(violated) / known)
-            if fabs(e[i]) > 1e-9 * known:
-                worst = fmax(worst, 1e-4 * fabs(violated) / terms)
-    return worst if isfinite(total) and isfinite(worst) else INFINITY
+    return worst_residual(
+        read(cost, held), read(told_diagonal, held), read(at_x, held), read(at_y, held),
+        read(at_z, held), read(told_Fx, held), read(lower, held), read(upper, held),
+        read(right, held), read(told_rows, held), m, n, room.at,
+    )

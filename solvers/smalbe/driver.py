@@ -322,8 +322,6 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     qp, problem = task.inner, task.problem
     found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
     x, a, z_box, Fx = found or recovered(problem, qp, at)
-    if not (Fx + qp.q).any():  # a minimum of the cost without any constraint
-        a, z_box = np.zeros_like(a), np.zeros_like(z_box)
     letters = at.steps
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
@@ -354,6 +352,8 @@ def recovered(
     x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
     Fx = problem.F(x)
     r = Fx + qp.q
+    if not r.any():  # a minimum of the cost without any constraint
+        return x, np.zeros_like(at.mu), np.zeros_like(x), Fx
     free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
     a += problem.rows.fitted(free, r + C.T @ a)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +64,8 @@ class Projected:
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
     q: Vector  #: as given
     diagonal: Vector  #: of F; empty where an operator does not tell
-    counts: Counter[str] = field(default_factory=Counter)  #: besides products with F
+    #: besides products with F
+    counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
 
     def energy_error(self, nu: Vector, gradient: Vector) -> float:
         """Estimate the relative energy error from what is left of the gradient.

@@ -23,7 +23,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -656,16 +656,20 @@ def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
 def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
     """Do what `orthonormal_rows` does, compiled."""
     if not e.size:
-        none, n = np.zeros((0, G.shape[1])), G.shape[1]
-        return DenseRows(
-            none, none, 0.0, 1.0, np.zeros(n), True, _themselves, np.zeros((0, 0))
-        )
+        return _no_rows(G.shape[1])
     found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))
     dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
     multipliers = partial(compiled.multipliers, e.size, *triangle)
     return DenseRows(
         dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
     )
+
+
+@lru_cache(maxsize=8)
+def _no_rows(n: int) -> DenseRows:
+    none, square, x_tilde = np.zeros((0, n)), np.zeros((0, 0)), np.zeros(n)
+    x_tilde.flags.writeable = False
+    return DenseRows(none, none, 0.0, 1.0, x_tilde, True, _themselves, square)
 
 
 def _themselves(a: Vector) -> Vector:

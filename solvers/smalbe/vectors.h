@@ -274,11 +274,15 @@ TWICE static void copy_scaled(double s, in a, out b, Py_ssize_t n)
         b[i] = s * a[i];
 }
 
-/* z = s z on the free components, zero on the others. */
-TWICE static void scale_free(double s, in free, out z, Py_ssize_t n)
+/* z = s z on the free components, zero on the others; returns zᵀv. */
+TWICE static double scale_free(double s, in free, in v, out z, Py_ssize_t n)
 {
-    for (Py_ssize_t i = 0; i < n; i++)
+    double along = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
         z[i] *= s * free[i];
+        along += z[i] * v[i];
+    }
+    return along;
 }
 
 /* Whether a and b have the same components. */
@@ -294,92 +298,99 @@ TWICE static int same(in a, in b, Py_ssize_t n)
     return 1;
 }
 
-/* c = U v for U (k, n) by rows, four of which share a pass over v. Two sums a row, for
-   one would wait for itself. */
-TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
+/* The products c of `rows` rows U by rows with v, in one pass over v. Two sums a row where
+   these are few, for one would wait for itself. */
+INLINE void some_rows_times(in U, in v, out c, Py_ssize_t rows, Py_ssize_t n)
 {
-    Py_ssize_t i = 0;
-    for (; i + 4 <= k; i += 4) {
-        in u0 = U + i * n, u1 = u0 + n, u2 = u1 + n, u3 = u2 + n;
-        four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0, s0 = t0, s1 = t0, s2 = t0, s3 = t0;
-        Py_ssize_t j = 0;
-        for (; j + 8 <= n; j += 8) {
-            four w = FOUR(v + j), z = FOUR(v + j + 4);
-            t0 += FOUR(u0 + j) * w, s0 += FOUR(u0 + j + 4) * z;
-            t1 += FOUR(u1 + j) * w, s1 += FOUR(u1 + j + 4) * z;
-            t2 += FOUR(u2 + j) * w, s2 += FOUR(u2 + j + 4) * z;
-            t3 += FOUR(u3 + j) * w, s3 += FOUR(u3 + j + 4) * z;
-        }
-        double c0 = total(t0 + s0), c1 = total(t1 + s1);
-        double c2 = total(t2 + s2), c3 = total(t3 + s3);
-        for (; j < n; j++) {
-            c0 += u0[j] * v[j];
-            c1 += u1[j] * v[j];
-            c2 += u2[j] * v[j];
-            c3 += u3[j] * v[j];
-        }
-        c[i] = c0, c[i + 1] = c1, c[i + 2] = c2, c[i + 3] = c3;
-    }
-    for (; i + 2 <= k; i += 2) {
-        in u0 = U + i * n, u1 = u0 + n;
-        four t0 = EACH(0), t1 = t0;
-        Py_ssize_t j = 0;
-        for (; j + 4 <= n; j += 4) {
-            t0 += FOUR(u0 + j) * FOUR(v + j);
-            t1 += FOUR(u1 + j) * FOUR(v + j);
-        }
-        double c0 = total(t0), c1 = total(t1);
-        for (; j < n; j++) {
-            c0 += u0[j] * v[j];
-            c1 += u1[j] * v[j];
-        }
-        c[i] = c0, c[i + 1] = c1;
-    }
-    if (i < k) {
-        double rest = 0;
-        for (Py_ssize_t j = 0; j < n; j++)
-            rest += U[i * n + j] * v[j];
-        c[i] = rest;
+    four t[8], s[8];
+    Py_ssize_t j = 0;
+    for (Py_ssize_t i = 0; i < rows; i++)
+        t[i] = s[i] = EACH(0);
+    if (rows < 8)
+        for (; j + 8 <= n; j += 8)
+            for (Py_ssize_t i = 0; i < rows; i++) {
+                t[i] += FOUR(U + i * n + j) * FOUR(v + j);
+                s[i] += FOUR(U + i * n + j + 4) * FOUR(v + j + 4);
+            }
+    for (; j + 4 <= n; j += 4)
+        for (Py_ssize_t i = 0; i < rows; i++)
+            t[i] += FOUR(U + i * n + j) * FOUR(v + j);
+    for (Py_ssize_t i = 0; i < rows; i++) {
+        c[i] = total(t[i] + s[i]);
+        for (Py_ssize_t l = j; l < n; l++)
+            c[i] += U[i * n + l] * v[l];
     }
 }
 
-/* y = y + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over y. */
+/* c = U v for U (k, n) by rows. */
+TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
+{
+    Py_ssize_t i = 0;
+    for (; i + 8 <= k; i += 8)
+        some_rows_times(U + i * n, v, c + i, 8, n);
+    U += i * n, c += i;
+    switch (k - i) { /* the number of rows known, the loop over them is none */
+    case 1: some_rows_times(U, v, c, 1, n); break;
+    case 2: some_rows_times(U, v, c, 2, n); break;
+    case 3: some_rows_times(U, v, c, 3, n); break;
+    case 4: some_rows_times(U, v, c, 4, n); break;
+    case 5: some_rows_times(U, v, c, 5, n); break;
+    case 6: some_rows_times(U, v, c, 6, n); break;
+    case 7: some_rows_times(U, v, c, 7, n); break;
+    }
+}
+
+/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over v, which may be
+   y. */
 INLINE void
-add_rows(in U, const double *c, out y, Py_ssize_t rows, Py_ssize_t n)
+add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_ssize_t n)
 {
     Py_ssize_t j = 0;
     for (; j + 4 <= n; j += 4) {
         four sum = EACH(0);
         for (Py_ssize_t i = 0; i < rows; i++)
             sum += FOUR(U + i * n + j) * EACH(c[i]);
-        *(four *) (y + j) += sum;
+        *(four *) (y + j) = FOUR(v + j) + sum;
     }
-    for (; j < n; j++)
+    for (; j < n; j++) {
+        double sum = 0;
         for (Py_ssize_t i = 0; i < rows; i++)
-            y[j] += c[i] * U[i * n + j];
+            sum += c[i] * U[i * n + j];
+        y[j] = v[j] + sum;
+    }
 }
 
-/* y = y + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over y. */
-TWICE static void add_combination(double s, in U, in c, out y, Py_ssize_t k,
-                                  Py_ssize_t n)
+/* y = v + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over v, which may
+   be y. The last rows first: after `rows_times` these are in the nearest cache. */
+TWICE static void combination(double s, in U, in c, const double *v, double *y,
+                              Py_ssize_t k, Py_ssize_t n)
 {
     double sc[8];
-    for (Py_ssize_t i = 0, rows; i < k; i += rows) {
-        rows = k - i < 8 ? k - i : 8;
+    if (!k && v != y)
+        memcpy(y, v, n * sizeof(double));
+    for (Py_ssize_t last = k, rows; last; last -= rows, v = y) {
+        rows = last < 8 ? last : 8;
+        in V = U + (last - rows) * n;
         for (Py_ssize_t j = 0; j < rows; j++)
-            sc[j] = s * c[i + j];
-        in V = U + i * n;
+            sc[j] = s * c[last - rows + j];
         switch (rows) { /* the number of rows known, the loop over them is none */
-        case 1: add_rows(V, sc, y, 1, n); break;
-        case 2: add_rows(V, sc, y, 2, n); break;
-        case 3: add_rows(V, sc, y, 3, n); break;
-        case 4: add_rows(V, sc, y, 4, n); break;
-        case 5: add_rows(V, sc, y, 5, n); break;
-        case 6: add_rows(V, sc, y, 6, n); break;
-        case 7: add_rows(V, sc, y, 7, n); break;
-        default: add_rows(V, sc, y, 8, n);
+        case 1: add_rows(V, sc, v, y, 1, n); break;
+        case 2: add_rows(V, sc, v, y, 2, n); break;
+        case 3: add_rows(V, sc, v, y, 3, n); break;
+        case 4: add_rows(V, sc, v, y, 4, n); break;
+        case 5: add_rows(V, sc, v, y, 5, n); break;
+        case 6: add_rows(V, sc, v, y, 6, n); break;
+        case 7: add_rows(V, sc, v, y, 7, n); break;
+        default: add_rows(V, sc, v, y, 8, n);
         }
     }
+}
+
+/* y = y + s Uᵀc. */
+static inline void
+add_combination(double s, in U, in c, double *y, Py_ssize_t k, Py_ssize_t n)
+{
+    combination(s, U, c, y, y, k, n);
 }
 
 typedef long long __attribute__((may_alias)) ordered; /* as doubles ≥ 0 are */
@@ -390,7 +401,8 @@ typedef long long __attribute__((vector_size(32))) mask;
     ((four) ((mask) (a) & (mask){LLONG_MAX, LLONG_MAX, LLONG_MAX, LLONG_MAX}))
 
 /* What a step x - αp meets in a block: the α at which it is on the first bound, where
-   that is below `least`, pᵀHp and gᵀp, which are added to told[3] and told[2].
+   that is below `least`; pᵀHp and gᵀp are added to told[3] and told[2], unless that is
+   NULL.
 
    Few blocks have a component that is on its bound before the first of those before:
    whether one is needs no division. */
@@ -405,18 +417,22 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
         four room = to - FOUR(lower + j);
         if (upper) {
             room = CHOSEN(q > zero, room, FOUR(upper + j) - to);
-            nearer |= (room <= most * ABSOLUTE(q)) & (q != zero);
+            nearer |= room < most * ABSOLUTE(q);
         } else {
-            nearer |= (room <= most * q) & (q > zero);
+            nearer |= (room < most * q) & (q > zero);
         }
-        curvature += q * FOUR(Hp + j);
-        slope += q * FOUR(g + j);
+        if (told) {
+            curvature += q * FOUR(Hp + j);
+            slope += q * FOUR(g + j);
+        }
     }
-    told[3] += total(curvature);
-    told[2] += total(slope);
-    for (Py_ssize_t j = whole; j < n; j++) {
-        told[3] += p[j] * Hp[j];
-        told[2] += g[j] * p[j];
+    if (told) {
+        told[3] += total(curvature);
+        told[2] += total(slope);
+        for (Py_ssize_t j = whole; j < n; j++) {
+            told[3] += p[j] * Hp[j];
+            told[2] += g[j] * p[j];
+        }
     }
     Py_ssize_t from = nearer[0] | nearer[1] | nearer[2] | nearer[3] ? 0 : whole;
     double room[BLOCK];
@@ -453,9 +469,9 @@ turn_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
     }
 }
 
-/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. With F, Hp = s F p
-   is found first, in the same go through memory; and before, where p is `turning`,
-   p = φ − γp, as far as the product needs it. */
+/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. Hp = s F p is found
+   first, in the same go through memory; and before, where p is `turning`, p = φ − γp, as
+   far as the product needs it. */
 INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, in x,
                          in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
                          out told)
@@ -471,8 +487,7 @@ INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, i
                     gamma, p + turned, to - turned);
             turned = to;
         }
-        if (F)
-            some_rows(F, i, i + size, s, p, Hp + i);
+        some_rows(F, i, i + size, s, p, Hp + i);
         feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
                                  upper ? upper + i : NULL, size, feasible, told);
     }
@@ -480,14 +495,31 @@ INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, i
     told[1] = feasible;
 }
 
-/* upper : NULL where no component has a bound above */
-TWICE static void lengths(in x, in g, double *p, out Hp, in lower, in upper,
-                          Py_ssize_t n, out told)
+/* α of x - αp: told = the minimising, the largest feasible where that is less, else inf,
+   gᵀp, pᵀHp.
+
+   upper : NULL where no component has a bound above */
+TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
+                          out told)
 {
-    if (upper)
-        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, upper, n, told);
-    else
-        find_lengths(NULL, 1, 0, 0, x, g, p, Hp, lower, NULL, n, told);
+    double slope = 0, curvature = 0, feasible;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        slope += g[i] * p[i];
+        curvature += p[i] * Hp[i];
+    }
+    told[0] = feasible = curvature > 0 ? slope / curvature : INFINITY;
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        if (upper)
+            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, upper + i, size,
+                                     feasible, NULL);
+        else
+            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, NULL, size,
+                                     feasible, NULL);
+    }
+    told[1] = feasible < told[0] ? feasible : INFINITY;
+    told[2] = slope;
+    told[3] = curvature;
 }
 
 TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *p,
@@ -726,18 +758,31 @@ TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in fre
     told[1] = phi_Hp;
 }
 
+/* Uᵀ by rows of `stride` numbers, those from column k on as they are. */
+TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
+                             Py_ssize_t stride)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        for (Py_ssize_t j = 0; j < k; j++)
+            columns[i * stride + j] = U[j * n + i];
+}
+
 /* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, those rows of V (n, k), k a multiple of four; only
    the upper triangle of S (k, k) means something. */
 TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_t k)
 {
     in v0 = V + row[0] * k, v1 = V + row[1] * k, v2 = V + row[2] * k;
     in v3 = V + row[3] * k;
-    for (Py_ssize_t i = 0; i < k; i++) {
+    for (Py_ssize_t i = 0; i < k; i += 2) { /* two rows of S share the vectors */
         four a0 = EACH(s[0] * v0[i]), a1 = EACH(s[1] * v1[i]), a2 = EACH(s[2] * v2[i]);
-        four a3 = EACH(s[3] * v3[i]);
-        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < k; j += 4)
-            *(four *) (S + i * k + j) += a0 * FOUR(v0 + j) + a1 * FOUR(v1 + j)
-                                         + a2 * FOUR(v2 + j) + a3 * FOUR(v3 + j);
+        four a3 = EACH(s[3] * v3[i]), b0 = EACH(s[0] * v0[i + 1]);
+        four b1 = EACH(s[1] * v1[i + 1]), b2 = EACH(s[2] * v2[i + 1]);
+        four b3 = EACH(s[3] * v3[i + 1]);
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < k; j += 4) {
+            four w0 = FOUR(v0 + j), w1 = FOUR(v1 + j), w2 = FOUR(v2 + j), w3 = FOUR(v3 + j);
+            *(four *) (S + i * k + j) += a0 * w0 + a1 * w1 + a2 * w2 + a3 * w3;
+            *(four *) (S + (i + 1) * k + j) += b0 * w0 + b1 * w1 + b2 * w2 + b3 * w3;
+        }
     }
 }
 
@@ -764,23 +809,33 @@ TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict 
     return count;
 }
 
-/* S = RᵀR (k, k) in a square of `stride` numbers a side, a multiple of four, zeros from
-   column k on: R above the diagonal of S, 1/Rᵢᵢ in `inverse`, zeros for what is beyond k;
-   0 where S is not positive definite. */
-TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
+/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in squares of `stride` numbers a side, a
+   multiple of four; `root` and G have zeros from column k on. */
+TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
+                         Py_ssize_t stride)
+{
+    for (Py_ssize_t i = 0; i < k; i++) {
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < stride; j += 4)
+            *(four *) (S + i * stride + j)
+                = EACH(root[i]) * FOUR(root + j) * FOUR(G + i * stride + j);
+        S[i * stride + i] += tau;
+    }
+}
+
+/* S = RᵀD⁻¹R (k, k) with the diagonal D of R, by Gaussian elimination in a square of
+   `stride` numbers a side, a multiple of four, zeros from column k on: R takes the place
+   of S, 1/Dᵢᵢ is in `inverse`, zeros are beyond k; 0 where S is not positive definite. */
+TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
         double *r = S + i * stride;
-        Py_ssize_t first = i & ~(Py_ssize_t) 3;
         if (!(r[i] > 0))
             return 0;
-        inverse[i] = 1 / sqrt(r[i]);
-        for (Py_ssize_t j = first; j < i; j++)
+        inverse[i] = 1 / r[i];
+        for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < i; j++)
             r[j] = 0; /* means nothing, and would grow from face to face */
-        for (Py_ssize_t j = first; j < stride; j += 4)
-            *(four *) (r + j) *= EACH(inverse[i]);
         for (Py_ssize_t j = i + 1; j < k; j++) {
-            four s = EACH(r[j]);
+            four s = EACH(r[j] * inverse[i]);
             for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < stride; l += 4)
                 *(four *) (S + j * stride + l) -= s * FOUR(r + l);
         }
@@ -792,8 +847,8 @@ TWICE static int cholesky(double *S, double *inverse, Py_ssize_t k, Py_ssize_t s
     return 1;
 }
 
-/* y = S⁻¹y with its `cholesky`, four components at once; y has `stride` of them, of which
-   those from k on become zero. */
+/* y = S⁻¹y with S as it was `eliminated`, four components at once; y has `stride` of
+   them, of which those from k on become zero. */
 TWICE static void solve(const double *R, const double *inverse, double *y,
                         Py_ssize_t stride)
 {
@@ -809,7 +864,7 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
                                  + FOUR(r2 + j) * EACH(a2) + FOUR(r3 + j) * EACH(a3);
         *(four *) (y + i) = (four){a0, a1, a2, a3};
     }
-    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* Ry = a */
+    for (Py_ssize_t i = stride - 4; i >= 0; i -= 4) { /* D⁻¹Ry = a */
         const double *r0 = R + i * stride, *r1 = r0 + stride, *r2 = r1 + stride;
         const double *r3 = r2 + stride, *d = inverse + i;
         four t0 = EACH(0), t1 = t0, t2 = t0, t3 = t0;
@@ -819,19 +874,20 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
             t2 += FOUR(r2 + j) * FOUR(y + j);
             t3 += FOUR(r3 + j) * FOUR(y + j);
         }
-        double a3 = (y[i + 3] - total(t3)) * d[3];
-        double a2 = (y[i + 2] - total(t2) - r2[i + 3] * a3) * d[2];
-        double a1 = (y[i + 1] - total(t1) - r1[i + 2] * a2 - r1[i + 3] * a3) * d[1];
-        double a0 = y[i] - total(t0) - r0[i + 1] * a1 - r0[i + 2] * a2 - r0[i + 3] * a3;
-        *(four *) (y + i) = (four){a0 * d[0], a1, a2, a3};
+        double a3 = y[i + 3] - total(t3) * d[3];
+        double a2 = y[i + 2] - (total(t2) + r2[i + 3] * a3) * d[2];
+        double a1 = y[i + 1] - (total(t1) + r1[i + 2] * a2 + r1[i + 3] * a3) * d[1];
+        double a0 = total(t0) + r0[i + 1] * a1 + r0[i + 2] * a2 + r0[i + 3] * a3;
+        *(four *) (y + i) = (four){y[i] - a0 * d[0], a1, a2, a3};
     }
 }
 
 INLINE void tilted_block(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
+    double length = 1 / tau;
     for (Py_ssize_t i = 0; i < n; i++) {
-        double target = x[i] - g[i] / tau;
+        double target = x[i] - length * g[i];
         double low = target <= lower[i] ? 1.0 : 0.0;
         double high = target >= upper[i] ? 1.0 - low : 0.0;
         target = target >= upper[i] ? upper[i] : target;
@@ -889,4 +945,139 @@ TWICE static int turn_round(out s, Py_ssize_t n)
         s[i] = -s[i];
     }
     return any != 0;
+}
+
+#define LARGER(a, b) ((a) > (b) ? (a) : (b))
+#define SMALLER(a, b) ((a) < (b) ? (a) : (b))
+
+/* x = shift + ν, within lb and ub, and on them where ν is on its bounds (the sum may
+   differ from that in the last bit); `free` is 1 where ν is on none, 0 elsewhere. */
+TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, out x,
+                           out free, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        int down = nu[i] <= lower[i], up = nu[i] >= upper[i];
+        double to = up ? ub[i] : shift[i] + nu[i];
+        to = down ? lb[i] : to;
+        to = LARGER(to, lb[i]);
+        x[i] = SMALLER(to, ub[i]);
+        free[i] = down | up ? 0.0 : 1.0;
+    }
+}
+
+/* The multipliers z of the bounds that ν is on, where the gradient without them is g. */
+TWICE static void held_by(in nu, in lower, in upper, in g, out z, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double push = LARGER(g[i], 0), pull = SMALLER(g[i], 0);
+        z[i] = (nu[i] <= lower[i] ? -push : 0) - (nu[i] >= upper[i] ? pull : 0);
+    }
+}
+
+/* t = free a. */
+TWICE static void masked(in free, in a, out t, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i++)
+        t[i] = free[i] * a[i];
+}
+
+/* The sizes of variables that an energy knows of, as `harness.verify.kkt` says; zero
+   where it knows of none. */
+INLINE void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssize_t n)
+{
+    for (Py_ssize_t j = 0; j < n; j++) {
+        double step = diagonal[j] > 0 ? sqrt(energy / diagonal[j]) : INFINITY;
+        double other = q[j] != 0 ? energy / fabs(q[j]) : INFINITY;
+        step = SMALLER(step, other);
+        other = SMALLER(fabs(x[j]), 1e3 * step);
+        size[j] = step < INFINITY ? LARGER(other, step) : 0;
+    }
+}
+
+/* Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components where the gradient leads into the box, and is
+   more than `noise`. */
+TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
+                                  double noise, Py_ssize_t n)
+{
+    double total = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double r = norm * g[i], d = diagonal[i] > 0 ? diagonal[i] : 1;
+        int inward = ((g[i] < 0) & (x[i] < upper[i])) | ((g[i] > 0) & (x[i] > lower[i]));
+        int told = (diagonal[i] > 0) & (fabs(r) > noise) & inward;
+        total += told ? r * r / d : 0;
+    }
+    return total;
+}
+
+/* An upper bound of the worst residual, see `residual_bound` in `compiled.pyx`; room for
+   2n numbers. */
+TWICE static double
+worst_residual(in q, in diagonal, in x, in y, in z, in Fx, in lb, in ub, in e, in rows,
+               Py_ssize_t m, Py_ssize_t n, out room)
+{
+    double *restrict forces = room, *restrict size = room + n;
+    double xFx = 0, qx = 0, held = 0, most = 0, largest = 0, least = INFINITY, all = 0;
+    Py_ssize_t outside = 0;
+    memcpy(forces, z, n * sizeof(double));
+    add_combination(1, rows, y, forces, m, n);
+    for (Py_ssize_t i = 0; i < m; i++)
+        held += e[i] * y[i];
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double step = z[i] > 0 ? ub[i] : lb[i], size_of_all;
+        step = z[i] != 0 ? step : 0;
+        outside |= !(lb[i] <= x[i]) | !(x[i] <= ub[i]);
+        xFx += x[i] * Fx[i];
+        qx += q[i] * x[i];
+        held += step * z[i];
+        most = LARGER(most, fabs(z[i] * (x[i] - step)));
+        least = diagonal[i] > 0 && diagonal[i] < least ? diagonal[i] : least;
+        size_of_all = LARGER(fabs(Fx[i]), fabs(q[i]));
+        size_of_all = LARGER(size_of_all, fabs(forces[i]));
+        largest = LARGER(largest, size_of_all);
+        size[i] = size_of_all;
+    }
+    double terms = LARGER(LARGER(fabs(xFx), fabs(qx)), fabs(held));
+    double energy = LARGER(1e4 * fabs(xFx / 2 + qx), terms / 1e4);
+    energy = SMALLER(terms, energy);
+    if (outside || !(energy > 0))
+        return INFINITY;
+    double worst = LARGER(most, fabs(xFx + qx + held)) / energy;
+    if (least < INFINITY)
+        largest = LARGER(largest, sqrt(energy * least));
+    for (Py_ssize_t i = 0; i < n; i++) {
+        forces[i] += Fx[i] + q[i];
+        all += fabs(forces[i]);
+    }
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double r = fabs(forces[i]), own;
+        worst = LARGER(worst, r / largest);
+        if (!(r > worst * size[i]))
+            continue;
+        own = r / size[i];
+        if (diagonal[i] > 0) {
+            double known = LARGER(fabs(x[i]), r / diagonal[i]);
+            double way = forces[i] > 0 ? x[i] - lb[i] : ub[i] - x[i];
+            known = SMALLER(known, way);
+            own = SMALLER(own, r * known / energy);
+        }
+        worst = LARGER(worst, own);
+    }
+    if (m)
+        known_sizes(energy, q, diagonal, x, size, n);
+    for (Py_ssize_t i = 0; i < m; i++) {
+        in row = rows + i * n;
+        double violated = -e[i], told = fabs(e[i]), known = told;
+        for (Py_ssize_t j = 0; j < n; j++) {
+            violated += row[j] * x[j];
+            told += fabs(row[j] * x[j]);
+            known += fabs(row[j]) * size[j];
+        }
+        all += fabs(violated);
+        if (violated == 0)
+            continue;
+        worst = LARGER(worst, fabs(violated) / known);
+        if (fabs(e[i]) > 1e-9 * known)
+            worst = LARGER(worst, 1e-4 * fabs(violated) / told);
+    }
+    return isfinite(all) && isfinite(worst) ? worst : INFINITY;
 }

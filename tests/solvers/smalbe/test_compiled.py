@@ -145,8 +145,17 @@ def test_preparation_is_as_it_is_written(seed):
 @pytest.mark.parametrize("seed", range(12))
 def test_the_steps_are_those_that_are_written(seed, name, kind):
     """Letter for letter for 25 steps; rounding lets long runs part later."""
-    options = replace(SOLVERS[name], max_steps=25)
-    qp, runs = random_qp(seed, kind), []
+    they_agree(random_qp(seed, kind), replace(SOLVERS[name], max_steps=25))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
+    """Of a model whose first rows are those of the penalty."""
+    they_agree(random_qp(seed), replace(SOLVERS["smalbe"], max_steps=25, rho=1e-3))
+
+
+def they_agree(qp, options):
+    runs = []
     for written in (False, True):
         problem = projected_problem(qp, partial(by_lanczos, steps=12))
         solve, solver = outer_loop(problem, qp, options, is_compiled=not written)
