@@ -103,6 +103,7 @@ class ProblemInParts:
     material: Integers  #: (S,) of each subdomain
     kind: Callable[[Part], Kind]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
+    names: tuple[str, ...]  #: of the bodies
     #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
     #: `problems.feti.structured.Layout.shaping`; None for 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None

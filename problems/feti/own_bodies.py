@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+from scipy.sparse import bsr_array, csr_array, hstack
 
 from harness import Solution, Vector
 from harness.distributed.vectors import Answered
-from harness.verify.over_ranks import Contact, OwnBodies
+from harness.verify.over_ranks import Contact, OwnBodies, Unheld
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import Halo
+from problems.feti.subdivision import Points
 from problems.feti.substructures import LocalProblems
 from problems.feti.torn import Torn
 
@@ -100,8 +103,7 @@ def answers(
 ) -> Callable[[Solution], Answered]:
     """Make what says what an answer means, on each rank for its own.
 
-    Where the supports leave a rigid motion of some body, only the whole knows what
-    holds it; where they are eliminated, subdomains do not float, as is taken here.
+    Where supports are eliminated, subdomains do not float, as is taken here.
 
     Parameters
     ----------
@@ -109,7 +111,7 @@ def answers(
     torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
 
     """
-    problem, is_held = own.problem, holds_all(own.problem)
+    problem = own.problem
 
     def answer(s: Solution) -> Answered:
         if problem.eliminated:
@@ -120,10 +122,7 @@ def answers(
             def results() -> Mapping[str, Any]:
                 return {**reported(found), **torn}
 
-        return Answered(
-            (found.bodies, found.u, found.z[_carrying(problem)]) if is_held else None,
-            results,
-        )
+        return Answered((found.bodies, found.u, found.z[_carrying(problem)]), results)
 
     return answer
 
@@ -132,7 +131,9 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     """Gather what this rank has, and count the copies (n,) of its components."""
     problem, domains, rows = own.problem, own.domains, own.rows
     d, contact, kept = problem.components, problem.contact, _carrying(problem)
-    nodes, of_node = np.unique(own.nodes.number, return_inverse=True)
+    nodes, copy, of_node = np.unique(
+        own.nodes.number, return_index=True, return_inverse=True
+    )
     components, place = (
         (d * at[:, None] + np.arange(d)).ravel() for at in (nodes, of_node)
     )
@@ -155,6 +156,7 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
             rows=csr_array(contact.rows[kept]), c=contact.c[kept],
             bound=contact.bound[contact.bound > 0],
         ),
+        unheld=_unheld(own, copy),
     ), times  # fmt: skip
 
 
@@ -178,20 +180,96 @@ def _carrying(problem: ProblemInParts) -> Nodes:
 
 def holds_all(problem: ProblemInParts) -> bool:
     """Whether the supports leave no rigid motion of any body."""
+    return not _unheld_bodies(problem)
+
+
+def _unheld_bodies(problem: ProblemInParts) -> list[int]:
+    """List the bodies that supports leave some rigid motion."""
     of, d = problem.layout, problem.components
-    node, k = np.divmod(problem.held, d)
+    node, axis = np.divmod(problem.held, d)
     body = of.body[of.holder(node)]
-    for b in range(problem.E.size):
+
+    def is_held(b: int) -> bool:
         own = body == b
         if not own.any():
             return False
-        if d == 1:
-            continue
         points = of.position(node[own])
-        size = np.ptp(points, axis=0).max(initial=0.0) or 1.0
-        x, y = ((points - points[:1]) / size).T
-        along_x = k[own] == 0
-        motions = np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
-        if np.linalg.matrix_rank(motions) < 3:
-            return False
-    return True
+        size = np.ptp(points, axis=0).max() or 1.0
+        motions = _motions((points - points[0]) / size, axis[own], d)
+        return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
+
+    return [b for b in range(problem.E.size) if not is_held(b)]
+
+
+def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+    """Return the rigid motions of components of points, (k, 1) or (k, 3).
+
+    axis : (k,) of each component, one of d
+    """
+    if d == 1:
+        return np.ones((len(points), 1))
+    x, y = points.T
+    along_x = axis == 0
+    return np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
+
+
+class _Extent(NamedTuple):
+    """Where a body is, and how large, by its N nodes."""
+
+    centre: Vector  #: (2,)
+    radius: float  #: √ of the mean square distance from it
+    size: float  #: √N
+
+    def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+        """Return its rigid motions, orthonormal in the sum over all nodes."""
+        return _motions((points - self.centre) / self.radius, axis, d) / self.size
+
+
+def _unheld(own: OwnSubdomains, copy: Nodes) -> Unheld:
+    """Gather the rigid motions of the bodies that supports leave any.
+
+    copy : (n/d,) of each own node, in turn, a copy among the own torn nodes
+    """
+    problem, of, d = own.problem, own.problem.layout, own.problem.components
+    components = d * copy.size
+    motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
+    if not (unheld := _unheld_bodies(problem)):
+        return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
+    points = np.concatenate([*of.points(own.number)])
+    body = of.body[own.number][own.nodes.subdomain]
+    held, axis = np.divmod(problem.held, d)
+    body_held = of.body[of.holder(held)]
+    for b in unheld:
+        extent = _extent(own, points, np.where(body == b, 1 / own.nodes.times, 0.0))
+        of_body = body_held == b
+        at_held = extent.motions(of.position(held[of_body]), axis[of_body], d)
+        left.append(null_space(at_held) if of_body.any() else np.eye(at_held.shape[1]))
+        mine = np.flatnonzero(body[copy] == b)
+        at = np.repeat(points[copy[mine]], d, axis=0)
+        found = extent.motions(at, np.tile(np.arange(d), mine.size), d)
+        rows = (d * mine[:, None] + np.arange(d)).ravel()
+        one = csr_array(
+            (np.ones(rows.size), (rows, np.arange(rows.size))),
+            shape=(components, rows.size),
+        )
+        motions.append(one @ csr_array(found))
+        names.append(problem.names[b])
+    return Unheld(
+        motions=csr_array(hstack(motions)), left=block_diag(*left), names=tuple(names)
+    )
+
+
+def _extent(own: OwnSubdomains, points: Points, share: Vector) -> _Extent:
+    """Measure a body whose nodes all ranks have; called by all of them.
+
+    Parameters
+    ----------
+    points : of own torn nodes (M, 2)
+    share : (M,) of all copies of a node, which add up to one in the body
+
+    """
+    total = own.ranks.total
+    count, *moments = total(np.append(share.sum(), share @ points))
+    centre = np.array(moments) / count
+    spread = total(np.array([share @ ((points - centre) ** 2).sum(axis=1)]))[0]
+    return _Extent(centre, float(np.sqrt(spread / count)), float(np.sqrt(count)))

@@ -185,7 +185,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     column, row = (x.astype(np.int64) for x in layout.block[1:])
     none = np.zeros(0)
     return ProblemInParts(
-        layout=layout, components=2, E=moduli[:1], glue=p["glue"],
+        layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
         load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
