@@ -270,6 +270,7 @@ class _RigidMotions:
     at_rows: NDArray[np.float64]  #: (w, p) felt ones, of the components that rows touch
     together: NDArray[np.float64]  #: (motions, r) coefficients of R of all subdomains
     balance: Balance  #: of the load along felt ones
+    driven: str = ""  #: which load along free ones nothing can balance, if there is one
 
     def still(self, own: OwnBodies, v: NDArray[Any]) -> NDArray[Any]:
         """Take the rigid motions out of v (n,), a displacement of own components."""
@@ -297,14 +298,7 @@ class _RigidMotions:
 def _rigid_motions(
     own: OwnBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions by whether rows feel them at the components `at` (w,).
-
-    Raises
-    ------
-    UncertifiableError
-        When a load drives a motion that they do not feel.
-
-    """
+    """Split the rigid motions by whether rows feel them at the components `at` (w,)."""
     among, parts, unheld = own.among, own.parts, own.unheld
 
     if not unheld.left.shape[1]:
@@ -328,10 +322,10 @@ def _rigid_motions(
     f = among.completed(parts.spread.T @ own.f.astype(Real))
     size, along = np.abs(f), among.along(R, f)
     total = among.summed(size[among.counts].sum(keepdims=True))
-    if is_driven(along[p:], among.along(abs(R), size)[p:], total * largest[p:]):
-        along[:p] = 0
-        pushed = among.along(unheld.motions, R @ along)
-        raise UncertifiableError(driven(pushed, unheld.names))
+    why, terms = "", among.along(abs(R), size)
+    if is_driven(along[p:], terms[p:], total * largest[p:]):
+        along_free = np.append(np.zeros(p), along[p:])
+        why = driven(among.along(unheld.motions, R @ along_free), unheld.names)
     own_motions = csr_array(parts.kernel.T @ (parts.spread @ R.astype(np.float64)))
     together = [among.gathered(column) for column in own_motions.toarray().T]
     felt = R_at[:, :p]
@@ -343,6 +337,7 @@ def _rigid_motions(
             along[:p], (among.along(R != 0, size) * largest)[:p],
             np.zeros(p, dtype=Real), exact.lower, exact.upper,
         ),
+        why,
     )  # fmt: skip
 
 
@@ -371,6 +366,8 @@ def _proof(
     found = inside_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
         raise UncertifiableError("the answer penetrates beyond repair")
+    if rigid.driven:
+        raise UncertifiableError(rigid.driven)
     lam = rigid.balance.near(lam)
     places, here = own.among.places(at)
     feasible = rigid.moved(u * found.theta, found.u[at.size :])

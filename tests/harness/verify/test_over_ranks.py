@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from harness.distributed import mpi
@@ -145,6 +146,48 @@ def test_digests_tell_qps_apart_and_not_the_ranks_that_emit_them(found):
     assert all(by_ranks == by_one for by_ranks, by_one in digests)
     assert len({digest for digest, _ in digests}) == len(found)
     assert all(digest.startswith(EMITTED) for digest, _ in digests)
+
+
+SEARCHED = (
+    HELD[0], "membranes/S=3/n=2/dual", "contact-patch/ratio=0.1/feti=3/dual",
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual", MINDLIN,
+    "sliding disc", "disc under rollers", "tilted disc", "soft disc",
+)  # fmt: skip
+
+
+def searched(ranks, *arguments):
+    done = subprocess.run(
+        [
+            mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
+            str(SUPPORT / "fooled_on_ranks.py"), *map(str, arguments),
+        ],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    ("count", "ranks", "names"),
+    [
+        (20, 4, ("membranes/S=3/n=2/dual", "disc under rollers")),
+        *(pytest.param(200, n, SEARCHED, marks=pytest.mark.slow) for n in (2, 3)),
+    ],
+)
+def test_no_answer_is_found_whose_error_exceeds_the_bound_of_ranks(count, ranks, names):
+    for found in searched(ranks, count, *names).values():
+        assert found["faults"] == []
+        assert len(found["sharp"]) == count
+        assert np.median(found["sharp"]) < 2
+
+
+def test_a_load_that_nothing_balances_is_refused_in_the_words_of_one_process():
+    pushed, lifted = searched(2, 0)
+
+    assert pushed[0] == pushed[1]
+    assert lifted[0] == lifted[1]
+    assert "nothing balances the load of body upper along x" in pushed[0]
+    assert "contact would have to pull" in lifted[0]
 
 
 def flat(quantities, prefix=""):
