@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,7 +71,8 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
     touches.data[:] = 1
-    rank = balanced(csr_array(touches.T @ touches), _work(B, domains), ranks)
+    work, size = _work(B, domains), np.diff(domains.start)
+    rank = balanced(csr_array(touches.T @ touches), work, size, ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
@@ -94,10 +96,19 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.kind]
 
 
+EVEN = 1.1  #: largest/mean of what ranks do, or hold, that is good enough
+SEEDS = 12  #: of METIS, that are tried
+SHARES = (0.25, 0.5, 1.0)  #: of size in the weight, beside work
+
+
 def balanced(
-    graph: csr_array, work: NDArray[np.int64], ranks: int
+    graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
-    """Partition the graph of subdomains that share rows, by work (S,).
+    """Partition the graph of subdomains that share rows, by work and size (S,).
+
+    METIS balances one weight: first the work. Where ranks hold uneven parts then, as
+    where few subdomains have most of the work, it weighs both in several ways, and of
+    what leaves the work even the partition with the most even sizes is taken.
 
     graph : (S, S) how many rows they share
     """
@@ -108,15 +119,36 @@ def balanced(
         )
     if ranks == 1:
         return np.zeros(work.size, dtype=np.int64)
-    import pymetis  # late: one process needs none
-
     graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
-    unit = max(int(work.min()), 1)
-    _, found = pymetis.part_graph(
-        ranks, xadj=graph.indptr, adjncy=graph.indices, eweights=graph.data,
-        vweights=work // unit, recursive=True,
+
+    def uneven(weight: NDArray[np.int64], rank: NDArray[np.int64]) -> float:
+        sums = np.bincount(rank, weight, minlength=ranks)
+        return float(sums.max() / sums.mean())
+
+    rank = _partitioned(graph, work // max(int(work.min()), 1), ranks)
+    best = uneven(size, rank)
+    for seed, share in product(range(SEEDS), SHARES):
+        if best <= EVEN:
+            break
+        weight = work / work.mean() + share * size / size.mean()
+        other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
+        if uneven(work, other) <= EVEN and uneven(size, other) < best:
+            rank, best = other, uneven(size, other)
+    return rank
+
+
+def _partitioned(
+    graph: csr_array, weight: NDArray[np.int64], ranks: int, seed: int | None = None
+) -> NDArray[np.int64]:
+    """Partition a graph by weights (S,), by METIS."""
+    from pymetis import CSRAdjacency, Options, part_graph  # late: one rank needs none
+
+    _, found = part_graph(
+        ranks, CSRAdjacency(graph.indptr, graph.indices), eweights=graph.data,
+        vweights=weight, recursive=True,
+        options=Options() if seed is None else Options(seed=seed),
     )  # fmt: skip
     rank = np.array(found, dtype=np.int64)
     for idle in np.setdiff1d(np.arange(ranks), rank):  # few subdomains: each gets one

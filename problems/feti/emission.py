@@ -551,7 +551,7 @@ def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
 
 
 def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
-    """Give subdomains to ranks (S,), so that these do alike much and share few rows.
+    """Give subdomains to ranks (S,), so that these do and hold alike much.
 
     Raises
     ------
@@ -577,7 +577,7 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
     )
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    return balanced(csr_array(graph), (d * touched) ** 2, ranks)
+    return balanced(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
 
 
 def _rows(own: OwnSubdomains) -> _Rows:

@@ -29,7 +29,7 @@ it, and 3.7 without, as it is if B holds the rows of that face alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -67,9 +67,9 @@ class Group(NamedTuple):
     touched: Nodes  #: b (n_g,) components within each, ascending
 
 
-def condensed(groups: Sequence[Group]) -> list[Condensed]:
-    """Form (K⁺)_bb and S_bb of each group."""
-    return [group.kind.condensed(group.touched) for group in groups]
+def condensed(groups: Sequence[Group]) -> Iterable[Condensed]:
+    """Form (K⁺)_bb and S_bb of each group, when it is asked for."""
+    return (group.kind.condensed(group.touched) for group in groups)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ class DualOperator:
     explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
     equalities: int  #: rows that are equations, the first ones; the others are contact
     #: forms (K⁺)_bb and S_bb of groups that are explicit
-    condense: Callable[[Sequence[Group]], list[Condensed]] = condensed
+    condense: Callable[[Sequence[Group]], Iterable[Condensed]] = condensed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
