@@ -217,6 +217,16 @@ class OwnSubdomains:
             )
         return Subdomains(tuple(kinds), kind), rotation
 
+    @property
+    def floating(self) -> OwnSubdomains:
+        """Hold the same with supports that are rows: all its subdomains float."""
+        if not self.problem.eliminated:
+            return self
+        found = replace(self, problem=replace(self.problem, eliminated=False))
+        same = ("number", "nodes", "_classified")  # none depends on how it is held
+        vars(found).update({name: getattr(self, name) for name in same})
+        return found
+
     @cached_property
     def domains(self) -> Subdomains:
         """Its subdomains on their own."""
@@ -273,6 +283,12 @@ class OwnSubdomains:
         for number, count in self.ranks.comm.allgather(own):
             found[number] = count
         return np.concatenate([[0], np.cumsum(found)])
+
+    @property
+    def own_motions(self) -> NDArray[np.int64]:
+        """Number its rigid motions among those of all subdomains."""
+        first, end = self.motions[self.number], self.motions[self.number + 1]
+        return np.concatenate([np.arange(*m) for m in zip(first, end, strict=True)])
 
     @property
     def coarse(self) -> int:

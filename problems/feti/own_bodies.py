@@ -68,16 +68,17 @@ def own_solution(
     """Go back from multipliers to displacements, on each rank for its own.
 
     It is the way of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
-    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks.
+    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
+    supports eliminate are zero.
 
     scale : (m,) by which the rows of contact and friction are multiplied
     """
-    rows = own.rows
-    bodies, times = _bodies(own)
-    T, R = bodies.parts.spread, bodies.parts.kernel
+    bodies, times = _bodies(own.floating)
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[own.own_motions]
     touched = halo.gathered(np.asarray(s.x))
-    v = own.domains.inverse(own.f - rows.B.T @ touched)
-    v -= R @ np.asarray(s.y)[bodies.coarse]
+    v = np.zeros(T.shape[0])
+    v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
+    v[own.kept] -= own.domains.kernel @ alpha
     u = bodies.among.completed(T.T @ v) / times
     z = contact_multipliers(own, halo, scale, s)
     return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
@@ -103,8 +104,6 @@ def answers(
 ) -> Callable[[Solution], Answered]:
     """Make what says what an answer means, on each rank for its own.
 
-    Where supports are eliminated, subdomains do not float, as is taken here.
-
     Parameters
     ----------
     scale : as of `own_solution`
@@ -114,8 +113,6 @@ def answers(
     problem = own.problem
 
     def answer(s: Solution) -> Answered:
-        if problem.eliminated:
-            return Answered(None, None)
         found, results = own_solution(own, halo, scale, s), None
         if (reported := problem.results) is not None:
 
@@ -128,7 +125,10 @@ def answers(
 
 
 def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
-    """Gather what this rank has, and count the copies (n,) of its components."""
+    """Gather what this rank has, and count the copies (n,) of its components.
+
+    own : its subdomains float
+    """
     problem, domains, rows = own.problem, own.domains, own.rows
     d, contact, kept = problem.components, problem.contact, _carrying(problem)
     nodes, copy, of_node = np.unique(
@@ -140,8 +140,6 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     times = np.empty(components.size)
     times[place] = own.times
     T = _spread(own, place, components.size)
-    first, end = own.motions[own.number], own.motions[own.number + 1]
-    coarse = [np.arange(*motions) for motions in zip(first, end, strict=True)]
     torn = Torn(
         kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
         scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
@@ -149,7 +147,7 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     return OwnBodies(
         ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
         shared=np.bincount(place, minlength=times.size) < times,
-        coarse=np.concatenate(coarse),
+        coarse=own.own_motions,
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(

@@ -92,12 +92,14 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
         )
 
 
-@pytest.mark.parametrize("case", [ELIMINATED])
-def test_what_is_eliminated_is_certified_by_the_whole(found, case):
-    for answer in found[case]:
-        assert answer["by_ranks"]["bounds"] is None
+def test_what_supports_eliminate_is_certified_in_subdomains_that_float(found):
+    for answer in found[ELIMINATED]:
+        # u_λ of the whole is the nearest there is, which one process finds
+        bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
+
+        assert answer["same"]
         assert answer["by_ranks"]["notes"] == []
-        assert answer["by_one"]["bound"] < 1
+        assert (1 - ROUNDING) * least <= bound["energy_bound"] <= 2 * least < 1
 
 
 @pytest.mark.parametrize(

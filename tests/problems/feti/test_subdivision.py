@@ -170,7 +170,7 @@ def _around(own):
 
 def test_ranks_hold_alike_much_where_few_subdomains_have_most_of_the_work():
     """A half disc, graded: long boundaries in its middle, most nodes around it."""
-    case = parse("hertz-plane/n=8/halvings=3/feti=16/dual", PROBLEMS)
+    case = parse("hertz-plane/n=8/halvings=4/feti=16/dual", PROBLEMS)
     problem = case.family.in_subdomains(case.params)
     of, rank = problem.layout, subdomains_of(problem, 2)
 
