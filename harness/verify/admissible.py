@@ -316,8 +316,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
     pushed : (r,) that load along the rigid motions of the bodies, in turn
     """
-    pushed = np.abs(pushed) if pushed.size else np.zeros(1)
-    most = int(pushed.argmax())
+    most = int(np.abs(pushed).argmax()) if pushed.size else 0
     per_body = pushed.size // len(names) if names else 1
     directions = ("along x", "along y", "turning")
     which = f"body {names[most // 3]}" if per_body == 3 else "some body"

@@ -258,7 +258,7 @@ def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
     """Count the nodes of a block of cells; the centre, if it is there, is one."""
     has_centre = rings.stop == disc.radii.size
     lines = rings.stop - rings.start + (not has_centre)
-    return (angles.stop - angles.start + 1) * lines + has_centre
+    return int((angles.stop - angles.start + 1) * lines + has_centre)
 
 
 def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
