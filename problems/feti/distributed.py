@@ -316,6 +316,12 @@ class RankOperator:
             Y = self.local.packed.multiplied(blocks, X)
         return rows.times(Y)
 
+    def onto_rows(self) -> Product:
+        """Make the orthogonal projector onto the range of B:  x ↦ BBᵀ(BBᵀ)⁺x."""
+        of = self.local.packed
+        solve = self._gram_inverse(csr_array(of.B @ of.BT))
+        return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
+
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
         of, ranks = self.local.packed, self.halo.ranks

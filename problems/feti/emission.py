@@ -485,6 +485,11 @@ def _chosen(sequence: list[_Dual]) -> _Dual:
     return iterate_of(sequence, coulomb.iterate, coulomb.step)
 
 
+def dual_of(own: OwnSubdomains) -> QP:
+    """Make this rank's share of the dual; called by all ranks."""
+    return _dual(own).share().qp
+
+
 def _dual(own: OwnSubdomains) -> _Dual:
     rows, domains, ranks = own.rows, own.domains, own.ranks
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
