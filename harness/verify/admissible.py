@@ -6,7 +6,7 @@ be held, and a mortar row couples several.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -271,14 +271,7 @@ def _compliance(
 
 
 def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
-    """Find λ̂ near `multipliers` with Rᵀ(f − Bᵀλ̂ − Ku) = 0; R is what is felt.
-
-    Both are within their bounds: λ̂ ≥ 0 of contact, |λ̂| ≤ g of friction. Nearest
-    relative to their distance from these, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, wᵢ ≈ λᵢ of contact: what
-    balances the load must not act across wide gaps or against a slip, where it would do
-    work. Along motions that λ
-    does not hold, see `held_and_loose`, the load has to vanish up to its rounding, or
-    else all rows have to help, in the end each as much as any other.
+    """Find λ̂ near `multipliers` that balances the load with û, see `Balance.near`.
 
     Raises
     ------
@@ -288,47 +281,45 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
     """
     exact, motions = mechanics.exact, mechanics.motions
-    driven = _driven(mechanics) if motions.free.shape[1] else None
-    if driven is not None:
-        raise UncertifiableError(driven)
-    G = motions.G
-    if not G.shape[1]:
-        return multipliers
-    problem = _Balance(
-        G,
+    free, f, names = motions.free, exact.f, mechanics.names
+    if free.shape[1]:
+        largest = abs(free).max(axis=0).toarray().ravel()
+        along, terms = free.T @ f, abs(free).T @ np.abs(f)
+        if is_driven(along, terms, np.abs(f).sum() * largest):
+            pushed = mechanics.rigid.T @ (free @ along)
+            raise UncertifiableError(driven(pushed, names))
+    return Balance(
+        motions.G,
         np.asarray((abs(exact.B) @ motions.largest).toarray()),
-        motions.felt.T @ exact.f,
-        motions.largest.T @ np.abs(exact.f),
+        motions.felt.T @ f,
+        motions.largest.T @ np.abs(f),
         motions.KR.T @ u,
         exact.lower,
         exact.upper,
-    )
-    w = relative(exact.interior(multipliers))
-    for shares in (w, w + 1e-6, np.ones_like(w)):
-        if (found := problem.solved(multipliers, shares)) is not None:
-            return found
-    raise UncertifiableError(
-        "contact would have to pull to balance the load: some body is driven away "
-        "from all that touches it, and no support holds it"
-        if exact.contact.all()
-        else "contact would have to pull, or friction to exceed its bound, to balance "
-        "the load: some body is driven away, or along, and no support holds it"
-    )
+    ).near(multipliers)
 
 
-def _driven(mechanics: Mechanics) -> str | None:
-    """Say which load nothing can balance; None where there is none."""
-    free, f, rigid = mechanics.motions.free, mechanics.exact.f, mechanics.rigid
-    along, terms = free.T @ f, abs(free).T @ np.abs(f)
-    largest = abs(free).max(axis=0).toarray().ravel()
-    rounding = UNFELT * terms + ROUNDED * np.abs(f).sum() * largest
-    if (np.abs(along) <= rounding).all():
-        return None
-    pushed = np.abs(rigid.T @ (free @ along)) if rigid.size else np.zeros(1)
-    most = int(pushed.argmax())
-    per_body = rigid.shape[1] // len(mechanics.names) if mechanics.names else 1
+def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
+    """Whether there is a load along motions that contact does not feel (q,).
+
+    Parameters
+    ----------
+    along, terms : the load along each, and the sum of the sizes that it is added up of
+    most : what that sum would be if each motion were its largest entry everywhere
+
+    """
+    return bool((np.abs(along) > UNFELT * terms + ROUNDED * most).any())
+
+
+def driven(pushed: Extended, names: Sequence[str]) -> str:
+    """Say which load nothing can balance.
+
+    pushed : (r,) that load along the rigid motions of the bodies, in turn
+    """
+    most = int(np.abs(pushed).argmax()) if pushed.size else 0
+    per_body = pushed.size // len(names) if names else 1
     directions = ("along x", "along y", "turning")
-    which = f"body {mechanics.names[most // 3]}" if per_body == 3 else "some body"
+    which = f"body {names[most // 3]}" if per_body == 3 else "some body"
     return (
         f"nothing balances the load of {which} "
         f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
@@ -356,8 +347,11 @@ def held_and_loose(
     return turn[:h].T, turn[h:].T
 
 
-class _Balance(NamedTuple):
-    """Gᵀλ = load − bent, and how large terms are that G and load are added up from."""
+class Balance(NamedTuple):
+    """Gᵀλ = load − bent, and how large terms are that G and load are added up from.
+
+    Along the rigid motions R that contact feels, it is  Rᵀ(f − Bᵀλ − Ku) = 0.
+    """
 
     G: Extended  #: (m, p)
     G_terms: Extended  #: (m, p)
@@ -367,7 +361,38 @@ class _Balance(NamedTuple):
     lower: Extended  #: (m,) of λ
     upper: Extended  #: (m,)
 
-    def solved(self, multipliers: Extended, w: Extended) -> Extended | None:
+    def near(self, multipliers: Extended) -> Extended:
+        """Find λ̂ near `multipliers` that balances.
+
+        It is within its bounds: λ̂ ≥ 0 of contact, |λ̂| ≤ g of friction. Nearest relative
+        to the distance from these, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, wᵢ ≈ λᵢ of contact: what
+        balances the load must not act across wide gaps or against a slip, where it
+        would do work. Along motions that λ does not hold, see `held_and_loose`, the
+        load has to vanish up to its rounding, or else all rows have to help, in the end
+        each as much as any other.
+
+        Raises
+        ------
+        UncertifiableError
+            When the load drives a motion that contact would have to pull back.
+
+        """
+        if not self.G.shape[1]:
+            return multipliers
+        w = relative(np.minimum(multipliers - self.lower, self.upper - multipliers))
+        for shares in (w, w + 1e-6, np.ones_like(w)):
+            if (found := self._solved(multipliers, shares)) is not None:
+                return found
+        raise UncertifiableError(
+            "contact would have to pull to balance the load: some body is driven away "
+            "from all that touches it, and no support holds it"
+            if np.isinf(self.upper).all()
+            else "contact would have to pull, or friction to exceed its bound, to "
+            "balance the load: some body is driven away, or along, and no support "
+            "holds it"
+        )
+
+    def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Balance by the rows with w > 0; None where that is impossible.
 
         λ̂ is λ + WGν cut off at its bounds, where ν minimises a convex function of as

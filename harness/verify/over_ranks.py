@@ -1,10 +1,15 @@
 """The certificate of torn bodies by the ranks that hold them: no process has the whole.
 
-As `harness.verify.substructured`, of bodies that supports hold, with what other ranks
-have added where a sum says so. Each rank has the components that its subdomains touch.
-Copies of a component on several ranks get the same value on all of them. The rows of
-contact and friction, which are no longer than the sides, are on every rank, and so is
-the coarse problem.
+As `harness.verify.substructured`, with what other ranks have added where a sum says so.
+Each rank has the components that its subdomains touch. Copies of a component on several
+ranks get the same value on all of them. The rows of contact and friction, which are no
+longer than the sides, are on every rank, and so is the coarse problem.
+
+Where contact alone holds a body, its rigid motions R are a few columns of which each
+rank has the rows of its components; products with Rᵀ are sums over all components, in
+extended precision. That is all that λ̂ needs to balance the load (`harness.verify.
+admissible.Balance`): the load along R, and the motion of the rows, which every rank
+has.
 
 K is the sum TᵀK_T T over subdomains here, since nobody has another one: what rounding
 makes of it is no part of the problem.
@@ -18,13 +23,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
 from harness.distributed.vectors import Ranks
-from harness.mechanics import Exact, Extended, Real, Substructures
+from harness.mechanics import Exact, Extended, Real, Substructures, felt_first
 from harness.qp import Vector
 from harness.verify.active_set_refinement import CLOSED, at_bounds, suggested
-from harness.verify.admissible import UncertifiableError, inside_at_rows
+from harness.verify.admissible import (
+    Balance,
+    UncertifiableError,
+    driven,
+    inside_at_rows,
+    is_driven,
+)
 from harness.verify.certificate import (
     Certificate,
     Energies,
@@ -45,8 +56,21 @@ class Contact:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Unheld:
+    """The rigid motions of bodies that supports do not hold, as one rank has them.
+
+    Columns are orthonormal to double precision, in the sum over the components of all
+    ranks.
+    """
+
+    motions: csr_array  #: (n, k) of single bodies, supports or not, in turn
+    left: NDArray[np.float64]  #: (k, r) combinations that move nothing that is held
+    names: tuple[str, ...]  #: of these bodies
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class OwnBodies:
-    """What one rank has of torn bodies that their supports hold."""
+    """What one rank has of torn bodies."""
 
     ranks: Ranks
     parts: Substructures  #: its subdomains; T has a column for each of its components
@@ -57,6 +81,7 @@ class OwnBodies:
     f: Vector  #: (N,) the load of a component is the sum of those of its copies
     held: NDArray[np.int64]  #: (h,) places in `components` of those prescribed
     contact: Contact
+    unheld: Unheld
 
     @cached_property
     def among(self) -> AmongRanks:
@@ -82,7 +107,7 @@ class AmongRanks:
         self.counts = np.ones(own.components.size, dtype=bool)
         self.counts[own.shared] = lowest[self._place[own.shared]] == comm.rank
 
-    def _summed(self, x: NDArray[Any]) -> NDArray[Any]:
+    def summed(self, x: NDArray[Any]) -> NDArray[Any]:
         """Add arrays in the order of the ranks: all get the same digits."""
         parts = np.empty((self._own.ranks.size, *x.shape), dtype=x.dtype)
         self._own.ranks.comm.Allgather(x, parts)
@@ -95,8 +120,12 @@ class AmongRanks:
         exchanged = np.zeros(self._size, dtype=v.dtype)
         exchanged[place[here]] = v[here]
         found = v.copy()
-        found[here] = self._summed(exchanged)[place[here]]
+        found[here] = self.summed(exchanged)[place[here]]
         return found
+
+    def along(self, M: Any, v: NDArray[Any]) -> NDArray[Any]:
+        """Return Mᵀv of the whole (k,), of columns M (n, k), sparse, and v (n,)."""
+        return self.summed(np.asarray(M.T @ np.where(self.counts, v, 0)))
 
     def total(self, *numbers: float) -> list[float]:
         """Add numbers over all ranks."""
@@ -106,7 +135,7 @@ class AmongRanks:
         """Put coefficients of own rigid motions together with those of other ranks."""
         whole = np.zeros(self._own.motions)
         whole[self._own.coarse] = alpha
-        return self._summed(whole)
+        return self.summed(whole)
 
     def own(self, alpha: Vector) -> Vector:
         """Take the coefficients of own rigid motions."""
@@ -118,7 +147,7 @@ class AmongRanks:
         counted = self.counts[places[here]]
         found = np.zeros(at.size, dtype=v.dtype)
         found[np.flatnonzero(here)[counted]] = v[places[here][counted]]
-        return self._summed(found)
+        return self.summed(found)
 
     def places(
         self, at: NDArray[np.int64]
@@ -180,6 +209,8 @@ def certify_over_ranks(
     u[own.held] = 0
     at = np.unique(own.contact.rows.indices).astype(np.int64)
     exact, softness = _at_rows(own, at)
+    rigid = _rigid_motions(own, exact, at)
+    u = rigid.without_free(own, u)
     trace = own.among.traced(u, at)
     raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
     states = suggested(exact, trace, raw)
@@ -188,7 +219,9 @@ def certify_over_ranks(
     for lam, closed in (tidied, (raw, np.zeros(raw.size, dtype=bool))):
         try:
             found.append(
-                _proof(own, exact, (at, softness, trace), u, lam, closed, claimed)
+                _proof(
+                    own, exact, rigid, (at, softness, trace), u, lam, closed, claimed
+                )
             )
         except UncertifiableError as e:
             why.append(str(e))
@@ -222,21 +255,126 @@ def _at_rows(own: OwnBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     ), softness  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _RigidMotions:
+    """The rigid motions that supports leave, and what contact must do about them.
+
+    As `harness.mechanics.RigidMotions`, columns are orthonormal in extended precision,
+    in the sum over the components of all ranks. K of subdomains is exactly zero along
+    them.
+    """
+
+    #: (n, r) sparse, of own components. Contact rows open or close along the first p,
+    #: which are *felt*; along the others, *free*, no gap changes but for rounding
+    all: Any
+    at_rows: NDArray[np.float64]  #: (w, p) felt ones, of the components that rows touch
+    together: NDArray[np.float64]  #: (motions, r) coefficients of R of all subdomains
+    balance: Balance  #: of the load along felt ones
+    driven: str = ""  #: which load along free ones nothing can balance, if there is one
+
+    def still(self, own: OwnBodies, v: NDArray[Any]) -> NDArray[Any]:
+        """Take the rigid motions out of v (n,), a displacement of own components."""
+        if not self.all.shape[1]:  # sparse matrices take long over nothing
+            return v
+        return np.asarray(v - self.all @ own.among.along(self.all, v))
+
+    def without_free(self, own: OwnBodies, v: Extended) -> Extended:
+        """Take the free motions out of v (n,)."""
+        p, r = self.at_rows.shape[1], self.all.shape[1]
+        if p == r:
+            return v
+        along = own.among.along(self.all, v)
+        along[:p] = 0
+        return np.asarray(v - self.all @ along)
+
+    def moved(self, v: Extended, alpha: Extended) -> Extended:
+        """Add felt motions with the coefficients alpha (p,) to v (n,)."""
+        if not alpha.size:
+            return v
+        free = np.zeros(self.all.shape[1] - alpha.size)
+        return np.asarray(v + self.all @ np.append(alpha, free))
+
+
+def _rigid_motions(
+    own: OwnBodies, exact: Exact, at: NDArray[np.int64]
+) -> _RigidMotions:
+    """Split the rigid motions by whether rows feel them at the components `at` (w,)."""
+    among, parts, unheld = own.among, own.parts, own.unheld
+
+    if not unheld.left.shape[1]:
+        none, rows = csr_array((own.components.size, 0)), exact.c.size
+        return _RigidMotions(
+            none, np.zeros((at.size, 0)), np.zeros((own.motions, 0)),
+            Balance(*np.zeros((2, rows, 0)), *np.zeros((3, 0)), *np.zeros((2, rows))),
+        )  # fmt: skip
+
+    def seen(R: Any) -> NDArray[Any]:
+        """Tell all ranks columns (n, k) at these components: (w, k)."""
+        columns = (R[:, [k]].toarray().ravel() for k in range(R.shape[1]))
+        return np.stack([among.traced(column, at) for column in columns], axis=1)
+
+    free = np.ones(own.components.size)
+    free[own.held] = 0
+    R = csr_array(diags_array(free) @ unheld.motions @ csr_array(unheld.left))
+    turn, p = felt_first(own.contact.rows[:, at], seen(R))
+    R = _orthonormal(own, csr_array(R @ csr_array(turn)))
+    largest, R_at = _largest(own, R), seen(R)
+    f = among.completed(parts.spread.T @ own.f.astype(Real))
+    size, along = np.abs(f), among.along(R, f)
+    total = among.summed(size[among.counts].sum(keepdims=True))
+    why, terms = "", among.along(abs(R), size)
+    if is_driven(along[p:], terms[p:], total * largest[p:]):
+        along_free = np.append(np.zeros(p), along[p:])
+        why = driven(among.along(unheld.motions, R @ along_free), unheld.names)
+    own_motions = csr_array(parts.kernel.T @ (parts.spread @ R.astype(np.float64)))
+    together = [among.gathered(column) for column in own_motions.toarray().T]
+    felt = R_at[:, :p]
+    return _RigidMotions(
+        R, felt.astype(np.float64), np.stack(together, axis=1),
+        Balance(
+            np.asarray(exact.B @ felt),
+            np.asarray(abs(exact.B) @ np.where(felt, largest[:p], 0)),
+            along[:p], (among.along(R != 0, size) * largest)[:p],
+            np.zeros(p, dtype=Real), exact.lower, exact.upper,
+        ),
+        why,
+    )  # fmt: skip
+
+
+def _orthonormal(own: OwnBodies, R: csr_array) -> Any:
+    """Orthonormalise columns (n, r) that are so to double precision; sparse."""
+    R = csr_array(R.astype(Real))
+    counted = R[own.among.counts]
+    gram = own.among.summed((counted.T @ counted).toarray())
+    return csr_array(R + R @ csr_array(0.5 * (np.eye(R.shape[1]) - gram)))
+
+
+def _largest(own: OwnBodies, R: Any) -> Extended:
+    """Return the largest size in each column (k,) on all ranks."""
+    found = abs(csc_array(R))
+    sizes = found.max(axis=0).toarray().ravel() if found.nnz else np.zeros(R.shape[1])
+    return np.asarray(np.max(own.ranks.comm.allgather(sizes), axis=0))
+
+
 def _proof(
-    own: OwnBodies, exact: Exact, trace: tuple[NDArray[np.int64], Vector, Extended],
+    own: OwnBodies, exact: Exact, rigid: _RigidMotions,
+    trace: tuple[NDArray[np.int64], Vector, Extended],
     u: Extended, lam: Extended, closed: NDArray[np.bool_], claimed: Vector,
 ) -> Certificate:  # fmt: skip
     """Evaluate (1) and (3) of `harness.verify.certificate` for the pair mended."""
     at, softness, start = trace
-    none = np.zeros((at.size, 0))
-    found = inside_at_rows(exact, none, softness, start, closed)
+    found = inside_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
         raise UncertifiableError("the answer penetrates beyond repair")
+    if rigid.driven:
+        raise UncertifiableError(rigid.driven)
+    lam = rigid.balance.near(lam)
     places, here = own.among.places(at)
-    feasible = u * found.theta
-    feasible[places[here]] = found.u[here]
+    feasible = rigid.moved(u * found.theta, found.u[at.size :])
+    feasible[places[here]] = found.u[: at.size][here]
     parts, among, T = own.parts, own.among, own.parts.spread
-    torn = times_rows(T.data, T.indices, T.indptr, feasible)
+    still = rigid.still(own, feasible)
+    torn = times_rows(T.data, T.indices, T.indptr, still)
     pull = parts.product(torn)
     square = torn @ pull
     pull -= own.f
@@ -245,16 +383,16 @@ def _proof(
     )
     rho[places[here]] += (exact.B.T @ lam)[here]
     rho[own.held] = 0
-    near = neighbour(
-        parts, own.held, rho.astype(np.float64), np.zeros((own.motions, 0)), among
-    )
-    moved = parts.spread @ (claimed - feasible).astype(np.float64)
+    near = neighbour(parts, own.held, rho.astype(np.float64), rigid.together, among)
+    moved = rigid.still(own, claimed - feasible).astype(np.float64)
+    moved = parts.spread @ moved
     energies = among.total(
         float(square), float(torn @ near.Kd), float(near.d @ near.Kd),
         float(moved @ parts.product(moved)), float(moved @ near.Kd), near.left,
     )  # fmt: skip
+    motion = exact.motion(found.u[: at.size])
     return torn_certificate(
-        exact, False, u=feasible, multipliers=lam, off=near.d,
-        works=exact.friction_work(found.u) - lam * exact.motion(found.u),
+        exact, rigid.all.shape[1] > 0, u=feasible, multipliers=lam, off=near.d,
+        works=exact.friction_work(found.u[: at.size]) - lam * motion,
         energies=Energies(*energies),
     )  # fmt: skip

@@ -14,9 +14,10 @@ several ranks have, one forms the explicit blocks, and sends them to the others.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,7 +76,8 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
     touches.data[:] = 1
-    rank = balanced(csr_array(touches.T @ touches), _work(B, domains), ranks)
+    work, size = _work(B, domains), np.diff(domains.start)
+    rank = balanced(csr_array(touches.T @ touches), work, size, ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
@@ -99,10 +101,19 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.kind]
 
 
+EVEN = 1.1  #: largest/mean of what ranks do, or hold, that is good enough
+SEEDS = 12  #: of METIS, that are tried
+SHARES = (0.25, 0.5, 1.0)  #: of size in the weight, beside work
+
+
 def balanced(
-    graph: csr_array, work: NDArray[np.int64], ranks: int
+    graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
-    """Partition the graph of subdomains that share rows, by work (S,).
+    """Partition the graph of subdomains that share rows, by work and size (S,).
+
+    METIS balances one weight: first the work. Where ranks hold uneven parts then, as
+    where few subdomains have most of the work, it weighs both in several ways, and of
+    what leaves the work even the partition with the most even sizes is taken.
 
     graph : (S, S) how many rows they share
     """
@@ -113,15 +124,36 @@ def balanced(
         )
     if ranks == 1:
         return np.zeros(work.size, dtype=np.int64)
-    import pymetis  # late: one process needs none
-
     graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
-    unit = max(int(work.min()), 1)
-    _, found = pymetis.part_graph(
-        ranks, xadj=graph.indptr, adjncy=graph.indices, eweights=graph.data,
-        vweights=work // unit, recursive=True,
+
+    def uneven(weight: NDArray[np.int64], rank: NDArray[np.int64]) -> float:
+        sums = np.bincount(rank, weight, minlength=ranks)
+        return float(sums.max() / sums.mean())
+
+    rank = _partitioned(graph, work // max(int(work.min()), 1), ranks)
+    best = uneven(size, rank)
+    for seed, share in product(range(SEEDS), SHARES):
+        if best <= EVEN:
+            break
+        weight = work / work.mean() + share * size / size.mean()
+        other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
+        if uneven(work, other) <= EVEN and uneven(size, other) < best:
+            rank, best = other, uneven(size, other)
+    return rank
+
+
+def _partitioned(
+    graph: csr_array, weight: NDArray[np.int64], ranks: int, seed: int | None = None
+) -> NDArray[np.int64]:
+    """Partition a graph by weights (S,), by METIS."""
+    from pymetis import CSRAdjacency, Options, part_graph  # late: one rank needs none
+
+    _, found = part_graph(
+        ranks, CSRAdjacency(graph.indptr, graph.indices), eweights=graph.data,
+        vweights=weight, recursive=True,
+        options=Options() if seed is None else Options(seed=seed),
     )  # fmt: skip
     rank = np.array(found, dtype=np.int64)
     for idle in np.setdiff1d(np.arange(ranks), rank):  # few subdomains: each gets one
@@ -289,6 +321,12 @@ class RankOperator:
             Y = self.local.packed.multiplied(blocks, X)
         return rows.times(Y)
 
+    def onto_rows(self) -> Product:
+        """Make the orthogonal projector onto the range of B:  x ↦ BBᵀ(BBᵀ)⁺x."""
+        of = self.local.packed
+        solve = self._gram_inverse(csr_array(of.B @ of.BT))
+        return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
+
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
         of, ranks = self.local.packed, self.halo.ranks
@@ -450,20 +488,24 @@ def meanwhile(tasks: Mapping[str, Forming], rank: int) -> int:
     """
     factors: dict[int, float] = {}
     for task in tasks.values():
-        made = (1 - AFTER_FACTOR) * task.work
-        factors[task.factor] = factors.get(task.factor, 0.0) + made
+        if len(task.have) > 1:
+            made = (1 - AFTER_FACTOR) * task.work
+            factors[task.factor] = factors.get(task.factor, 0.0) + made
     giving = [factors[t.factor] for t in tasks.values() if t.factor != t.blocks]
     left = max(giving, default=np.inf) - factors.get(rank, 0.0)
-    own = [t.work for t in tasks.values() if t.factor == t.blocks == rank]
-    ends = AFTER_FACTOR * (np.cumsum(own) - np.array(own) / 2)
-    return int(np.count_nonzero(ends < left))
+    own = [t for t in tasks.values() if t.factor == t.blocks == rank]
+    takes = [t.work * (AFTER_FACTOR if len(t.have) > 1 else 1.0) for t in own]
+    return int(np.count_nonzero(np.cumsum(takes) - np.array(takes) / 2 < left))
 
 
-def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]:
+def condensed_by_ranks(
+    groups: Sequence[Group], ranks: Ranks
+) -> Iterator[tuple[int, Condensed]]:
     """Form the blocks of equal groups on one of the ranks that have them.
 
-    Factors that are given away are sent when those who give them have made all of
-    theirs. Who has made its own before has formed some blocks meanwhile.
+    Factors that are given away are sent when those who give them have made all that
+    several ranks need. Who has made its own before has formed some blocks meanwhile.
+    What one rank alone has is formed whole in its turn, and not kept.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     ours = dict(zip(names, groups, strict=True))
@@ -473,21 +515,32 @@ def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]
     given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
     taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
     kept = [n for n, t in tasks.items() if t.factor == me == t.blocks]
+    alone = {n for n in kept if len(tasks[n].have) == 1}
+    place = {name: i for i, name in enumerate(names)}
+    factors = {
+        n: ours[n].kind.border_factor(ours[n].touched)
+        for n in given + kept if n not in alone
+    }  # fmt: skip
+    found = dict[str, Condensed]()
 
-    def blocks(some: list[str]) -> dict[str, Condensed]:
-        return {n: ours[n].kind.blocks(ours[n].touched, factors[n]) for n in some}
+    def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
+        for n in some:
+            kind, touched = ours[n].kind, ours[n].touched
+            if n in alone:
+                yield place[n], kind.condensed(touched)
+            else:
+                found[n] = kind.blocks(touched, factors.pop(n))
 
-    factors = {n: ours[n].kind.border_factor(ours[n].touched) for n in given + kept}
     before = meanwhile(tasks, me)
-    found = blocks(kept[:before])
+    yield from formed(kept[:before])
     came = _exchanged(
         ranks,
         [(tasks[n].blocks, np.ascontiguousarray(factors[n].T)) for n in given],
         [(tasks[n].factor, (border[n], border[n])) for n in taken],
     )
     factors |= {n: L.T for n, L in zip(taken, came, strict=True)}
-    found |= blocks(kept[before:] + taken)
-    made = {n: np.stack(found[n]) for n in found if len(tasks[n].have) > 1}
+    yield from formed(kept[before:] + taken)
+    made = {n: np.stack(both) for n, both in found.items()}
     others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
     to = [(r, n) for n in tasks if n in made for r in tasks[n].have if r != me]
     came = _exchanged(
@@ -496,7 +549,7 @@ def condensed_by_ranks(groups: Sequence[Group], ranks: Ranks) -> list[Condensed]
         [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
     )
     found |= {n: Condensed(*both) for n, both in zip(others, came, strict=True)}
-    return [found[name] for name in names]
+    yield from ((place[n], blocks) for n, blocks in found.items())
 
 
 def _exchanged(

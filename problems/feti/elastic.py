@@ -278,7 +278,7 @@ def in_parts(
 
     return ProblemInParts(
         layout=layout, components=2, material=layout.body,
-        kind=partial(elastic_kind, D=D, E=E), E=E,
+        kind=partial(elastic_kind, D=D, E=E), E=E, names=names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         held=fixed,
         load=forces_at(load[0], load[1] / force), glue=glue,

@@ -104,6 +104,7 @@ class ProblemInParts:
     material: Integers  #: (S,) of each subdomain
     kind: Callable[[Part], Kind]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
+    names: tuple[str, ...]  #: of the bodies
     #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
     #: `problems.feti.structured.Layout.shaping`; None for 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
@@ -217,6 +218,16 @@ class OwnSubdomains:
             )
         return Subdomains(tuple(kinds), kind), rotation
 
+    @property
+    def floating(self) -> OwnSubdomains:
+        """Hold the same with supports that are rows: all its subdomains float."""
+        if not self.problem.eliminated:
+            return self
+        found = replace(self, problem=replace(self.problem, eliminated=False))
+        same = ("number", "nodes", "_classified")  # none depends on how it is held
+        vars(found).update({name: getattr(self, name) for name in same})
+        return found
+
     @cached_property
     def domains(self) -> Subdomains:
         """Its subdomains on their own."""
@@ -274,6 +285,12 @@ class OwnSubdomains:
         for number, count in self.ranks.comm.allgather(own):
             found[number] = count
         return np.concatenate([[0], np.cumsum(found)])
+
+    @property
+    def own_motions(self) -> NDArray[np.int64]:
+        """Number its rigid motions among those of all subdomains."""
+        first, end = self.motions[self.number], self.motions[self.number + 1]
+        return np.concatenate([np.arange(*m) for m in zip(first, end, strict=True)])
 
     @property
     def coarse(self) -> int:
@@ -473,6 +490,11 @@ def _chosen(sequence: list[_Dual]) -> _Dual:
     return iterate_of(sequence, coulomb.iterate, coulomb.step)
 
 
+def dual_of(own: OwnSubdomains) -> QP:
+    """Make this rank's share of the dual; called by all ranks."""
+    return _dual(own).share().qp
+
+
 def _dual(own: OwnSubdomains) -> _Dual:
     rows, domains, ranks = own.rows, own.domains, own.ranks
     at = halo(ranks, rows.number, rows.reach, owners(rows.number, rows.reach))
@@ -555,7 +577,7 @@ def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
 
 
 def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
-    """Give subdomains to ranks (S,), so that these do alike much and share few rows.
+    """Give subdomains to ranks (S,), so that these do and hold alike much.
 
     Raises
     ------
@@ -581,7 +603,7 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
     )
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    return balanced(csr_array(graph), (d * touched) ** 2, ranks)
+    return balanced(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
 
 
 def _rows(own: OwnSubdomains) -> _Rows:

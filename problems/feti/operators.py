@@ -29,7 +29,7 @@ it, and 3.7 without, as it is if B holds the rows of that face alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -68,9 +68,9 @@ class Group(NamedTuple):
     touched: Nodes  #: b (n_g,) components within each, ascending
 
 
-def condensed(groups: Sequence[Group]) -> list[Condensed]:
-    """Form (K⁺)_bb and S_bb of each group."""
-    return [group.kind.condensed(group.touched) for group in groups]
+def condensed(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
+    """Form (K⁺)_bb and S_bb of each group, when it is asked for, with its place."""
+    return ((i, g.kind.condensed(g.touched)) for i, g in enumerate(groups))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +169,8 @@ class DualOperator:
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
     equalities: int  #: rows that are equations, the first ones; the others are contact
-    #: forms (K⁺)_bb and S_bb of groups that are explicit
-    condense: Callable[[Sequence[Group]], list[Condensed]] = condensed
+    #: forms (K⁺)_bb and S_bb of explicit groups, in any order, with their places
+    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = condensed
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
@@ -259,10 +259,11 @@ class DualOperator:
     def _blocks(self) -> list[tuple[Any, Any]]:
         """(K⁺)_bb and S_bb of each group: matrices, or what multiplies with them."""
         groups = self.packed.groups
-        formed = iter(self.condense([g for g in groups if g.explicit]))
-        return [
-            _explicit(g, next(formed)) if g.explicit else _implicit(g) for g in groups
-        ]
+        found = {i: _implicit(g) for i, g in enumerate(groups) if not g.explicit}
+        places = [i for i, g in enumerate(groups) if g.explicit]
+        for at, blocks in self.condense([groups[i] for i in places]):
+            found[places[at]] = _explicit(groups[places[at]], blocks)
+        return [found[i] for i in range(len(groups))]
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:

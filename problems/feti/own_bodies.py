@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import bsr_array, csr_array
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+from scipy.sparse import bsr_array, csr_array, hstack
 
 from harness import Solution, Vector
 from harness.distributed.vectors import Answered
-from harness.verify.over_ranks import Contact, OwnBodies
+from harness.verify.over_ranks import Contact, OwnBodies, Unheld
 from problems.fem.mesh import Nodes
 from problems.feti.distributed import Halo
+from problems.feti.subdivision import Points
 from problems.feti.substructures import LocalProblems
 from problems.feti.torn import Torn
 
@@ -65,16 +68,17 @@ def own_solution(
     """Go back from multipliers to displacements, on each rank for its own.
 
     It is the way of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
-    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks.
+    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
+    supports eliminate are zero.
 
     scale : (m,) by which the rows of contact and friction are multiplied
     """
-    rows = own.rows
-    bodies, times = _bodies(own)
-    T, R = bodies.parts.spread, bodies.parts.kernel
+    bodies, times = _bodies(own.floating)
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[own.own_motions]
     touched = halo.gathered(np.asarray(s.x))
-    v = own.domains.inverse(own.f - rows.B.T @ touched)
-    v -= R @ np.asarray(s.y)[bodies.coarse]
+    v = np.zeros(T.shape[0])
+    v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
+    v[own.kept] -= own.domains.kernel @ alpha
     u = bodies.among.completed(T.T @ v) / times
     z = contact_multipliers(own, halo, scale, s)
     return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
@@ -100,47 +104,42 @@ def answers(
 ) -> Callable[[Solution], Answered]:
     """Make what says what an answer means, on each rank for its own.
 
-    Where the supports leave a rigid motion of some body, only the whole knows what
-    holds it; where they are eliminated, subdomains do not float, as is taken here.
-
     Parameters
     ----------
     scale : as of `own_solution`
     torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
 
     """
-    problem, is_held = own.problem, holds_all(own.problem)
+    problem = own.problem
 
     def answer(s: Solution) -> Answered:
-        if problem.eliminated:
-            return Answered(None, None)
         found, results = own_solution(own, halo, scale, s), None
         if (reported := problem.results) is not None:
 
             def results() -> Mapping[str, Any]:
                 return {**reported(found), **torn}
 
-        return Answered(
-            (found.bodies, found.u, found.z[_carrying(problem)]) if is_held else None,
-            results,
-        )
+        return Answered((found.bodies, found.u, found.z[_carrying(problem)]), results)
 
     return answer
 
 
 def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
-    """Gather what this rank has, and count the copies (n,) of its components."""
+    """Gather what this rank has, and count the copies (n,) of its components.
+
+    own : its subdomains float
+    """
     problem, domains, rows = own.problem, own.domains, own.rows
     d, contact, kept = problem.components, problem.contact, _carrying(problem)
-    nodes, of_node = np.unique(own.nodes.number, return_inverse=True)
+    nodes, copy, of_node = np.unique(
+        own.nodes.number, return_index=True, return_inverse=True
+    )
     components, place = (
         (d * at[:, None] + np.arange(d)).ravel() for at in (nodes, of_node)
     )
     times = np.empty(components.size)
     times[place] = own.times
     T = _spread(own, place, components.size)
-    first, end = own.motions[own.number], own.motions[own.number + 1]
-    coarse = [np.arange(*motions) for motions in zip(first, end, strict=True)]
     torn = Torn(
         kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
         scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
@@ -148,13 +147,14 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     return OwnBodies(
         ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
         shared=np.bincount(place, minlength=times.size) < times,
-        coarse=np.concatenate(coarse),
+        coarse=own.own_motions,
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(
             rows=csr_array(contact.rows[kept]), c=contact.c[kept],
             bound=contact.bound[contact.bound > 0],
         ),
+        unheld=_unheld(own, copy),
     ), times  # fmt: skip
 
 
@@ -178,20 +178,96 @@ def _carrying(problem: ProblemInParts) -> Nodes:
 
 def holds_all(problem: ProblemInParts) -> bool:
     """Whether the supports leave no rigid motion of any body."""
+    return not _unheld_bodies(problem)
+
+
+def _unheld_bodies(problem: ProblemInParts) -> list[int]:
+    """List the bodies that supports leave some rigid motion."""
     of, d = problem.layout, problem.components
-    node, k = np.divmod(problem.held, d)
+    node, axis = np.divmod(problem.held, d)
     body = of.body[of.holder(node)]
-    for b in range(problem.E.size):
+
+    def is_held(b: int) -> bool:
         own = body == b
         if not own.any():
             return False
-        if d == 1:
-            continue
         points = of.position(node[own])
-        size = np.ptp(points, axis=0).max(initial=0.0) or 1.0
-        x, y = ((points - points[:1]) / size).T
-        along_x = k[own] == 0
-        motions = np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
-        if np.linalg.matrix_rank(motions) < 3:
-            return False
-    return True
+        size = np.ptp(points, axis=0).max() or 1.0
+        motions = _motions((points - points[0]) / size, axis[own], d)
+        return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
+
+    return [b for b in range(problem.E.size) if not is_held(b)]
+
+
+def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+    """Return the rigid motions of components of points, (k, 1) or (k, 3).
+
+    axis : (k,) of each component, one of d
+    """
+    if d == 1:
+        return np.ones((len(points), 1))
+    x, y = points.T
+    along_x = axis == 0
+    return np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
+
+
+class _Extent(NamedTuple):
+    """Where a body is, and how large, by its N nodes."""
+
+    centre: Vector  #: (2,)
+    radius: float  #: √ of the mean square distance from it
+    size: float  #: √N
+
+    def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+        """Return its rigid motions, orthonormal in the sum over all nodes."""
+        return _motions((points - self.centre) / self.radius, axis, d) / self.size
+
+
+def _unheld(own: OwnSubdomains, copy: Nodes) -> Unheld:
+    """Gather the rigid motions of the bodies that supports leave any.
+
+    copy : (n/d,) of each own node, in turn, a copy among the own torn nodes
+    """
+    problem, of, d = own.problem, own.problem.layout, own.problem.components
+    components = d * copy.size
+    motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
+    if not (unheld := _unheld_bodies(problem)):
+        return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
+    points = np.concatenate([*of.points(own.number)])
+    body = of.body[own.number][own.nodes.subdomain]
+    held, axis = np.divmod(problem.held, d)
+    body_held = of.body[of.holder(held)]
+    for b in unheld:
+        extent = _extent(own, points, np.where(body == b, 1 / own.nodes.times, 0.0))
+        of_body = body_held == b
+        at_held = extent.motions(of.position(held[of_body]), axis[of_body], d)
+        left.append(null_space(at_held) if of_body.any() else np.eye(at_held.shape[1]))
+        mine = np.flatnonzero(body[copy] == b)
+        at = np.repeat(points[copy[mine]], d, axis=0)
+        found = extent.motions(at, np.tile(np.arange(d), mine.size), d)
+        rows = (d * mine[:, None] + np.arange(d)).ravel()
+        one = csr_array(
+            (np.ones(rows.size), (rows, np.arange(rows.size))),
+            shape=(components, rows.size),
+        )
+        motions.append(one @ csr_array(found))
+        names.append(problem.names[b])
+    return Unheld(
+        motions=csr_array(hstack(motions)), left=block_diag(*left), names=tuple(names)
+    )
+
+
+def _extent(own: OwnSubdomains, points: Points, share: Vector) -> _Extent:
+    """Measure a body whose nodes all ranks have; called by all of them.
+
+    Parameters
+    ----------
+    points : of own torn nodes (M, 2)
+    share : (M,) of all copies of a node, which add up to one in the body
+
+    """
+    total = own.ranks.total
+    count, *moments = total(np.append(share.sum(), share @ points))
+    centre = np.array(moments) / count
+    spread = total(np.array([share @ ((points - centre) ** 2).sum(axis=1)]))[0]
+    return _Extent(centre, float(np.sqrt(spread / count)), float(np.sqrt(count)))

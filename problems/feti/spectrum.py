@@ -26,6 +26,9 @@ from scipy.sparse import csc_matrix, csr_array
 from sksparse.cholmod import cholesky
 
 from harness import Vector
+from harness.distributed.vectors import DistributedColumns
+from problems.fem.mesh import Nodes
+from problems.feti.distributed import RankOperator
 from problems.feti.operators import dual_operator, inverted_blocks, made, uncoupled
 from problems.feti.torn import Torn
 
@@ -90,8 +93,9 @@ def projector(G: csr_array, B: csr_array) -> Product:
 
 
 def spectrum(
-    F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5
-) -> Spectrum:
+    F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5,
+    *, rows: Nodes | None = None, total: Product = np.asarray,
+) -> Spectrum:  # fmt: skip
     """Find the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
     Parameters
@@ -100,28 +104,36 @@ def spectrum(
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
     tol : error bound of both eigenvalues, relative
+    rows : components that this rank has, of n; all of them unless given
+    total : adds numbers (k,) over all ranks, which get the same
 
     """
+    own = np.arange(n) if rows is None else rows
+
+    def dot(x: Vector, y: Vector) -> float:
+        return float(total(np.atleast_1d(x @ y))[0])
+
     #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + np.arange(n) ** 2))
-    V = np.empty((_CHUNK, n))
+    v = P(np.sin(1.0 + own**2))
+    V = np.empty((_CHUNK, own.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
-    length = float(np.sqrt(v @ Wv))
+    length = float(np.sqrt(dot(v, Wv)))
     for k in range(n):
         if k == len(V):
-            V = np.concatenate([V, np.empty((_CHUNK, n))])
-            WV = V if M is None else np.concatenate([WV, np.empty((_CHUNK, n))])
+            more = np.empty((_CHUNK, own.size))
+            V = np.concatenate([V, more])
+            WV = V if M is None else np.concatenate([WV, more])
         V[k], WV[k] = v / length, Wv / length
         v = image(WV[k])
-        alpha.append(float(v @ WV[k]))
+        alpha.append(dot(v, WV[k]))
         v -= alpha[-1] * V[k] + (beta[-1] * V[k - 1] if k else 0.0)
-        v = P(v - (WV[: k + 1] @ v) @ V[: k + 1])
+        v = P(v - total(WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
-        length = float(np.sqrt(max(float(v @ Wv), 0.0)))
+        length = float(np.sqrt(max(dot(v, Wv), 0.0)))
         over = length <= EXHAUSTED * max(alpha)
         if over or k % CHECKED == CHECKED - 1 or k == n - 1:
             found = ritz_bounds(np.array(alpha), np.array(beta), length)
@@ -150,6 +162,44 @@ def spectra_of_equations(
     P = projector(csr_array((B_E @ torn.domains.kernel).T), B_E)
     inverses = [p and F.preconditioner(*p) for p in preconditioners]
     return [spectrum(F, P, m, M, tol) for M in inverses]
+
+
+def spectra_over_ranks(
+    F: RankOperator,
+    G: DistributedColumns,
+    preconditioners: Sequence[tuple[str, str] | None] = (None,),
+    tol: float = 1e-5,
+) -> list[Spectrum]:
+    """Find what `spectra_of_equations` does, of a dual that ranks have made.
+
+    Called by all ranks, which get the same.
+
+    Parameters
+    ----------
+    F, G : of the dual of bodies that nothing touches
+
+    """
+    at, ranks = F.halo, F.halo.ranks
+    m, within = ranks.total(np.array([float(at.own.size)]))[0], F.onto_rows()
+    coarse = cholesky(csc_matrix(G.gram())) if G.shape[0] else None
+
+    def project(x: Vector) -> Vector:
+        y = within(x)
+        if coarse is not None:
+            y -= np.asarray(G.T @ coarse(G @ y))
+        return y
+
+    def plain(A: Product) -> Product:
+        return lambda x: np.asarray(A(x))
+
+    inverses = [p and plain(F.preconditioner(*p)) for p in preconditioners]
+    return [
+        spectrum(
+            plain(F), project, int(m), M, tol,
+            rows=at.rows[at.own], total=ranks.total,
+        )
+        for M in inverses
+    ]  # fmt: skip
 
 
 def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:

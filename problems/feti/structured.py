@@ -132,6 +132,12 @@ class Layout:
         )  # fmt: skip
         return first[0], first[1], last[0] - first[0] + 1, last[1] - first[1] + 1
 
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Count the nodes of each block, (S,)."""
+        _, _, columns, rows = self.corner(np.arange(self.count))
+        return np.asarray(columns * rows, dtype=np.int64)
+
     def torn_nodes(self, subdomains: Nodes) -> TornNodes:
         """List the nodes of some blocks, row by row."""
         left, low, columns, rows = self.corner(subdomains)

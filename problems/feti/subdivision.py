@@ -54,6 +54,10 @@ class Subdivision(Protocol):
     def body(self) -> Integers:
         """Body of each subdomain, (S,)."""
 
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Count the nodes of each subdomain, (S,)."""
+
     def torn_nodes(self, subdomains: Nodes) -> TornNodes:
         """List the nodes of some subdomains."""
 
@@ -101,6 +105,7 @@ class Listed:
 
     nodes: int
     body: Integers  #: (S,)
+    sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
     node: Nodes  #: (k,) listed ones, ascending
     start: NDArray[np.int64]  #: (k + 1,) first holder of each, and l
     held_by: Nodes  #: (l,) subdomains that have it, ascending for each
@@ -242,9 +247,18 @@ def half_discs_in_blocks(
         np.concatenate(around), subdomain, len(every)
     )
     return Listed(
-        nodes=int(first[-1]), body=body, node=node, start=start, held_by=held_by,
+        nodes=int(first[-1]), body=body,
+        sizes=np.array([_nodes(disc, *block) for disc, _, *block in every]),
+        node=node, start=start, held_by=held_by,
         part=part, position=position,
     )  # fmt: skip
+
+
+def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
+    """Count the nodes of a block of cells; the centre, if it is there, is one."""
+    has_centre = rings.stop == disc.radii.size
+    lines = rings.stop - rings.start + (not has_centre)
+    return int((angles.stop - angles.start + 1) * lines + has_centre)
 
 
 def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
@@ -286,6 +300,7 @@ def mesh_in_parts(
         return nodes, corner.reshape(own.shape)
 
     return Listed(
-        nodes=N, body=body[by_label[ends[:-1]]], node=node, start=start,
+        nodes=N, body=body[by_label[ends[:-1]]],
+        sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
         held_by=held_by, part=part, position=points.__getitem__,
     )  # fmt: skip

@@ -149,7 +149,7 @@ class Membranes:
         G = _touching(sides, layout.nodes)
         return ProblemInParts(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
-            kind=membrane_kind, E=np.ones(2), load=self.load, glue=rows,
+            kind=membrane_kind, E=np.ones(2), names=NAMES, load=self.load, glue=rows,
             held=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
             results=self.results,

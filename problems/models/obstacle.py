@@ -131,7 +131,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     return ProblemInParts(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
         kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
-        load=partial(_load, grid, shape), held=held,
+        names=("membrane",), load=partial(_load, grid, shape), held=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
         results=partial(_found_by_ranks, grid, shape),
     )  # fmt: skip

@@ -15,7 +15,7 @@ the held edge do not float, as in FETI-1 (Farhat and Roux 1991).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any
@@ -40,9 +40,14 @@ from problems.fem.mesh import (
     rectangle_grid,
 )
 from problems.feti.elastic import elastic_kind, forces_at
-from problems.feti.emission import Contact, ProblemInParts
+from problems.feti.emission import Contact, ProblemInParts, dual_of
 from problems.feti.gluing import glue, without_supports
-from problems.feti.spectrum import Spectrum, spectra_of_equations
+from problems.feti.own_bodies import OwnSolution
+from problems.feti.spectrum import (
+    Spectrum,
+    spectra_of_equations,
+    spectra_over_ranks,
+)
 from problems.feti.structured import Layout
 from problems.feti.substructures import LocalProblems
 from problems.feti.tearing import blocks, decompose
@@ -133,15 +138,7 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        names = dict(PRECONDITIONERS)
-        uniform = self.moduli[0] == self.moduli[1]  # so that both scalings are one
-        if uniform:
-            del names["dirichlet_stiffness"]
-        found = spectra_of_equations(self.torn, list(names.values()))
-        spectra = dict(zip(names, found, strict=True))
-        return spectra | (
-            {"dirichlet_stiffness": spectra["dirichlet"]} if uniform else {}
-        )
+        return _spectra(self.moduli, partial(spectra_of_equations, self.torn))
 
     @property
     def held(self) -> NDArray[np.int64]:
@@ -152,6 +149,18 @@ class Plate:
         """Factorise K without the prescribed components."""
         free = np.setdiff1d(np.arange(self.mesh.dofs), self.held)
         return regular_inverse(self.primal.P, free)
+
+
+def _spectra(
+    moduli: Vector, find: Callable[[list[tuple[str, str] | None]], list[Spectrum]]
+) -> Mapping[str, Spectrum]:
+    """Find the spectra by the names of `PRECONDITIONERS`."""
+    names = dict(PRECONDITIONERS)
+    uniform = moduli[0] == moduli[1]  # so that both scalings are one
+    if uniform:
+        del names["dirichlet_stiffness"]
+    spectra = dict(zip(names, find(list(names.values())), strict=True))
+    return spectra | ({"dirichlet_stiffness": spectra["dirichlet"]} if uniform else {})
 
 
 @lru_cache(maxsize=4)
@@ -185,13 +194,33 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     column, row = (x.astype(np.int64) for x in layout.block[1:])
     none = np.zeros(0)
     return ProblemInParts(
-        layout=layout, components=2, E=moduli[:1], glue=p["glue"],
+        layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
         load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
+        results=partial(_found_by_ranks, grid, moduli),
     )  # fmt: skip
+
+
+def _found_by_ranks(
+    grid: StructuredGrid, moduli: Vector, found: OwnSolution
+) -> dict[str, Any]:
+    """Report what ranks have found, as `quantities`; called by all of them."""
+    own, dual = found.subdomains, dual_of(found.subdomains)
+    tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]))
+    known = {
+        "nodes": grid.nodes,
+        "elements": int(np.prod(grid.divisions)),
+        "dofs": 2 * grid.nodes,
+        "equality_rows": own.problem.held.size,
+        "energy": found.energy * LOAD * LENGTH,
+        "tip": (found.at(tip) * LENGTH).tolist(),
+    }
+    return known | conditions(
+        _spectra(moduli, partial(spectra_over_ranks, dual.P, dual.A))
+    )
 
 
 def _size(p: Mapping[str, Any]) -> tuple[float, float]:
@@ -267,9 +296,13 @@ def dual_quantities(plate: Plate) -> dict[str, Any]:
     kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
     preconditioners, by multiplicity but for the last. Each has an `…_error`.
     """
-    spectra = plate.spectra
+    torn = torn_quantities(plate.torn, plate.dual.qp)
+    return conditions(plate.spectra) | torn
+
+
+def conditions(spectra: Mapping[str, Spectrum]) -> dict[str, Any]:
+    """Report ‖PFP‖ and condition numbers, see `dual_quantities`."""
     found: dict[str, Any] = {
-        **torn_quantities(plate.torn, plate.dual.qp),
         "norm_PFP": spectra["none"].largest,
         "norm_PFP_error": spectra["none"].largest_error,
     }

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
-from sksparse.cholmod import cholesky
+from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
 from harness import QP, Solution, Status, Vector, kkt_residuals, no_rows
 from harness.distributed.vectors import DistributedColumns, distributed
@@ -51,7 +51,8 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     Raises
     ------
     ArithmeticError
-        When no active set is confirmed, or its point has KKT residuals above 1e-9.
+        When no active set is confirmed, its point has KKT residuals above 1e-9, or
+        equality rows depend on each other on a face.
 
     """
     task = _Task.of(qp)
@@ -160,7 +161,13 @@ class _Task:
         x : where to begin
         """
         free = ~(lower | upper)
-        coarse = cholesky(csc_matrix(self.G.gram(free)))
+        try:
+            coarse = cholesky(csc_matrix(self.G.gram(free)))
+        except CholmodNotPositiveDefiniteError:
+            raise ArithmeticError(
+                "the reference solve over ranks came to a face whose equations depend "
+                "on each other: the open contacts leave some body without hold"
+            ) from None
 
         def spread(t: Vector) -> Vector:
             """Return G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹t."""

@@ -15,13 +15,24 @@ from numpy.typing import NDArray
 
 from harness import Case, Mechanics
 from harness.mechanics import Extended, Real
-from problems.contact.bodies import ContactPair, assemble, clamped, floating, supported
+from problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
 from problems.duality.stepping import primal_qp
 from problems.fem.elasticity import Material
 from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from problems.feti.elastic import in_parts, linearised_by
+from problems.feti.emission import ProblemInParts
+from problems.feti.partition import graph_partition
+from problems.feti.subdivision import mesh_in_parts
 
 PRESSURE = 1e7  #: Pa
 
@@ -46,6 +57,45 @@ def disc_between_plates(
     turn, tilt : angles, of the mesh within the disc and of everything
     push : share of the pressure that acts sideways
     """
+    bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
+    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    return contact_case(
+        bodies, primal, form,
+        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
+        supported=lambda: supported(bodies),
+        quantities=lambda s: quantities(bodies, primal, s),
+    )  # fmt: skip
+
+
+def disc_in_parts(
+    n: int = 4,
+    *,
+    parts: int = 6,
+    rollers: bool = False,
+    tilt: float = 0.0,
+    push: float = 0.0,
+    E: tuple[float, float, float] = (70e9, 200e9, 70e9),
+) -> ProblemInParts:
+    """Describe the dual of `disc_between_plates`, cut into so many parts by METIS."""
+    bodies = _disc_and_plates(n, True, rollers, 0.3, tilt, push, E)
+    mesh, fixed = bodies.mesh, bodies.B_D.indices
+    label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
+    named = np.concatenate([fixed, bodies.interface]) // 2
+    loaded = np.flatnonzero(bodies.f)
+    return in_parts(
+        mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
+        plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
+        fixed=fixed, load=(loaded, bodies.f[loaded] * bodies.force),
+        pairs=bodies.pairs, linearise=linearised_by("nts", "dual"), glue="orthonormal",
+    )  # fmt: skip
+
+
+def _disc_and_plates(
+    n: int, disc_is_slave: bool, rollers: bool, turn: float, tilt: float, push: float,
+    E: tuple[float, float, float],
+) -> Bodies:  # fmt: skip
+    """Assemble the bodies of `disc_between_plates`."""
     lower = rectangle((-1.5, -1.0), (3.0, 1.0), (2 * n, n // 2))
     upper = rectangle((-1.5, 2.0), (3.0, 0.5), (2 * n + 1, n // 3))
     mesh, body = join((
@@ -64,20 +114,12 @@ def disc_between_plates(
         (side["disc_down"], side["lower_top"]),
         (side["disc_up"], side["upper_bottom"]),
     )
-    bodies = assemble(
+    return assemble(
         mesh, body, names=("lower", "disc", "upper"),
         materials=(Material(E[0], 0.33), Material(E[1], 0.3), Material(E[2], 0.33)),
         plane="strain", units=(3.0, 3 * PRESSURE), fixed=np.concatenate(fixed),
         load=(load @ T.T).ravel(),
         pairs=tuple(ContactPair(*(f if disc_is_slave else f[::-1])) for f in faces),
-    )  # fmt: skip
-    rows = linearisation(bodies, contact, basis)(np.zeros(mesh.dofs))
-    primal = primal_qp(bodies, rows)
-    return contact_case(
-        bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
 
 

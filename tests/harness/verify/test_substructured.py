@@ -29,6 +29,7 @@ from problems.feti.substructures import LocalProblems
 from problems.models import beam_ring, hertz, patch
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
+from tests.support.disturbed import DISTURBANCES
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
@@ -112,41 +113,6 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     return Known(mechanics, reference_point(whole, reference_solution))
 
 
-def noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
-    z = s.z + size * np.abs(s.z).max() * rng.standard_normal(s.z.size)
-    return replace(s, x=x, z=z)
-
-
-def scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    a, b = 1 + size * rng.standard_normal(2)
-    return replace(s, x=a * s.x, z=b * s.z)
-
-
-def wrong_rows(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move forces from rows in contact to others."""
-    z, swapped = s.z.copy(), rng.random(s.z.size) < max(size, 1.5 / s.z.size)
-    z[swapped] = rng.permutation(z)[swapped]
-    return replace(s, z=z)
-
-
-def infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Push bodies into each other, move what is held, and let contact pull."""
-    x = s.x * (1 + 10 * size) + size * np.abs(s.x).max() * rng.random(s.x.size)
-    return replace(s, x=x, z=s.z - size * np.abs(s.z).max() * rng.random(s.z.size))
-
-
-def shifted(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move and bend all bodies together."""
-    u = s.x.reshape(-1, 2)
-    bend = np.cumsum(rng.standard_normal(u.shape), axis=0) / len(u) ** 0.5
-    moved = u + size * np.abs(u).max() * (rng.standard_normal(2) + bend)
-    return replace(s, x=moved.ravel())
-
-
-KINDS = (noise, scaled, wrong_rows, infeasible, shifted)
-
-
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
     """Whether no error that the certificate speaks of exceeds what it says."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
@@ -167,7 +133,7 @@ def violations(name: str, count: int) -> tuple[list[str], list[float]]:
     problem, told, sharp = known(name), list[str](), list[float]()
     rng = np.random.default_rng(sum(map(ord, name)))
     for i in range(count):
-        kind, size = KINDS[i % len(KINDS)], 10 ** rng.uniform(-9, 0.3)
+        kind, size = DISTURBANCES[i % len(DISTURBANCES)], 10 ** rng.uniform(-9, 0.3)
         s = kind(problem.solution(), size, rng)
         try:
             found = certify(problem.mechanics, s)

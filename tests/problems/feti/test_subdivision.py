@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from harness.names import parse
+from problems import PROBLEMS
 from problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
+from problems.feti.emission import subdomains_of
 from problems.feti.structured import Layout
 from problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
 from problems.feti.tearing import (
@@ -71,6 +74,12 @@ def test_torn_nodes_are_numbered_as_in_the_torn_mesh(known):
     assert_array_equal(nodes.number, whole.node)
     assert_array_equal(nodes.start, whole.start)
     assert_array_equal(nodes.subdomain, whole.subdomain)
+
+
+def test_nodes_of_subdomains_are_counted_before_they_are_listed(known):
+    of, _, _, whole = known
+
+    assert_array_equal(of.sizes, np.diff(whole.start))
 
 
 def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
@@ -157,3 +166,14 @@ def test_neighbours_are_those_with_common_nodes(known):
 def _around(own):
     for s, mine in enumerate(own):
         yield mine, set().union(*own[:s], *own[s + 1 :])
+
+
+def test_ranks_hold_alike_much_where_few_subdomains_have_most_of_the_work():
+    """A half disc, graded: long boundaries in its middle, most nodes around it."""
+    case = parse("hertz-plane/n=8/halvings=4/feti=16/dual", PROBLEMS)
+    problem = case.family.in_subdomains(case.params)
+    of, rank = problem.layout, subdomains_of(problem, 2)
+
+    for held in (of.sizes, of.glued() ** 2):
+        by_rank = np.bincount(rank, held)
+        assert by_rank.max() < 1.2 * by_rank.mean()

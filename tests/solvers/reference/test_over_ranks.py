@@ -1,0 +1,56 @@
+"""The reference over ranks, on one rank in this process."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness import QP, no_rows
+from harness.distributed.vectors import DistributedColumns, Ranks, distributed
+from solvers.reference.over_ranks import reference_over_ranks
+
+mpi = pytest.importorskip("mpi4py.MPI")
+
+
+class Identity:
+    """F = 1, as operators of torn bodies come."""
+
+    def __init__(self, n, ranks):
+        self.shape, self.ranks = (n, n), ranks
+
+    def __matmul__(self, x):
+        return x.copy()
+
+    def diagonal(self):
+        return distributed(np.ones(self.shape[0]), self.ranks)
+
+    def preconditioner(self, kind, scaling):
+        return np.copy
+
+
+def balance(q, force, moment):
+    """Three contacts at −1, 0 and 1 hold one body:  min ½|x|² + qᵀx,  x ≥ 0."""
+    ranks = Ranks(mpi.COMM_SELF)
+    G = csr_array([[1.0, 1.0, 1.0], [-1.0, 0.0, 1.0]])
+    vectors = (distributed(np.array(v), ranks) for v in (q, 3 * [0.0], 3 * [np.inf]))
+    q, lb, ub = vectors
+    return QP(
+        P=Identity(3, ranks), q=q, A=DistributedColumns(G, ranks),
+        b=np.array([force, moment]), G=no_rows(3), h=np.zeros(0), lb=lb, ub=ub,
+    )  # fmt: skip
+
+
+def test_contacts_that_hold_a_body_have_its_load():
+    """Force 3 and moment 1 leave (t, 2 − 2t, 1 + t), which q is nearest to at t = ½."""
+    q = np.array([-0.5, -1.0, -1.5])
+
+    found = reference_over_ranks(balance(q, 3.0, 1.0))
+
+    np.testing.assert_allclose(np.asarray(found.x), -q, atol=1e-12)
+
+
+def test_a_face_that_leaves_a_body_without_hold_is_named_in_one_line():
+    """Without bounds x = (−2/3, 7/3, −2/3): one contact is left, for two motions."""
+    with pytest.raises(ArithmeticError, match="without hold") as refused:
+        reference_over_ranks(balance([1.0, -2.0, 1.0], 1.0, 0.0))
+
+    assert "\n" not in str(refused.value)

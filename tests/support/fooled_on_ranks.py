@@ -1,0 +1,216 @@
+"""Search for answers whose error exceeds the bound that ranks prove; prints JSON.
+
+Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. The truth is
+the reference point of the whole, which the first rank builds. Every other trial
+disturbs the answer that came nearest to its bound so far.
+
+Without cases, it tells why ranks, and one process, refuse loads that nothing balances.
+"""
+
+import json
+import sys
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from mpi4py import MPI
+
+from harness import Solution, Status, certify
+from harness.distributed.vectors import Ranks
+from harness.mechanics import Real
+from harness.names import parse
+from harness.verify.admissible import UncertifiableError
+from harness.verify.over_ranks import certify_over_ranks
+from harness.verify.references import reference_point
+from problems import PROBLEMS
+from problems.feti.emission import emitted
+from solvers.reference.over_ranks import reference_over_ranks
+from solvers.reference.solve import reference_solution
+from tests.support.disturbed import DISTURBANCES
+from tests.support.held_by_contact import disc_between_plates, disc_in_parts
+
+#: of a disc between plates: what holds it but contact, and where all of it is
+DISCS = {
+    "sliding disc": {}, "disc under rollers": {"rollers": True},
+    "tilted disc": {"tilt": 0.5}, "soft disc": {"E": (70e9, 70e3, 70e9)},
+}  # fmt: skip
+ROUNDED = 1 + 1e-9  #: local solves are those of doubles
+NOISE = 1e-7  #: relative error from which on effectivities are measured
+
+
+class Truth(NamedTuple):
+    """The solution of the whole to rounding; on every rank."""
+
+    u: np.ndarray  #: (n,) extended
+    multipliers: np.ndarray  #: (m,) of contact and friction rows
+    norm: float  #: ‖u‖
+    slack: float  #: ‖error of u‖
+    rigid: np.ndarray  #: (n, 3 bodies) motions of single bodies
+
+
+def posed(name):
+    """Return the problem in parts, and what builds the whole."""
+    if name in DISCS:
+        keys = DISCS[name]
+        return disc_in_parts(**keys), lambda: disc_between_plates(**keys)
+    case = parse(name, PROBLEMS)
+    problem = case.family.in_subdomains(case.params)
+    return problem, lambda: case.build(reference_solution)
+
+
+def true(build, ranks):
+    """Solve the whole on the first rank; its mechanics stay there."""
+    mechanics, told = None, None
+    if ranks.rank == 0:
+        mechanics = build().mechanics.whole
+        point = reference_point(mechanics, reference_solution)
+        told = Truth(
+            point.u, point.multipliers, point.norm, point.bound * point.norm,
+            mechanics.rigid,
+        )  # fmt: skip
+    return mechanics, ranks.comm.bcast(told)
+
+
+def drifted(s, size, rng, rigid):
+    """Move each body on its own, up to a million times as far as it is displaced."""
+    far = 10 ** rng.uniform(0, 6) * size * np.linalg.norm(s.x)
+    return replace(s, x=s.x + rigid @ (far * rng.standard_normal(rigid.shape[1])))
+
+
+def pressed(s, size, rng, rigid):
+    """Press on one row alone, which nothing balances."""
+    z = s.z.copy()
+    if z.size:
+        z[rng.integers(z.size)] += size * np.abs(z).max() * rng.standard_normal()
+    return replace(s, z=z)
+
+
+def jumped(s, size, rng, rigid):
+    """Be wrong on one stretch of nodes, as a rank is that has lost its data."""
+    x, (begin, end) = s.x.copy(), sorted(rng.integers(s.x.size, size=2))
+    x[begin:end] += size * np.abs(s.x).max() * rng.choice([-1, 1])
+    return replace(s, x=x)
+
+
+def disturbed(s, rng, rigid):
+    """Disturb an answer in one way."""
+    size, kind = 10 ** rng.uniform(-9, 0.3), rng.integers(len(DISTURBANCES) + 3)
+    if kind < len(DISTURBANCES):
+        return DISTURBANCES[kind](s, size, rng)
+    return (drifted, pressed, jumped)[kind - len(DISTURBANCES)](s, size, rng, rigid)
+
+
+class Search:
+    """Certificates of answers to one problem, beside their errors."""
+
+    def __init__(self, name, ranks):
+        problem, build = posed(name)
+        self.ranks, self.name = ranks, name
+        self.mechanics, self.truth = true(build, ranks)
+        self.own = problem_of(problem, ranks)
+
+    def errors(self, found, claimed):
+        """Tell all ranks ‖û − u*‖, that of the answer, of the pair, and if û is in."""
+        own, truth = self.own, self.truth
+        told = self.ranks.comm.gather((own.components, found.u))
+        still = None
+        if told is not None:
+            u = np.empty(truth.u.size, dtype=Real)
+            for components, part in told:
+                u[components] = part
+            m = self.mechanics
+            motion, contact = m.exact.motion(u), m.exact.contact
+            inside = (motion[contact] <= 0).all() and not u[m.exact.held].any()
+            lengths = [m.norm(v - truth.u) for v in (u, claimed.astype(Real))]
+            still = *lengths, bool(inside), m.still(u - truth.u)
+        of_u, of_answer, inside, off = self.ranks.comm.bcast(still)
+        jump = own.parts.spread.astype(Real) @ off[own.components] - found.off
+        torn = own.among.total(float(jump @ own.parts.product(jump)))[0]
+        return of_u, of_answer, float(np.hypot(of_u, np.sqrt(max(torn, 0)))), inside
+
+    def tried(self, s):
+        """Certify an answer; returns a fault or "", and the error over its bound."""
+        slack = self.truth.slack
+        try:
+            found = certify_over_ranks(self.own, s.x[self.own.components], s.z)
+        except UncertifiableError as e:
+            return f"none: {e}", 0.0
+        of_u, of_answer, of_pair, inside = self.errors(found, s.x)
+        within = min(found.error, found.bound * self.truth.norm)
+        holds = (
+            inside and of_pair <= ROUNDED * found.pair + 2 * slack
+            and max(of_u, of_answer) <= ROUNDED * within + slack
+        )  # fmt: skip
+        fault = "" if holds else f"bound {found.error:.3e} < {of_answer:.3e}, {of_pair}"
+        return fault, max(of_answer, of_pair) / found.error
+
+    def result(self, count):
+        """Try so many answers; tell faults, and bounds over errors."""
+        rng = np.random.default_rng(sum(map(ord, self.name)))
+        start = Solution(
+            status=Status.SOLVED, x=self.truth.u.astype(float), y=np.zeros(0),
+            z=self.truth.multipliers.astype(float), z_box=np.zeros(0),
+        )  # fmt: skip
+        nearest, best, faults, sharp = start, 0.0, [], []
+        refused = 0
+        for i in range(count):
+            s = disturbed(nearest if i % 2 else start, rng, self.truth.rigid)
+            fault, ratio = self.tried(s)
+            refused += fault.startswith("none")
+            if fault:
+                faults.append(fault)
+            elif ratio:
+                sharp.append(1 / ratio)
+            size = np.abs(s.x).max() / np.abs(start.x).max()
+            if best < ratio and size < 10:
+                nearest, best = s, ratio
+        return {"faults": faults, "refused": refused, "sharp": sharp}
+
+
+def problem_of(problem, ranks):
+    """Emit a problem; return what this rank has of its bodies."""
+    share = emitted(problem, ranks, reference_over_ranks)
+    qp = share.share().qp
+    nothing = Solution(
+        status=Status.FAILED, x=0 * qp.q, y=0 * qp.b, z=qp.h, z_box=0 * qp.q
+    )
+    return share.answer(nothing).certifiable[0]
+
+
+def refused(ranks, sign, **keys):
+    """Say why an answer is refused under another load: by ranks, by one process."""
+    problem = disc_in_parts(**keys)
+    own = problem_of(replace(problem, load=lambda at: sign * problem.load(at)), ranks)
+    m = disc_between_plates(**keys).mechanics
+    m = replace(m, primal=replace(m.primal, q=sign * m.primal.q))
+    zero = Solution(
+        status=Status.FAILED, x=0 * m.primal.q, y=0 * m.primal.b, z=0 * m.primal.h,
+        z_box=0 * m.primal.q,
+    )  # fmt: skip
+    nothing = np.zeros(own.components.size)
+    return (
+        why(lambda: certify_over_ranks(own, nothing, zero.z)),
+        why(lambda: certify(m, zero)),
+    )
+
+
+def why(certificate):
+    """Say why there is no certificate; or that there is one."""
+    try:
+        return f"bound {certificate().bound}"
+    except UncertifiableError as e:
+        return str(e)
+
+
+def main():
+    ranks, count = Ranks(MPI.COMM_WORLD), int(sys.argv[1])
+    if not sys.argv[2:]:
+        found = [refused(ranks, 1, push=0.1), refused(ranks, -1)]
+    else:
+        found = {name: Search(name, ranks).result(count) for name in sys.argv[2:]}
+    if ranks.rank == 0:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
