@@ -25,6 +25,7 @@ VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
 READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
 TIGHTENING = "sequence, tighten="  #: begins the mode of a sequence that tightens
 LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
+SECONDS = (1e-12, 1e10)  #: between these is every time that is measured and not 0
 MOST_LEVELS = 20  #: of what is nested in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
@@ -259,8 +260,10 @@ _NOT_NEGATIVE = (
     "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
     "dual", "complementarity", "gap", "energy_bound", "optimum_error",
 )  # fmt: skip
+_SECONDS = tuple(name for name in _NOT_NEGATIVE if name.endswith("_seconds"))
 _texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
 _not_negative = attrgetter(*_NOT_NEGATIVE)
+_seconds = attrgetter(*_SECONDS)
 
 
 def _parsed(line: str | bytes) -> Any:
@@ -339,11 +342,20 @@ def _check(r: Record) -> None:
                 name = journal_name(name)
                 raise ValueError(f"{name} = {value!r}; expected no negative number")
             _check_nested(journal_name(name), value, 0)
+    _check_seconds(r)
     _check_nested("iterations", r.iterations, 0)
     _check_nested("reported", r.reported, MOST_LEVELS)
     _check_spent("rank_seconds", r.rank_seconds)
     _check_spent("rank_counts", r.rank_counts)
     _check_spent("rank_network", r.rank_network)
+
+
+def _check_seconds(r: Record) -> None:
+    for name, value in zip(_SECONDS, _seconds(r), strict=True):
+        if value and not SECONDS[0] <= value <= SECONDS[1]:
+            raise ValueError(
+                f"{name} = {value!r}; expected 0, or {SECONDS[0]:g} to {SECONDS[1]:g}"
+            )
 
 
 def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:

@@ -170,30 +170,35 @@ def _constraints(
     return found
 
 
-def violation(qp: QP, x: Vector, X: Vector) -> float:
+def violation(qp: QP, x: Vector, X: Vector, small: float = SMALL) -> float:
     """Measure the worst violation of a row or bound, as `kkt_residuals` says.
 
     X : (n,) sizes of the variables
+    small : of a row's scale: a right-hand side below is no size of its own
     """
-    return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X)
+    return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, small)
 
 
-def _violation(constraints: dict[str, _Constraints], X: Vector) -> float:
+def _violation(
+    constraints: dict[str, _Constraints], X: Vector, small: float = SMALL
+) -> float:
     return _largest(
         0.0,
         *(
             _violated(
                 c.slack if name == "A" else np.minimum(c.slack, 0),
-                c.rhs, c.terms, c.sized(X),
+                c.rhs, c.terms, c.sized(X), small,
             )
             for name, c in constraints.items()
         ),
     )  # fmt: skip
 
 
-def _violated(error: Vector, rhs: Vector, terms: Vector, known: Vector) -> float:
+def _violated(
+    error: Vector, rhs: Vector, terms: Vector, known: Vector, small: float
+) -> float:
     """Compare with |bᵢ| + Σ|aᵢⱼ|Xⱼ, and where bᵢ is a size of its own with its row."""
-    told = rhs > SMALL * (rhs + known)
+    told = rhs > small * (rhs + known)
     felt = _excess(error, rhs + terms, rhs + known)
     if not told.any():
         return felt
@@ -292,7 +297,7 @@ def _alone(
     Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
     at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ over its feasible width, if that is less.
 
-    by_length : where both are infinite |qᵢ|lᵢ, and where q is rounding Pᵢᵢlᵢ², of the
+    by_length : without curvature at most |qᵢ|lᵢ, and where q is rounding Pᵢᵢlᵢ², of the
         least length lᵢ that a row or bound knows, 1 if none does
     """
     q = np.abs(qp.q)
@@ -305,9 +310,9 @@ def _alone(
     lengths = _lengths(qp) if by_length else np.full(q.size, np.inf)
     if by_length and not np.isfinite(lengths).any():
         lengths = np.ones(q.size)
-    gain = np.where(
-        np.isfinite(gain), gain, np.where(np.isfinite(lengths), q * lengths, 0)
-    )
+    flat = (d == 0) & np.isfinite(lengths)
+    gain = np.where(flat, np.minimum(gain, q * lengths), gain)
+    gain = np.where(np.isfinite(gain), gain, 0)
     gain = gain[gain > NOISE * gain.max(initial=0)]
     bend: Vector = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
     if bend.size and gain.max(initial=0) <= NOISE * bend.min():

@@ -47,8 +47,10 @@ CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optim
 FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
 EPS = float(np.finfo(float).eps)
 SPARED = 10.0  #: the objective adds up what residuals say of single rows
+MOST = 0.5  #: of the terms of f*: a larger error is not verified at any tolerance
 SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
 NEEDLESS = 1e4  #: an optimum whose terms exceed another's by so much tells no rounding
+OWN = 1e-12  #: of a row's scale: a right-hand side below may be rounding
 RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
 
 
@@ -59,6 +61,7 @@ class Optimum:
     value: float  #: f*
     doubt: float  #: by how much f* may be off, with the rounding of a right answer
     energy: float  #: scale of errors of the objective
+    terms: float  #: of f* itself, and what the least variable alone is worth
     x: Vector  #: (n,) sizes of the variables
 
 
@@ -82,7 +85,8 @@ def decided(
     Returns
     -------
     the larger of |f(x) − f*| and of the violation, relative to the scales of the
-    optimum; the first to 10 times the smaller of its terms and 500·|f*|
+    optimum; the first to 10 times the smaller of its terms and 500·|f*|. Where it
+    exceeds half of the terms that f* itself is the sum of, relative to these
 
     """
     if not is_small(qp):
@@ -106,7 +110,8 @@ def error_at(qp: QP, s: Solution, optimum: Optimum) -> float:
     """Compare a point with the optimum; see `decided`."""
     x = s.x.astype(np.longdouble)
     off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
-    return max(max(off, 0.0) / optimum.energy, violation(qp, s.x, optimum.x))
+    scale = optimum.energy if off <= MOST * optimum.terms else optimum.terms
+    return max(max(off, 0.0) / scale, violation(qp, s.x, optimum.x, OWN))
 
 
 @np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
@@ -155,6 +160,7 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
         return None
     return Optimum(
         value=float(value), doubt=doubt + rounding, energy=SPARED * known,
+        terms=float(max(energy_at(qp, s), abs(s.x @ (qp.P @ s.x)), abs(qp.q @ s.x))),
         x=scales_at(qp, s.x.astype(float), known).x,
     )  # fmt: skip
 

@@ -127,7 +127,8 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     if not has_point(s):
         return {}, ""
     try:
-        return plain(case.quantities(s)), ""
+        with np.errstate(all="ignore"):  # a point may hold 1e300
+            return plain(case.quantities(s)), ""
     except Exception as e:  # the family's code; its fault must not lose the record
         return {}, note_of("quantities", e)
 
@@ -187,7 +188,8 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
     if (results := answered.quantities) is not None:
         start = perf_counter()
         try:
-            found["quantities"] = plain(agreed(ranks, results))
+            with np.errstate(all="ignore"):
+                found["quantities"] = plain(agreed(ranks, results))
             found["recover_seconds"] = perf_counter() - start
         except Exception as e:
             found["quantities"] = {}

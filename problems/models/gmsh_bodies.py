@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.sparse import vstack
+from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
 from harness import QP, Case, Friction, InputError, Reference, Value
 from harness.checked import located
@@ -54,7 +55,24 @@ from problems.models.description import (
 
 
 def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of one load step in one form."""
+    """Emit the QP of one load step in one form.
+
+    Raises
+    ------
+    InputError
+        Also where rounding leaves the stiffness without a Cholesky factor.
+
+    """
+    try:
+        return _load_step(form, params, reference)
+    except (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError):
+        raise InputError(
+            f"{params['path']}: the stiffness has no Cholesky factor in double "
+            "precision; expected cells whose sides, and bodies whose E, differ by less"
+        ) from None
+
+
+def _load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     p: Any = params
     source = (p["path"], p["sha256"], p["plane"])
     bodies = model(*source)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from harness import InputError, Record, Verdict
-from harness.errors import say
+from harness.errors import say, some
 from harness.files.reading import read_json, read_toml
 from harness.record import VERIFIED_FACTOR
 from harness.results.faults import Fault, left, read_faults
@@ -245,6 +245,7 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
     records = read_journal(directory, say)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
+    _tell_contradicted(directory, records)
     environment = _read(directory / "environment.json", read_json)
     marks = _marks(records, str(environment.get("digest", "")))
     return Evidence(
@@ -257,6 +258,24 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         factor=factor,
         faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
     )
+
+
+def _tell_contradicted(directory: Path, records: Iterable[Record]) -> None:
+    """Tell of records that say verified beside residuals that are too large for it."""
+    wrong = [r.run_id for r in records if _is_contradicted(r)]
+    if wrong:
+        say(
+            f"{directory}: verified, by their journal, with residuals above "
+            f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
+            "that, and `validate` judges the points anew"
+        )
+
+
+def _is_contradicted(r: Record) -> bool:
+    names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
+    values = (getattr(r, name) for name in names)
+    is_above = any(v is not None and v > allowed(r.judged_at) for v in values)
+    return r.verdict is Verdict.VERIFIED and is_above
 
 
 def _read(path: Path, read: Callable[[Path, str], Any]) -> dict[str, Any]:

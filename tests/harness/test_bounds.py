@@ -72,6 +72,8 @@ def refused(capsys, monkeypatch, tmp_path):
         ({"accuracy": 0.0}, "accuracy = 0.0; expected"),
         ({"solve_seconds": -2e-6}, "solve_seconds = -2e-06; expected no negative"),
         ({"gap": -1.0}, "gap = -1.0; expected no negative number"),
+        ({"total_seconds": 1e308}, "total_seconds = 1e+308; expected 0, or 1e-12 to"),
+        ({"total_seconds": 1e-320}, "total_seconds = 1e-320; expected 0, or 1e-12"),
         ({"repeat": 10**30}, "expected an integer of at most 64 bits"),
         ({"iterations": -(10**30)}, "expected an integer of at most 64 bits"),
         ({"counts": {"steps": 10**400}}, "counts.steps = 1000"),

@@ -119,6 +119,24 @@ def folder(tmp_path):
     return tmp_path
 
 
+def test_a_verdict_that_the_residuals_beside_it_refute_is_told(tmp_path, capsys):
+    changed = record(Status.SOLVED, Residuals(0, 0.5, 0, 0), 1e-6)
+    with Journal(tmp_path, "test") as journal:
+        journal.append(changed.but(verdict=Verdict.VERIFIED))
+    read_evidence(tmp_path)
+
+    message = capsys.readouterr().err
+    assert "verified, by their journal, with residuals above 10 times" in message
+    assert changed.run_id in message
+    assert message.count("\n") == 1
+
+
+def test_a_sound_journal_is_read_without_a_word(folder, capsys):
+    read_evidence(folder)
+
+    assert capsys.readouterr().err == ""
+
+
 def test_the_report_judges_at_the_factor_and_says_so(folder):
     page = compose(judge(folder, 1.0)[1])
     tables = [asdict(t) for s in page.sections for t in s.tables]

@@ -246,6 +246,44 @@ def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
     assert optimum.energy <= 1e4 * 2.0**-20
 
 
+#: (½, ½, ½), f* = 1.5; between its bounds each variable could gain 1e12
+WIDE = qp_of(
+    [0] * 3, [1] * 3, G=[[-1, -1, 0], [0, -1, -1], [-1, 0, -1]], h=[-1] * 3,
+    lb=-1e12, ub=1e12,
+)  # fmt: skip
+#: (0, 0, 1), f* = −½; without its bound each of the first two could gain 1e12
+PUSHED = qp_of([1] * 3, [1e6, 1e6, -1], lb=[0, 0, -INF])
+#: (−3, 3.5), f* = −1.2e10: the row is worth nothing beside the bound
+BESIDE = qp_of([0, 0], [4e9, 1], A=[[0, 1]], b=[3.5], lb=[-3, -INF])
+
+
+@pytest.mark.parametrize(
+    ("qp", "right", "wrong", "tol"),
+    [
+        (WIDE, at([0.5] * 3, z=[0.5] * 3), at([2] * 3, z=[0.5] * 3), 1e-4),  # 6
+        (PUSHED, at([0, 0, 1], z_box=[-1e6, -1e6, 0]),
+         at([0, 0, -1], z_box=[-1e6, -1e6, 0]), 1e-4),  # 1.5
+        (BESIDE, at([-3, 3.5], [-1], z_box=[-4e9, 0]),
+         at([-3, 5.5], [-1], z_box=[-4e9, 0]), TOL),
+    ],
+    ids=["far bounds", "other variables", "other rows"],
+)  # fmt: skip
+def test_nothing_that_is_large_excuses_all_of_what_is_small(qp, right, wrong, tol):
+    def verified(s, tol):
+        residuals = kkt_residuals(qp, s)
+        error = decided(qp, s, residuals, tol, proves(reference_solution))
+        return verdict(Status.SOLVED, residuals, tol, error=error) is Verdict.VERIFIED
+
+    assert verified(right, TOL)
+    assert not verified(wrong, tol)
+
+
+def test_far_bounds_do_not_excuse_an_error_where_residuals_alone_decide():
+    s = at([2] * 3, z=[0.5] * 3)  # 6 for 1.5
+
+    assert kkt_residuals(WIDE, s, generous=True).worst > 0.1
+
+
 def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
     """min ½x², x = 1, and a fixed variable of cost −½: f* = 0, terms ½."""
     qp = qp_of([1, 0], [0, -0.5], A=[[1, 0]], b=[1], lb=[-INF, 1], ub=[INF, 1])

@@ -111,6 +111,13 @@ def test_quantities_are_plain_numbers():
     assert type(quantities["first"]) is float
 
 
+def test_a_point_too_large_for_its_quantities_warns_nobody():
+    large = replace(POINT, x=np.full(2, 1e200))
+    found = quantities_of(case(lambda s: {"value": QP_.objective(s.x)}), large)
+
+    assert found == ({"value": np.inf}, "")
+
+
 def test_what_a_family_cannot_compute_is_a_note_of_one_line():
     message = "ZeroDivisionError: two lines"
 

@@ -550,6 +550,13 @@ def test_a_body_of_two_parts_is_refused(tmp_path):
         read(tmp_path, both, {"a": np.vstack([cells, cells + 9])}, {}, {})
 
 
+def test_a_stiffness_that_rounding_makes_indefinite_is_refused(described):
+    far = POINTS.copy()
+    far[CORNER, 0] += 1e14
+    with pytest.raises(InputError, match=r"^a\.toml: the stiffness has no Cholesky"):
+        build(f"{described(msh22(far, *parts()))}/steps=1/dual")
+
+
 def test_a_closed_contact_side_is_refused(described):
     points, cells = square()
     shell = np.array([[0, 1], [1, 2], [2, 5], [5, 8], [8, 7], [7, 6], [6, 3], [3, 0]])

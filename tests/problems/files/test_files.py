@@ -9,7 +9,14 @@ import highspy
 import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
-from scipy.sparse import csc_array, csc_matrix, csr_array, eye_array, vstack
+from scipy.sparse import (
+    csc_array,
+    csc_matrix,
+    csr_array,
+    diags_array,
+    eye_array,
+    vstack,
+)
 
 from harness import QP, InputError, kkt_residuals
 from harness.files.qpfile import explicit_matrices, load_qp, save_qp
@@ -407,6 +414,51 @@ def test_a_bad_mat_file_is_named_with_what_is_wrong(written, changes, message):
 
     assert str(e.value).startswith(f"a.mat: {message}")
     assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize(
+    ("P", "message"),
+    [
+        (np.diag([1.0, -1.0]), "P[1, 1] = -1; expected a convex QP"),
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "it has a negative eigenvalue; exp"),
+        (
+            np.array([[0.0, 1.0], [1.0, 0.0]]) * 1e-310,
+            "it has a negative eigenvalue; exp",
+        ),
+        (
+            diags_array([1.0] * 3000 + [-1e-3]),
+            "P[3000, 3000] = -0.001; expected a convex",
+        ),
+    ],
+    ids=["concave", "saddle", "small", "large"],
+)
+def test_a_qp_that_is_not_convex_is_refused(written, P, message):
+    """min −½x² over −1 ≤ x ≤ 1 has its maximum, a KKT point, at 0."""
+    n = P.shape[0]
+    free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.zeros(n)}
+    with pytest.raises(InputError) as e:
+        build(written({"P": csc_matrix(P), **free}, "a.mat"))
+
+    expected = f"a.mat: P is not positive semidefinite: {message}"
+    assert str(e.value).startswith(expected)
+
+
+@pytest.mark.parametrize(
+    "P",
+    [
+        [[1, 1], [1, 1 - 2e-16]],
+        [[1, -1e-17], [-1e-17, -1e-17]],
+        [[1e-300, 0], [0, 0]],
+        [[1e300, 1e150], [1e150, 1.0]],
+        [[0, 0], [0, 0]],
+        [[1, 0.333333], [0.333333, 0.111111]],  # rank one, to six digits
+    ],
+)
+def test_rounding_of_a_semidefinite_p_is_none_of_convexity(written, P):
+    n = len(P)
+    free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.ones(n)}
+
+    assert build(written({"P": csc_matrix(np.array(P)), **free}, "a.mat")).qp.q.size
 
 
 def test_other_files_are_refused(written, tmp_path):
