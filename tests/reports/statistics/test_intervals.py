@@ -67,7 +67,13 @@ def test_the_interval_of_the_exponent_covers_at_its_nominal_rate(sizes):
 
 
 @pytest.mark.parametrize(
-    ("n", "t"), [([1, 2], [1, 2]), ([5, 5, 9], [1, 2, 3]), ([1, 2, 3], [1, 0, 2])]
+    ("n", "t"),
+    [
+        ([1, 2], [1, 2]),
+        ([5, 5, 9], [1, 2, 3]),
+        ([1, 2, 3], [1, 0, 2]),
+        ([0, 2, 3], [1, 1, 2]),
+    ],
 )
 def test_what_does_not_determine_a_power_law_is_refused(n, t):
     with pytest.raises(ValueError, match="three different sizes"):
