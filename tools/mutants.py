@@ -340,8 +340,11 @@ def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
         named = [s for s in lines if s.startswith(("FAILED", "ERROR"))]
         if code is None:
             pipe.send(f"hangs ({limit:.0f} s)")
-        else:
-            pipe.send(None if code == 0 else (named or lines[-1:] or [f"{code}"])[0])
+        elif code == 0:
+            pipe.send(None)
+        else:  # below zero: by that signal
+            said = "; ".join([f"exit code {code}", *lines[-1:]])
+            pipe.send((named or [said])[0])
 
 
 def _run_tests(tests: Sequence[str], output: Path) -> None:
