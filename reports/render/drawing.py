@@ -162,8 +162,8 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     decades = high - low
     ticked.set_minor_formatter(NullFormatter())
     if decades > _VAST:  # matplotlib looks for ticks beyond the ends, up to infinity
-        exponents = np.arange(ceil(low), high, ceil(decades / 6))
-        ticked.set_major_locator(FixedLocator(10.0**exponents))
+        exponents = range(ceil(low), ceil(high), ceil(decades / 6))
+        ticked.set_major_locator(FixedLocator([10.0**k for k in exponents]))
         ticked.set_minor_locator(NullLocator())
     elif axis.most is not None:
         ticked.set_major_locator(LogLocator(numticks=axis.most))
