@@ -94,8 +94,10 @@ def budget(seconds: float, where: str = "budget") -> float:
     return seconds
 
 
-def check_formats(formats: Sequence[str], where: str) -> None:
-    """Refuse what is no format of a report.
+def check_known(
+    kind: str, names: Sequence[str], known: Sequence[str], where: str
+) -> None:
+    """Refuse names that are not known, such as of a format.
 
     Raises
     ------
@@ -103,20 +105,6 @@ def check_formats(formats: Sequence[str], where: str) -> None:
         With what would be right.
 
     """
-    for form in formats:
-        if form not in FORMATS:
-            raise unknown("format", form, FORMATS, where=where)
-
-
-def check_gates(gates: Sequence[str], where: str) -> None:
-    """Refuse what a comparison cannot fail on.
-
-    Raises
-    ------
-    InputError
-        With what would be right.
-
-    """
-    for gate in gates:
-        if gate not in GATES:
-            raise unknown("gate", gate, GATES, where=where)
+    for name in names:
+        if name not in known:
+            raise unknown(kind, name, known, where=where)

@@ -13,7 +13,7 @@ from harness.checked import positive
 from harness.errors import InputError
 from harness.files.durable import full_disk_told
 from harness.record import VERIFIED_FACTOR
-from mortarbench.arguments import FORMATS, check_formats, check_gates
+from mortarbench.arguments import FORMATS, GATES, check_known
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -85,8 +85,8 @@ def report(
         to be pooled in a comparison, or what to fail on cannot be judged.
 
     """
-    check_formats(formats, "formats")
-    check_gates(fail_on, "fail_on")
+    check_known("format", formats, FORMATS, "formats")
+    check_known("gate", fail_on, GATES, "fail_on")
     factor = positive("factor", factor)
     first, after = Path(folder), [Path(other) for other in others if other is not None]
     if fail_on and not after:

@@ -340,8 +340,11 @@ def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
         named = [s for s in lines if s.startswith(("FAILED", "ERROR"))]
         if code is None:
             pipe.send(f"hangs ({limit:.0f} s)")
-        else:
-            pipe.send(None if code == 0 else (named or lines[-1:] or [f"{code}"])[0])
+        elif code == 0:
+            pipe.send(None)
+        else:  # below zero: by that signal
+            said = "; ".join([f"exit code {code}", *lines[-1:]])
+            pipe.send((named or [said])[0])
 
 
 def _run_tests(tests: Sequence[str], output: Path) -> None:
@@ -378,14 +381,16 @@ def copy_of_the_project(folder: Path) -> None:
     """Copy what git knows of, as it is in the working tree, and compiled modules."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    paths = [ROOT / name for name in os.fsdecode(listed.stdout).split("\0") if name]
     compiled = [
-        str(path.relative_to(ROOT))
-        for room in ("problems", "solvers") for path in (ROOT / room).rglob("*.so")
+        library
+        for path in paths if path.suffix == ".pyx"
+        for library in path.parent.glob(f"{path.stem}.*.so")
     ]  # fmt: skip
-    for name in filter(None, [*os.fsdecode(listed.stdout).split("\0"), *compiled]):
-        if (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / name)
+    for path in filter(Path.is_file, paths + compiled):
+        copy = folder / path.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(path, copy)
 
 
 def read_plan() -> Plan:

@@ -15,7 +15,9 @@ of ours, to start fast.
 from __future__ import annotations
 
 import json
+import os
 import resource
+import signal
 import sys
 from typing import Any
 
@@ -23,6 +25,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 CPU_SECONDS = 60  #: after which the kernel ends this process
+SECONDS = 600  #: likewise, of waiting for what never comes
 ROOM = 2**29  #: bytes of address space beside four times what the file declares
 
 
@@ -30,6 +33,7 @@ def main(most: int, key: str, wanted: list[str]) -> None:
     """Read standard input, write standard output."""
     # a thread of arrow's may abort Python when it ends
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
+    signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     told = file.metadata
     size = _declared(told)
@@ -92,3 +96,5 @@ def _numbers(scalar: Any) -> Any:
 
 if __name__ == "__main__":
     main(int(sys.argv[1]), sys.argv[2], sys.argv[3:])
+    sys.stdout.flush()
+    os._exit(0)  # without waiting for threads of arrow's, which may not end

@@ -7,16 +7,16 @@ from argparse import Namespace
 
 from harness.checked import positive
 from harness.errors import InputError
-from mortarbench.arguments import check_formats, check_gates, existing
+from mortarbench.arguments import FORMATS, GATES, check_known, existing
 from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
     """Write the report on a result folder, or what changed; 1 if it failed on that."""
     formats = options.format.split(",")
-    check_formats(formats, "--format")
+    check_known("format", formats, FORMATS, "--format")
     gates = options.fail_on.split(",") if options.fail_on is not None else []
-    check_gates(gates, "--fail-on")
+    check_known("gate", gates, GATES, "--fail-on")
     if gates and not options.others:
         raise InputError("--fail-on needs a second folder; expected report DIR DIR2")
     if options.factor is not None:

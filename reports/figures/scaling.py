@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import sqrt
 
 from reports.data.size_series import SizeSeries
 from reports.document.figure import (
@@ -22,6 +23,8 @@ from reports.document.formatting import exponent
 from reports.figures.style import GUIDE, LEGEND_LINE, below, legible, log, look, run_ids
 
 _SIZE = "degrees of freedom $n$"
+SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: of guides, the steepest last
+_FOOT = 0.04  #: part of the axis below the guides, and above them at least
 
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
@@ -72,12 +75,18 @@ def _times(series: SizeSeries, solver: str, style: Look) -> Series | None:
 
 
 def with_slopes(panel: Panel) -> Panel:
-    """Add guides of slopes 1 and 3/2 through the lower right."""
+    """Add guides of slopes 1 and 3/2 through the lower right.
+
+    Where y differs less than the guides rise, its axis goes on at both ends.
+    """
     (x0, x1), (y0, y1) = limits([panel], "x"), limits([panel], "y")
     start, stop = along((x0, x1), 0.62), along((x0, x1), 0.9)
-    base = along((y0, y1), 0.04)
+    rise = (stop / start) ** SLOPES[-1][0]
+    missing = max(rise ** (1 / (1 - 2 * _FOOT)) / (y1 / y0), 1.0)
+    y0, y1 = y0 / sqrt(missing), y1 * sqrt(missing)
+    base = along((y0, y1), _FOOT)
     guides, texts = [], []
-    for slope, name in ((1.0, "$n$"), (1.5, "$n^{3/2}$")):
+    for slope, name in SLOPES:
         end = base * (stop / start) ** slope
         guides.append(Series(x=(start, stop), y=(base, end), look=GUIDE))
         texts.append(Text(text=name, place=(stop, end), offset=(2, 0)))

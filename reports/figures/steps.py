@@ -171,6 +171,6 @@ def _fit(curve: _Curve, colour: str) -> Series:
     assert curve.law is not None
     n = np.geomspace(min(curve.x), max(curve.x), _FITTED)
     return Series(
-        x=numbers(n), y=numbers(curve.law.factor * n**curve.law.exponent),
+        x=numbers(n), y=numbers(curve.law.at(n)),
         look=Look(colour=colour, dash=DASHED, width=0.9),
     )  # fmt: skip

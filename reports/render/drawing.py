@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import ceil, log10
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import (
+    FixedLocator,
     FuncFormatter,
     LogLocator,
     MaxNLocator,
@@ -69,6 +71,7 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
 }
+_VAST = 100.0  #: decades of an axis, which only answers out of all bounds need
 _FRONT = 2.0  #: height of the first mark; each next one lies a little higher
 _PLACES: dict[str, Any] = {
     "below": "outside lower center",
@@ -155,9 +158,14 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     """Choose ticks so that their labels leave each other room."""
     assert axis.low is not None
     assert axis.high is not None
-    decades = np.log10(axis.high / axis.low)
+    low, high = log10(axis.low), log10(axis.high)
+    decades = high - low
     ticked.set_minor_formatter(NullFormatter())
-    if axis.most is not None:
+    if decades > _VAST:  # matplotlib looks for ticks beyond the ends, up to infinity
+        exponents = range(ceil(low), ceil(high), ceil(decades / 6))
+        ticked.set_major_locator(FixedLocator([10.0**k for k in exponents]))
+        ticked.set_minor_locator(NullLocator())
+    elif axis.most is not None:
         ticked.set_major_locator(LogLocator(numticks=axis.most))
         ticked.set_minor_locator(NullLocator())
     elif decades < 1.8:
@@ -223,9 +231,10 @@ def _series(axes: Axes, series: Series, height: float) -> None:
 
 
 def _text(axes: Axes, text: Text) -> None:
+    """Put a remark beside its point; beyond the axes there is none, as on the page."""
     x, y = ("axes fraction" if part else "data" for part in text.inside)
     axes.annotate(
-        text.text, text.place, xycoords=(x, y), xytext=text.offset,
+        text.text, text.place, xycoords=x if x == y else (x, y), xytext=text.offset,
         textcoords="offset points", ha=text.align[0], va=text.align[1],
         fontsize=text.size,
     )  # fmt: skip

@@ -28,7 +28,7 @@ class Growth:
     exponent: float  #: p
     most: float  #: one-sided 95 % bound: p is at most this
     p_value: float  #: of p ≤ 0: how often as much growth would be seen without any
-    factor: float  #: c
+    log_factor: float  #: log c
     scatter: float  #: standard deviation of log v about the line
     sizes: tuple[float, ...]  #: n, that were measured
 
@@ -59,7 +59,7 @@ class Growth:
         spread = float((x - x.mean()) @ (x - x.mean()))
         error = self.scatter * np.sqrt(1 + 1 / k + off**2 / spread)
         half = float(stdtrit(k - 2, 0.5 + COVERAGE / 2) * error)
-        value = self.factor * n**self.exponent
+        value = np.exp(self.log_factor + self.exponent * np.log(n))
         ends = value * np.exp(-half), value * np.exp(half)
         return Interval(float(value), float(ends[0]), float(ends[1]), COVERAGE, k)
 
@@ -92,7 +92,7 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
         exponent=p,
         most=p + float(stdtrit(x.size - 2, 1 - LEVEL)) * error,
         p_value=float(stdtr(x.size - 2, -p / error)) if error else float(p <= 0),
-        factor=law.factor,
+        log_factor=law.log_factor,
         scatter=error * spread,
         sizes=tuple(map(float, x)),
     )

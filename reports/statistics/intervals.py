@@ -8,7 +8,7 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, stdtrit
 
 COVERAGE = 0.95  #: asked for; a median of fewer than six samples cannot have it
@@ -60,8 +60,18 @@ class PowerLaw(NamedTuple):
     exponent: float
     low: float
     high: float
-    factor: float
+    log_factor: float  #: sizes that differ little leave a factor that is no double
     points: int
+
+    @property
+    def factor(self) -> float:
+        """What is multiplied with nᵖ; infinite where it is beyond all doubles."""
+        with np.errstate(over="ignore"):
+            return float(np.exp(self.log_factor))
+
+    def at(self, n: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Evaluate the law at sizes n (k,), near those that it was fitted to."""
+        return np.asarray(np.exp(self.log_factor + self.exponent * np.log(n)))
 
 
 def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
@@ -90,5 +100,5 @@ def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
     rest = Y - Y.mean() - p * X
     error = np.sqrt(rest @ rest / (x.size - 2) / (X @ X))
     half = float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2) * error)
-    factor = float(np.exp(Y.mean() - p * np.log(x).mean()))
-    return PowerLaw(p, p - half, p + half, factor, x.size)
+    log_factor = float(Y.mean() - p * np.log(x).mean())
+    return PowerLaw(p, p - half, p + half, log_factor, x.size)

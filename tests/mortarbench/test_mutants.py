@@ -64,6 +64,15 @@ def test_a_change_elsewhere_leaves_the_choice_of_mutants():
     assert {m.rank for m in alone} < {m.rank for m in moved}
 
 
+def test_the_copy_has_every_compiled_module(tmp_path):
+    mutants.copy_of_the_project(tmp_path)
+    sources = sorted(path.relative_to(ROOT) for path in ROOT.glob("*/*/*.pyx"))
+
+    assert sources
+    for source in sources:
+        assert list((tmp_path / source).parent.glob(f"{source.stem}.*.so")), source
+
+
 def test_the_list_names_modules_tests_and_mutants_that_there_are():
     plan = mutants.read_plan()
     for module, tests in plan.tests.items():

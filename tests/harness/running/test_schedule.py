@@ -52,13 +52,13 @@ def planned(**changes):
 
 
 def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Carry out a suite whose measured times are 1 and 2 s but for some noise."""
+    """Carry out a suite whose measured times are 1, 2 and 4 s but for some noise."""
     rng = np.random.default_rng(seed)
     schedule = planned(**changes)
     made = []
     for block in schedule.blocks():
         for (record,) in block.turns:
-            seconds = {"a": 1.0, "b": 2.0}[record.solver]
+            seconds = {"a": 1.0, "b": 2.0, "c": 4.0}[record.solver]
             seconds *= float(np.exp(noise * rng.standard_normal()))
             record = record.but(verdict=verdict, total_seconds=seconds)
             schedule.note(record)
@@ -164,14 +164,16 @@ def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
     assert len(carried_out(1e-4, precision=0.05)) == 2 * 3
 
 
-def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked():
-    made = carried_out(0.1, precision=0.05, max_repeats=200)
+@pytest.mark.parametrize("solvers", ["ab", "abc"])
+def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked(solvers):
+    specs = tuple(SolverSpec(name=s, label=s) for s in solvers)
+    made = carried_out(0.1, solvers=specs, precision=0.05, max_repeats=200)
     times = {
-        s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in "ab"
+        s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in solvers
     }
     before = {s: {k: v for k, v in t.items() if k < max(t)} for s, t in times.items()}
 
-    assert 2 * 3 < len(made) < 2 * 200
+    assert len(solvers) * 3 < len(made) < len(solvers) * 200
     assert widest(times) <= 0.05 < widest(before)
 
 
@@ -180,6 +182,34 @@ def test_blocks_end_at_the_most_repeats_and_at_the_budget():
     spent = carried_out(0.1, precision=0.001, max_repeats=99, budget=30.0)
 
     assert 30 <= sum(r.total_seconds for r in spent) < 36
+
+
+def test_what_has_no_time_spends_no_budget():
+    """One solver fails, and has none; the others are told apart after many blocks."""
+    specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
+    schedule = planned(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
+    rng = np.random.default_rng(271828)
+    spent = 0.0
+    for block in schedule.blocks():
+        for (record,) in block.turns:
+            if record.solver == "c":
+                schedule.note(record.but(verdict=Verdict.FAILED))
+                continue
+            seconds = float(rng.uniform(0.9, 1.1))
+            spent += seconds
+            schedule.note(record.but(verdict=Verdict.VERIFIED, total_seconds=seconds))
+
+    assert 30 <= spent < 33
+
+
+def test_parts_of_a_block_keep_a_number_each():
+    schedule = planned()
+    first = next(schedule.blocks()).number
+    numbers = [schedule.number_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
+
+    assert len({first, *numbers}) == 4
+    assert schedule.number_of_part(0, 2) == numbers[1]
+    assert next(schedule.blocks()).number not in numbers
 
 
 def test_solvers_that_fail_are_no_reason_to_go_on():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.sparse import csr_array, vstack
-from scipy.sparse.linalg import aslinearoperator
+from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
 from harness import (
     QP,
@@ -19,6 +19,7 @@ from harness import (
 )
 from harness.conformance.manufactured import manufactured
 from harness.operators import SerialisableOperator
+from harness.verify.kkt import energy_at
 from problems.families.beam_ring import BeamRing
 from solvers.adapters.clarabel_ import Clarabel
 from solvers.adapters.osqp_ import OSQP
@@ -288,3 +289,39 @@ def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
     )
     point = replace(s, x=s.x * (1 + 1e-15), z=np.append(s.z, 0.0))
     assert kkt_residuals(empty, point).worst < 1e-13
+
+
+def test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer():
+    """min ½x₁² − x₁ at its minimum; x₂ may be as long as it likes."""
+
+    def product(x):
+        return np.array([x[0], 2.0**-52 * x[0]])
+
+    P = LinearOperator((2, 2), matvec=product, dtype=float)
+    qp = replace(diagonal([0, 0], [-1, 0]), P=P)
+
+    residuals = kkt_residuals(qp, at([1, 1e8]))
+
+    assert residuals.dual == 0
+    assert verdict(Status.SOLVED, residuals, 1e-8) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize(
+    ("qp", "expected"),
+    [
+        (diagonal([1], [-1]), 1 / 2),  # |½x² − x| at x = 1
+        (diagonal([4], [-1]), 1 / 8),
+        (diagonal([1], [-1], ub=10), 1 / 2),
+        (diagonal([1], [-1], ub=0.5), 3 / 8),  # at x = ½
+        (diagonal([1], [0], ub=10), 100),  # no cost: Pl² over the length of the bound
+        (diagonal([1, 4], [-1, -1]), 1 / 8),  # the smallest
+    ],
+)
+def test_the_least_scale_of_energy_is_a_hundredth_of_what_a_variable_gains_alone(
+    qp, expected
+):
+    nowhere = at(0 * qp.q, z_box=0 * qp.q)
+    with np.errstate(invalid="ignore"):  # 0·∞, where there is no bound
+        found = energy_at(qp, nowhere)
+
+    assert found == pytest.approx(expected / 100)

@@ -3,6 +3,7 @@
 import gc
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,9 +56,10 @@ def test_both_phases_are_timed_and_add_up(qp):
     assert m.prepare_seconds > 0
     assert m.solve_seconds > 0
     assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
+    assert m.inner_loops == 1  # nobody has asked for a longer sample
 
 
-@pytest.mark.parametrize("sample_seconds", [0.0, 0.1])
+@pytest.mark.parametrize("sample_seconds", [0.0, 0.009, 0.011, 0.1])
 def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_seconds):
     """By a clock that only the solver moves: 1 ms to prepare, 4 ms to solve."""
     now = [0.0]
@@ -80,8 +82,9 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
     assert (m.prepare_seconds, m.solve_seconds) == pytest.approx((0.001, 0.004))
     assert m.total_seconds == pytest.approx(0.005)
-    assert m.inner_loops == (20 if sample_seconds else 1)
-    assert now[0] == pytest.approx(0.105 if sample_seconds else 0.005)
+    loops = {0.0: 1, 0.009: 1, 0.011: 3, 0.1: 20}[sample_seconds]
+    assert m.inner_loops == loops
+    assert now[0] == pytest.approx(0.005 * (1 + loops if loops > 1 else 1))
 
 
 def test_each_phase_has_a_peak_of_its_own(qp):
@@ -208,6 +211,37 @@ def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
     assert s.message == (
         "needs explicit matrices; P is an operator of 3 rows, and is multiplied out up "
         "to 2 where memory allows"
+    )
+
+
+def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
+    by_products, monkeypatch
+):
+    monkeypatch.setattr(harness.verify.measure, "too_large", lambda *_: True)
+    s = measure(ReadsEntries(), by_products, 1e-6).solution
+
+    assert s.status is Status.DECLINED
+
+
+@pytest.mark.parametrize(
+    ("iterations", "shown"),
+    [
+        (-1, "-1"),
+        (2**53 + 1, "9007199254740993"),
+        (10**300, "a number far out of range"),
+        (-(10**300), "a number far out of range"),
+    ],
+)
+def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, shown):
+    class Counts(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            return replace(super().act(qp), iterations=iterations)
+
+    s = measure(Counts(), qp, 1e-6).solution
+
+    assert s.status is Status.FAILED
+    assert s.message == (
+        f"malformed Solution: iterations = {shown}, expected 0 to 2**53"
     )
 
 

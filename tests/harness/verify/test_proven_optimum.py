@@ -10,7 +10,13 @@ from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdi
 from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
 from harness.verify.kkt import Residuals, rejudged, widths
-from harness.verify.optimum import decided, exact_optimum, proven_optimum, proves
+from harness.verify.optimum import (
+    decided,
+    exact_optimum,
+    is_small,
+    proven_optimum,
+    proves,
+)
 from harness.verify.verdicts import judged
 from solvers.reference.solve import reference_solution
 
@@ -96,6 +102,10 @@ TINY = 6e-13  #: ½x² + ½x² = 4e-25
         (qp_of([1, 1], [1e-17, -3e-17], lb=0, ub=3), at([TINY, TINY])),
         # a gradient of 1e-9 with a noise of 1e-10, beside one of 1
         (qp_of([1, 1], [-1, -1e-9]), at([1, 9e-10])),
+        # x₂ rests at its bound, whose multiplier of 1e-9 is missing
+        (qp_of([1, 0], [-1, 1e-9], lb=[-INF, 75]), at([1, 75])),
+        (qp_of([1, 0], [-1, -1e-9], ub=[INF, -75]), at([1, -75])),
+        (qp_of([1, 0], [-1e-6, 1e-15], lb=[-INF, 0]), at([1e-6, 0])),
     ],
 )
 def test_a_right_point_is_verified_by_its_residuals(qp, s):
@@ -230,6 +240,84 @@ def test_a_point_that_is_no_optimum_has_no_exact_value():
     assert exact_optimum(qp, wrong) is None  # the bound would pull
 
 
+BOUNDED = qp_of([1], [1], lb=0)  # x* = 0
+
+
+@pytest.mark.parametrize(
+    ("qp", "s"),
+    [
+        (BOUNDED, at([-1])),
+        (qp_of([1], [-1], ub=0), at([1])),
+        (qp_of([1], [-1], G=[[1]], h=[0]), at([1], z=[0])),
+        (qp_of([1], [1], G=[[1]], h=[0]), at([0], z=[1])),  # x* = −1: the row pulls
+        (qp_of([1], [-1], lb=0), at([0], z_box=[-1])),  # x* = 1: the bound pulls
+        (qp_of([1, 1], [0, 0], A=[[1, 0], [1, 0]], b=[1, 2]), at([1, 0], [0, 0])),
+    ],
+    ids=["x < lb", "x > ub", "G x > h", "z < 0", "z_box > 0 at lb", "infeasible"],
+)
+def test_a_point_that_breaks_one_condition_has_no_exact_value(qp, s):
+    assert exact_optimum(qp, s) is None
+
+
+def test_a_point_at_its_bound_has_an_exact_value():
+    exact = exact_optimum(BOUNDED, at([0], z_box=[-1]))
+
+    assert exact is not None
+    assert (exact.value, exact.solution.z_box) == (0, [-1])
+
+
+def test_the_optimum_of_a_well_conditioned_qp_is_known_to_fourteen_digits():
+    optimum = proven_optimum(FAR, reference_solution)
+
+    assert optimum is not None
+    assert optimum.value == pytest.approx(-3 / 4, rel=1e-14)
+    assert optimum.doubt <= 1e-14
+
+
+MANY = 45  #: variables, more than are solved for in rational arithmetic
+
+
+@pytest.mark.parametrize("unit", [2.0**-60, 1.0, 2.0**60])
+def test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy(unit):
+    """Two rows Σxⱼ = n/2 with multipliers of 5e11, which balance q to 1e-4 only."""
+    row = np.ones((2, MANY))
+    qp = qp_of([unit] * MANY, [-unit] * MANY, A=row, b=[MANY / 2] * 2)
+    off = 2.0**39 + 0.5 + 2.0**-13
+
+    def found(y):
+        return at([0.5] * MANY, unit * np.array(y))
+
+    assert proven_optimum(qp, lambda _: found([off, -(2.0**39)])) is None
+    optimum = proven_optimum(qp, lambda _: found([0.5, 0]))
+    assert optimum is not None
+    assert optimum.value == -MANY * 3 / 8 * unit
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point(sign):
+    """x₁ + x₂ = 2, twice, and x₁ = x₂; of all multipliers the least ones count."""
+    A = np.zeros((3, MANY))
+    A[:, :2] = sign * np.array([[1, 1], [1, 1], [1, -1]])
+    q = np.zeros(MANY)
+    q[:2] = -1, -3
+    qp = qp_of(np.eye(MANY), q, A=A, b=[sign * 2, sign * 2, 0])
+    x = np.where(np.arange(MANY) < 2, 1.0, 0.0)
+    y = sign * np.array([1 + 2.0**40, -(2.0**40), -1])
+
+    optimum = proven_optimum(qp, lambda _: at(x, y))
+
+    assert optimum is not None
+    assert optimum.value == -3
+    assert optimum.doubt <= 1e-13
+
+
+@pytest.mark.parametrize(("rows", "expected"), [(0, True), (1, False)])
+def test_a_qp_is_small_up_to_400_variables_and_rows(rows, expected):
+    qp = qp_of([1] * 400, [0] * 400, A=np.ones((rows, 400)), b=[0] * rows)
+
+    assert is_small(qp) is expected
+
+
 def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
     """Terms of 1e24 at a solution 1e10 along the free direction x₁ = −x₃, f* = 2⁻²⁰."""
     planted = hard(frozenset({"cancelled", "duplicates", "redundant"}), 194299169)
@@ -292,6 +380,11 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
     error = decided(qp, s, kkt_residuals(qp, s), TOL, proves(reference_solution))
 
     assert error == pytest.approx(1e-9, rel=3)
+    further = at([1 + 4e-9, 1], [-1 - 4e-9], z_box=[0, 0.5])
+    residuals = kkt_residuals(qp, further)
+    assert residuals.worst > 10 * TOL  # to the digits of f: they do not decide
+    error = decided(qp, further, residuals, TOL, proves(reference_solution))
+    assert error == pytest.approx(4e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
 
 
@@ -304,6 +397,20 @@ def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
     assert stored.verdict is Verdict.VERIFIED
     assert rejudged(stored, 10) is Verdict.VERIFIED
     assert rejudged(stored, 1) is Verdict.INACCURATE
+
+
+def test_without_a_reference_the_verdict_at_another_factor_is_that_of_the_residuals():
+    found = dict(claimed="solved", primal=5e-8, dual=0.0, complementarity=0.0, gap=0.0)
+    stored = new_record().but(**found, verdict=Verdict.VERIFIED)
+
+    assert rejudged(stored, 10) is Verdict.VERIFIED
+    assert rejudged(stored, 1) is Verdict.INACCURATE
+
+
+def test_without_a_point_the_verdict_is_the_same_at_every_factor():
+    stored = new_record().but(claimed="solved", verdict=Verdict.WRONG)
+
+    assert rejudged(stored, 1e9) is Verdict.WRONG
 
 
 @pytest.mark.parametrize("kind", ["plain", *KINDS])

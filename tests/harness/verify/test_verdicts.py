@@ -1,5 +1,6 @@
 """From what a solver returned to a record, by our own evaluation."""
 
+import json
 import re
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,10 +10,26 @@ import pytest
 from scipy.sparse import csr_array
 
 from harness import QP, Case, Solution, Status, Verdict
+from harness.distributed.vectors import (
+    Answered,
+    DistributedColumns,
+    Emitted,
+    Ranks,
+    Share,
+    distributed,
+)
 from harness.names import CaseId
-from harness.registry import SolverSpec
+from harness.operators import SerialisableOperator
+from harness.registry import COPIES, SolverSpec
 from harness.verify.certificate import UncertifiableError
-from harness.verify.verdicts import certified, judged, new_record, quantities_of
+from harness.verify.verdicts import (
+    certified,
+    evaluated_by_ranks,
+    judged,
+    new_record,
+    quantities_of,
+)
+from tests.support import ROOT
 
 #: min ½(x₁² + x₂²) − x₁ − x₂, x₁ + x₂ = 1, x₁ ≤ ¼, x ≥ 0: (¼, ¾), y = ¼, z = ½
 QP_ = QP(
@@ -26,10 +43,10 @@ POINT = Solution(
 )  # fmt: skip
 
 
-def record(tol=1e-8, options=None, **changes):
+def record(tol=1e-8, options=None, *, case="f/p", solver="s", spec=None, **changes):
     family = SimpleNamespace(name="f")
-    name = CaseId(family=family, name="f/p", params={"n": 1}, form="p")
-    spec = SolverSpec(name="s", label="s")
+    name = CaseId(family=family, name=case, params={"n": 1}, form="p")
+    spec = SolverSpec(name=solver, label=solver, **spec or {})
     return new_record(
         name, spec, options=options or {}, tol=tol,
         **dict(repeat=0, environment="e") | changes,
@@ -59,12 +76,28 @@ def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
         record(mode="sequence").run_id,
         record(accuracy=1e-3).run_id,
         record(mode="sequence", accuracy=1e-3).run_id,
+        record(spec={"ranks": 2}).run_id,
+        record(spec={"role": COPIES}).run_id,
     ]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch("[0-9a-f]{12}", name) for name in names)
     assert record(options={"b": 2, "a": 1}).run_id == names[3]
     assert record(block=7, environment="other").run_id == names[0]
     assert (record().block, record(block=7).block) == (0, 7)
+
+
+def test_measurements_have_the_names_that_they_have_in_earlier_journals():
+    journal = next((ROOT / "tests/data/results-2026-11/journal").glob("*.jsonl"))
+    told = [json.loads(line) for line in journal.read_text("utf-8").splitlines()]
+    cold = [r for r in told if r["mode"] == "cold" and not r["arm"]]
+
+    assert cold
+    for r in cold:
+        same = record(
+            r["tol"], r["options"], case=r["case"], solver=r["solver"],
+            repeat=r["repeat"], accuracy=r["accuracy"],
+        )  # fmt: skip
+        assert same.run_id == r["run_id"]
 
 
 def test_what_was_declined_is_declined_and_has_no_residuals():
@@ -154,3 +187,83 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
         )  # fmt: skip
     else:
         assert (fields, note) == ({}, "no energy_bound: no admissible pair")
+
+
+class Alone:
+    """A communicator of one process."""
+
+    size, rank = 1, 0
+
+    def Dup(self):
+        return self
+
+    def Allgather(self, part, everyones):
+        everyones[0] = part
+
+    def Iallgather(self, part, everyones):
+        self.Allgather(part, everyones)
+        return SimpleNamespace(Wait=lambda: None, Test=lambda: True)
+
+
+def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
+    """Evaluate a point of the QP above, with the bound ¼ in place of the row."""
+    ranks = Ranks(Alone())
+
+    def slices(v):
+        return distributed(np.array(v, dtype=float), ranks)
+
+    def share():
+        unit = SerialisableOperator(2, "unit", {}, {"unit": lambda _: slices})
+        qp = replace(
+            QP_, P=unit, q=slices(QP_.q), A=DistributedColumns(QP_.A, ranks),
+            G=QP_.G[:0], h=QP_.h[:0], lb=slices(QP_.lb), ub=slices([0.25, np.inf]),
+        )  # fmt: skip
+        return Share(qp, lambda s: s)
+
+    answered = Answered(certifiable, quantities)
+    emitted = Emitted(2, 1, 3, share, lambda: "", lambda s: answered)
+    s = replace(POINT, x=slices(x), z=QP_.h[:0], z_box=slices([0.5, 0]))
+    return evaluated_by_ranks(emitted, s, ranks)
+
+
+def test_ranks_find_the_objective_and_no_residual_of_a_solution():
+    found = on_one_rank()
+
+    values = found.pop("values")
+    assert values.pop("objective") == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
+    assert max(values.values()) <= 1e-15
+    assert found.pop("notes") == []
+    assert set(found.values()) == {None}  # nothing else was to be had
+
+
+def test_ranks_say_nothing_of_a_point_that_is_not_finite():
+    found = on_one_rank([np.nan, 1], quantities=lambda: {"first": 0.25})
+
+    assert found.pop("notes") == []
+    assert set(found.values()) == {None}
+
+
+def test_ranks_give_physical_results_as_plain_numbers():
+    found = on_one_rank(quantities=lambda: {"first": np.float64(0.25)})
+
+    assert found["quantities"] == {"first": 0.25}
+    assert type(found["quantities"]["first"]) is float
+    assert found["recover_seconds"] >= 0
+
+
+def test_results_that_ranks_cannot_compute_are_none_and_a_note_of_one_line():
+    found = on_one_rank(quantities=lambda: fault(None))
+
+    assert found["quantities"] == {}
+    assert found["notes"] == ["no quantities: ZeroDivisionError: two lines"]
+
+
+def test_a_bound_that_ranks_cannot_give_is_a_note(monkeypatch):
+    def certify(*mechanics):
+        raise UncertifiableError("no admissible pair")
+
+    monkeypatch.setattr("harness.verify.verdicts.certify_over_ranks", certify)
+    found = on_one_rank(certifiable=())
+
+    assert found["bounds"].keys() == {"certify_seconds"}
+    assert found["notes"] == ["no energy_bound: no admissible pair"]

@@ -277,6 +277,15 @@ def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
     assert least_gap(-0.5, "dual") > 0.0099
 
 
+@pytest.mark.parametrize(("distance", "kept"), [(0.2, 0), (0.35, 1)])
+def test_a_segment_that_is_partly_out_of_reach_does_not_count(distance, kept):
+    """A slave from 0 to 1, and a master above it that rises from 0.1 to 0.3."""
+    s, m = sides([[1, 0], [0, 0]], [[0, 0.1], [1, 0.3]])
+    at = cast_rays(s, m, overlaps(s, m), Reach(distance=distance, cosine=1.0))
+
+    assert len(at.slave) == kept
+
+
 @pytest.mark.parametrize("height", [0.25, -0.25], ids=["apart", "overlapping"])
 @pytest.mark.parametrize(("distance", "kept"), [(0.3, 8), (0.2, 0)])
 def test_segments_farther_than_the_reach_do_not_count(distance, kept, height):

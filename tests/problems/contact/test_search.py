@@ -90,6 +90,26 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
     assert sum(visited) <= 60 * segments
 
 
+@pytest.mark.parametrize("segments", SIZES)
+def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
+    """With a point on the inner side of each of the two normals (x − p) × n."""
+    rng = np.random.default_rng(577215)
+    bent = arc(40) + 0.002 * rng.standard_normal((41, 2))
+    slave, master = polyline(bent, "s"), polyline(bent_beam(segments), "m")
+
+    def side(j, p):
+        way = slave.x[j][:, None] - p
+        normal = slave.node_normal[j][:, None]
+        return way[..., 0] * normal[..., 1] - way[..., 1] * normal[..., 0]
+
+    begins, ends = master.start, master.end
+    first = np.maximum(side(slave.first, begins), side(slave.first, ends)) >= 0
+    last = slave.first + 1
+    second = np.minimum(side(last, begins), side(last, ends)) <= 0
+
+    assert np.array_equal(facing(slave, master), np.nonzero(first & second))
+
+
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_few_master_segments_face_a_slave_segment(segments):
     slave, master = polyline(arc(segments), "s"), polyline(bent_beam(segments), "m")

@@ -67,6 +67,23 @@ def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() ->
     assert label.tolist() == 2 * [0, 0, 0, 1, 1, 1, 2, 2]
 
 
+def test_compact_blocks_know_how_long_rows_and_columns_are_where_they_are() -> None:
+    """Cells of 100 by 1, in rows and columns given by two factors each."""
+    one, many = np.ones(4), np.full(4, 100.0)
+    strips, whole = [slice(k, k + 1) for k in range(4)], slice(0, 4)
+    long = compact_blocks(((one, one), (one, many)), 2)
+    tall = compact_blocks(((one, many), (one, one)), 2)
+
+    assert long == [(whole, strip) for strip in strips]
+    assert tall == [(strip, whole) for strip in strips]
+
+
+def test_a_compact_block_as_long_as_wide_is_cut_between_rows() -> None:
+    found = compact_blocks(sides(np.full(3, 4.0), np.full(4, 3.0)), 3)
+
+    assert found == [(slice(0, 2), slice(0, 3)), (slice(2, 4), slice(0, 3))]
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_rounding_of_lengths_moves_no_cut_of_compact_blocks(seed: int) -> None:
     """Of seven equal cells, two lines are as near to the middle."""

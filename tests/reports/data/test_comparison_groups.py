@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import Record, Verdict
+from harness import Verdict
 from harness.results.journal import Journal
 from harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 from reports import write_report
@@ -19,25 +19,14 @@ from reports.figures.style import look
 from reports.folder import compose
 from reports.render.markdown import markdown
 from reports.render.saving import draw
+from tests.support.box_records import box_record
 
 LIMIT = 20.0
 
 
 @pytest.fixture
 def record():
-    def make(solver, case, seconds=0.01, repeat=0, **changes):
-        form, tol = changes.get("form", "dual"), changes.get("tol", 1e-6)
-        name = f"box/n={case}/{form}"
-        defaults = dict(
-            run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
-            params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
-            repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
-            iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
-            complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
-        )  # fmt: skip
-        return Record(**(defaults | changes))
-
-    return make
+    return box_record
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from harness import Verdict
@@ -12,12 +13,13 @@ from reports.compare.changes import compare
 from reports.compare.figure import ratios_figure
 from reports.data.evidence import Evidence, arrange
 from reports.data.size_series import size_series
-from reports.document.figure import Figure, Series
+from reports.document.figure import Axis, Figure, Panel, Row, Series, Text, fitted
 from reports.figures.accuracy import accuracy_figure
 from reports.figures.scaling import scaling_figure
 from reports.figures.style import GUIDE
 from reports.figures.sweeps import certified_figure, sweep_figure
 from reports.folder import compose
+from reports.render.saving import draw, draw_svg
 from reports.validation.error_figure import error_figure
 from tests.support.synthetic_results import records
 
@@ -111,6 +113,59 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
             assert curve.runs == tuple(
                 tuple(f"{curve.solver} {n:g} {i}" for i in range(3)) for n in curve.x
             )
+
+
+@pytest.mark.parametrize("spread", [1.0, 1 + 1e-9, 1.02, 1.5, 4.0, 1e6])
+def test_guides_leave_the_axes_their_room_however_little_times_differ(spread):
+    """Sizes of 1 to 100: a guide of slope 3/2 rises by seven."""
+    grown = [
+        r.but(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
+              form="dual", params={"n": n}, sizes={"variables": n},
+              quantities={"dofs": n}, total_seconds=1e-3 * spread**i,
+              verdict=Verdict.VERIFIED)
+        for i, n, r in zip((0, 0.5, 1), (100, 1000, 10000), records(1, 3, 1),
+                           strict=True)
+    ]  # fmt: skip
+    found = evidence(grown)
+    (one,) = size_series(found)
+    figure = scaling_figure(one, found.solvers)
+    panel = figure.panels[0]
+    guides = [m for m in panel.marks if isinstance(m, Series) and m.look == GUIDE]
+
+    assert len(guides) == 2
+    for guide in guides:
+        assert panel.y.low < min(guide.y) < max(guide.y) < panel.y.high
+        slope = np.diff(np.log(guide.y)) / np.diff(np.log(guide.x))
+        assert slope == pytest.approx([1.0 if guide is guides[0] else 1.5])
+    canvas = draw(figure)
+    canvas.draw_without_rendering()
+    assert canvas.axes[0].get_position().height >= 0.5
+
+
+@pytest.mark.parametrize("place", [(1.0, 1e9), (1e-9, 1.0), (1e9, 1e-9)])
+def test_a_remark_beside_the_axes_takes_no_room(place):
+    def room(*texts):
+        axis = Axis(log=True, low=0.1, high=10.0)
+        panel = Panel(x=axis, y=axis, texts=texts)
+        canvas = draw(Figure(rows=(Row(panels=(panel,)),), height=2.0))
+        canvas.draw_without_rendering()
+        return canvas.axes[0].get_position().bounds
+
+    assert room(Text(text="far away", place=place)) == room()
+
+
+def test_answers_out_of_all_bounds_have_their_place_in_the_figure_of_accuracy():
+    answers = [
+        r.but(primal=worst, dual=0.0, complementarity=0.0, gap=0.0)
+        for worst, r in zip((0.0, 1e-9, 1e290), records(1, 3, 1), strict=True)
+    ]
+    figure = accuracy_figure(evidence(answers))
+    (panel,) = fitted(figure).panels
+
+    assert panel.y.low < 1e-10
+    assert panel.y.high > 1e290
+    drawn = draw_svg(figure).text
+    assert drawn.count("<use") >= len(answers)
 
 
 @pytest.mark.parametrize("certified", [False, True])

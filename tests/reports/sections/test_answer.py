@@ -1,11 +1,12 @@
 """The report opens with who was fastest: no more than the measurements bear out."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 
-from harness import InputError, Record, Verdict
+from harness import InputError, Verdict
 from harness.results.journal import Journal
 from reports import answer, write_report
 from reports.data.aggregation import ranking_of
@@ -17,26 +18,14 @@ from reports.folder import compose
 from reports.render.html_page import html
 from reports.render.latex import latex
 from reports.render.markdown import markdown
+from tests.support.box_records import box_record
 
 LIMIT = 5.0
 
 
 @pytest.fixture
 def record():
-    def make(solver, case, seconds=0.01, repeat=0, **changes):
-        form, tol = changes.get("form", "dual"), changes.get("tol", 1e-6)
-        name = f"box/n={case}/{form}"
-        defaults = dict(
-            run_id=f"{solver}-{name}-{tol}-{repeat}", case=name, family="box",
-            params={"n": case}, form=form, sizes={}, solver=solver, options={}, tol=tol,
-            repeat=repeat, block=repeat, verdict=Verdict.VERIFIED, claimed="solved",
-            iterations=7, total_seconds=seconds, primal=1e-9, dual=1e-9,
-            complementarity=1e-9, gap=1e-9, quantities={"dofs": 100 * (case + 1)},
-            environment="abc",
-        )  # fmt: skip
-        return Record(**(defaults | changes))
-
-    return make
+    return partial(box_record, environment="abc")
 
 
 @pytest.fixture

@@ -40,6 +40,17 @@ def test_a_power_law_without_noise_is_recovered():
     assert fit.high == pytest.approx(1.4)
 
 
+def test_a_law_of_sizes_that_hardly_differ_is_one_though_its_factor_is_no_double():
+    """A factor of e within a hundredth of a per cent: p = 10⁴, c = e^−138155."""
+    n = 1e6 * np.array([1, 1 + 5e-5, 1 + 1e-4])
+    for sign in (1, -1):
+        t = 7.0 * (n / n[0]) ** (sign * 1e4)
+        fit = power_law(n, t)
+        assert fit.exponent == pytest.approx(sign * 1e4)
+        assert fit.at(n) == pytest.approx(t)
+        assert fit.factor == (0 if sign > 0 else np.inf)
+
+
 def test_counts_that_do_not_grow_have_exponent_zero():
     assert power_law([100, 300, 800], [12, 12, 12])[:3] == pytest.approx((0, 0, 0))
 
@@ -56,7 +67,13 @@ def test_the_interval_of_the_exponent_covers_at_its_nominal_rate(sizes):
 
 
 @pytest.mark.parametrize(
-    ("n", "t"), [([1, 2], [1, 2]), ([5, 5, 9], [1, 2, 3]), ([1, 2, 3], [1, 0, 2])]
+    ("n", "t"),
+    [
+        ([1, 2], [1, 2]),
+        ([5, 5, 9], [1, 2, 3]),
+        ([1, 2, 3], [1, 0, 2]),
+        ([0, 2, 3], [1, 1, 2]),
+    ],
 )
 def test_what_does_not_determine_a_power_law_is_refused(n, t):
     with pytest.raises(ValueError, match="three different sizes"):

@@ -392,6 +392,17 @@ def test_planted_growth_is_detected_and_bounded():
     assert (found.exponent, found.most) == pytest.approx((0.25, 0.25))
 
 
+def test_the_bound_of_growth_is_students_of_two_degrees_of_freedom():
+    """Logarithms of n: −3, −1, 1, 3; those of v are off a line of slope ½ by ±s."""
+    n, s = np.exp([-3.0, -1.0, 1.0, 3.0]), 0.1
+    found = growth_of(n, np.sqrt(n) * np.exp([s, -s, -s, s]))
+
+    error = np.sqrt(4 * s**2 / 2 / 20)
+    assert found.exponent == pytest.approx(0.5)
+    assert found.most == pytest.approx(0.5 + 2.919985580 * error)  # t of 95 %
+    assert found.scatter == pytest.approx(np.sqrt(2) * s)
+
+
 def test_constant_counts_do_not_grow_for_sure():
     found = growth_of([100, 400, 1600, 6400], [13, 13, 13, 13])
     assert (found.exponent, found.most, found.p_value) == (0, 0, 1)
@@ -401,7 +412,7 @@ def test_constant_counts_do_not_grow_for_sure():
 def test_falling_counts_do_not_grow():
     found = growth_of([100, 400, 1600, 6400], [40, 30, 25, 20])
     assert found.p_value > 0.99
-    assert found.most < 0
+    assert found.exponent < found.most < 0
 
 
 def test_three_sizes_make_no_test():

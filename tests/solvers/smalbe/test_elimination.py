@@ -46,6 +46,19 @@ def test_the_way_back_leads_to_a_kkt_point(dual, seed, r, apart):
     assert kkt_residuals(qp, solution).worst <= 1e-9
 
 
+def test_bounds_from_above_are_those_of_the_variables_that_are_left(dual):
+    qp = dual(271828)
+    tight = replace(
+        qp, ub=np.where(np.isinf(qp.lb), np.inf, 0.1 + 0.01 * np.arange(24))
+    )
+    small = eliminate_free(tight)
+    solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
+
+    assert (small.qp.ub == tight.ub[12:]).all()
+    assert (solution.z_box > 0).any()
+    assert kkt_residuals(tight, solution).worst <= 1e-9
+
+
 def test_more_rows_than_free_variables_leave_rows(dual):
     """14 rows determine the 12 free ones; two combinations of them are left."""
     qp = dual(271828, r=14)

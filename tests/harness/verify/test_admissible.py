@@ -1,0 +1,80 @@
+"""Displacements without penetration: the nearest one, by hand."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness.mechanics import Exact, Real
+from harness.verify import admissible as module
+from harness.verify.admissible import admissible, inside_at_rows
+from tests.support.held_by_contact import disc_between_plates
+
+
+def moved(B, c, u, *, R=None, softness=None, closed=None):
+    """Move u inside  Bu ≤ c; R no motions, softness and closed ones and none."""
+    B, c, u = (np.array(v, dtype=Real) for v in (B, c, u))
+    m, n = B.shape
+    exact = Exact(
+        f=np.zeros(n, dtype=Real), B=csr_array(B), c=c, lower=np.zeros(m, dtype=Real),
+        upper=np.full(m, np.inf, dtype=Real), held=np.zeros(0, dtype=np.int64),
+        loose=np.ones(m, dtype=Real),
+    )  # fmt: skip
+    R = np.zeros((n, 0)) if R is None else np.array(R, dtype=float)
+    softness = np.ones(n) if softness is None else np.array(softness, dtype=float)
+    closed = np.zeros(m, dtype=bool) if closed is None else np.array(closed)
+    with np.errstate(all="ignore"):  # as `certify` does
+        return inside_at_rows(exact, R, softness, u, closed)
+
+
+def test_what_penetrates_nothing_stays():
+    found = moved([[1, 1]], [3], [1, 1])
+
+    assert (found.u == [1, 1]).all()
+    assert found.theta == 1
+
+
+def test_nodes_share_the_way_out_as_they_are_soft():
+    """u₁ + u₂ ≤ 1 from (1, 1): least Σδᵢ²/sᵢ with s = (1, 3) moves them by ¼ and ¾."""
+    found = moved([[1, 1]], [1], [1, 1], softness=[1, 3])
+
+    assert found.u.astype(float) == pytest.approx([0.75, 0.25], rel=1e-9)
+    assert found.u.sum() <= 1
+
+
+def test_rigid_motions_come_before_bending():
+    """Both rows are violated by 1: one motion of both nodes by −1 bends nothing."""
+    found = moved(np.eye(2), [1, 1], [2, 2], R=[[1], [1]])
+
+    assert found.u.astype(float) == pytest.approx([1, 1, -1], rel=1e-9)
+
+
+def test_a_closed_row_is_closed_though_it_is_not_violated():
+    found = moved([[1, 0]], [3], [1, 1], closed=[True])
+
+    assert found.u.astype(float) == pytest.approx([3, 1], rel=1e-12)
+    assert found.u[0] <= 3
+
+
+def test_what_supports_hold_is_shrunk_until_it_fits():
+    """Nothing can move; 2 and 3 fit into 1 and 2 if halved."""
+    found = moved(np.eye(2), [1, 2], [2, 3], softness=[0, 0])
+
+    assert found.theta == pytest.approx(1 / 2)
+    assert found.u.astype(float) == pytest.approx([1, 1.5])
+    assert (found.u <= [1, 2]).all()
+
+
+def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypatch):
+    """Of a disc that contact alone holds, each node somewhere within a millimetre."""
+    mechanics = disc_between_plates().mechanics
+    rng = np.random.default_rng(161803)
+    u = 1e-3 * rng.standard_normal(mechanics.exact.f.size).astype(Real)
+    none = np.zeros(mechanics.exact.c.size, dtype=bool)
+    by_factor = admissible(mechanics, u, none)
+    monkeypatch.setattr(module, "DENSE", 2)
+    by_iterations = admissible(mechanics, u, none)
+
+    far = mechanics.norm(by_factor - u)
+    assert far > 0
+    assert mechanics.norm(by_iterations - by_factor) <= 1e-4 * far
+    assert (mechanics.exact.B @ by_iterations <= mechanics.exact.c).all()

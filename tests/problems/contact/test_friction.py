@@ -1,0 +1,161 @@
+"""Laws of friction and the fixed point of Coulomb's, of one node by hand."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from harness import Friction, InputError
+from harness.errors import PastEndError
+from harness.mechanics import NO_FRICTION
+from problems.contact.friction import (
+    FrictionLaw,
+    forces_at_nodes,
+    friction_of,
+    iterate_of,
+    law_of,
+    settled,
+)
+
+FORCE = 6.0  #: normal force without friction
+
+
+def friction(mu, bound=0.0, cohesion=0.0):
+    one = np.ones(1)
+    return Friction(
+        T=csr_array((1, 2)), bound=bound * one, start=0 * one, row=np.array([0]),
+        cohesion=cohesion * one, mu=mu * one,
+    )  # fmt: skip
+
+
+def lifted(by):
+    """Normal force of which a part of the friction's bound is taken away."""
+    return lambda one: FORCE - by * one.bound
+
+
+@pytest.mark.parametrize("cohesion", [0.0, 0.25])
+def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(cohesion):
+    """g = c + μ(6 − g)  with μ = ½: g = (c + 3)/1.5."""
+    found = settled(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
+
+    assert found[-1].bound == pytest.approx((cohesion + 3) / 1.5, rel=1e-10)
+    assert found[-1].unsettled == 0
+    for one, after in pairwise(found):
+        demanded = cohesion + 0.5 * (FORCE - one.bound)
+        assert after.bound == pytest.approx(demanded)
+        off = abs(one.bound - demanded) / one.bound
+        assert one.unsettled == pytest.approx(float(off[0]))
+
+
+def test_a_bound_of_zero_is_as_far_from_the_law_as_the_law_demands():
+    first, *others = settled(friction(0.5), lifted(0.0), step=1)
+
+    assert first.unsettled == 3.0
+    assert [float(one.bound[0]) for one in others] == [3.0]
+
+
+def test_a_law_that_asks_for_nothing_is_settled_at_once():
+    (only,) = settled(friction(0.0), lifted(1.0), step=1)
+
+    assert (only.bound, only.unsettled) == (0, 0)
+
+
+def test_bounds_that_go_apart_are_refused_with_the_nearest_and_the_last():
+    """μ = 1.01: each is 1.01 times as far from the fixed point, on the other side."""
+    calls = []
+
+    def normal(one):
+        calls.append(float(one.bound[0]))
+        return FORCE - one.bound
+
+    with pytest.raises(InputError, match="load step 7 does not settle") as e:
+        settled(friction(1.01, 3.0), normal, step=7)
+
+    assert "\n" not in str(e.value)
+    assert 31 <= len(calls) <= 33
+    assert f"after {len(calls)} Tresca problems" in str(e.value)
+    demanded = 1.01 * (FORCE - np.array(calls))
+    off = abs(np.array(calls) - demanded) / calls
+    assert f"is {off[-1]:.1e}, and was {off.min():.1e} at best" in str(e.value)
+
+
+def test_bounds_that_creep_end_at_a_thousand():
+    """Each is a thousandth nearer to a point that it never comes to."""
+    calls = []
+
+    def normal(one):
+        calls.append(one)
+        return one.bound * (1 + 1e-3 * 0.999 ** len(calls))
+
+    with pytest.raises(InputError, match="after 1000 Tresca problems"):
+        settled(friction(1.0, 1.0), normal, step=1)
+
+    assert len(calls) == 1000
+
+
+def test_a_bound_that_holds_no_equilibrium_is_named():
+    def normal(one):
+        if one.bound > 2:
+            raise ArithmeticError("no optimal point")
+        return FORCE - one.bound
+
+    with pytest.raises(
+        InputError, match=r"step 3: no equilibrium.* the 2\. bound"
+    ) as e:
+        settled(friction(0.5, 1.0), normal, step=3)
+    assert str(e.value).endswith("no optimal point")
+
+
+def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
+    problems = ["first", "second", "third"]
+
+    assert [iterate_of(problems, i, 1) for i in (0, 1, 2, 3)] == [
+        "third", "first", "second", "third",
+    ]  # fmt: skip
+    with pytest.raises(
+        PastEndError, match="iterate=4: the fixed point of step 5 has 3"
+    ):
+        iterate_of(problems, 4, 5)
+
+
+def test_nodes_are_pressed_and_never_pulled():
+    force = forces_at_nodes(np.array([2.0, -1.0, 3.0]), np.array([4, 0, 1]), 5)
+
+    assert force.tolist() == [0, 3, 0, 0, 2]
+
+
+def test_a_law_reads_what_is_its_own():
+    given = {"bound": 5.0, "mu": 0.3}
+
+    assert law_of({"friction": "none", **given}) == FrictionLaw()
+    assert law_of({"friction": "tresca", **given}) == FrictionLaw("tresca", bound=5.0)
+    assert law_of({"friction": "coulomb", **given}) == FrictionLaw("coulomb", mu=0.3)
+    assert [FrictionLaw(kind).acts for kind in ("none", "tresca", "coulomb")] == [
+        False, True, True,
+    ]  # fmt: skip
+
+
+def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_force():
+    """Two pairs of two and three slave nodes; rows of the nodes 1, 2 and 4."""
+    pairs = [SimpleNamespace(slave=np.arange(k)) for k in (2, 3)]
+    bodies = SimpleNamespace(pairs=pairs, force=10.0)
+    rows = SimpleNamespace(
+        row=np.array([0, 1, 2]), place=np.array([1, 2, 4]),
+        share=np.array([0.5, 2.0, 4.0]), T=csr_array(np.eye(3)),
+    )  # fmt: skip
+    laws = FrictionLaw("tresca", bound=20.0), FrictionLaw("coulomb", mu=0.5)
+    before, pressed = np.array([7.0, 8.0, 9.0]), np.array([1.0, 1.0, 3.0, 1.0, 5.0])
+    found = friction_of(bodies, rows, laws, before, pressed)
+
+    assert found.cohesion.tolist() == [20 * 0.5 / 10, 0, 0]
+    assert found.mu.tolist() == [0, 0.5, 0.5]
+    assert found.bound.tolist() == [1, 0.5 * 3, 0.5 * 5]
+    assert found.start.tolist() == [7, 8, 9]
+
+
+def test_without_rows_there_is_no_friction():
+    rows = SimpleNamespace(row=np.zeros(0, dtype=np.int64))
+
+    assert friction_of(None, rows, (), np.zeros(0), np.zeros(0)) is NO_FRICTION

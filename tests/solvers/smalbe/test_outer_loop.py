@@ -1,0 +1,127 @@
+"""The outer loop of SMALBE: what ends it, and what it does where nothing helps."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from harness import QP, Status, no_rows
+from solvers.smalbe.mprgp import Rules
+from solvers.smalbe.outer_loop import (
+    Constants,
+    InnerSolver,
+    Iterate,
+    _after_stall,
+    first_iterate,
+    infeasible,
+    smalbe,
+)
+from solvers.smalbe.projected import by_lanczos, projected_problem
+from solvers.smalbe.rows import orthonormal_rows
+
+
+def drawn(seed, n=60, condition=1e3):
+    """Bounds on the second half, two equality rows, eigenvalues 1 to 1/condition."""
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    P = Q * np.geomspace(1, 1 / condition, n) @ Q.T
+    P = (P + P.T) / 2
+    q, A, x = P @ rng.standard_normal(n), rng.standard_normal((2, n)), rng.random(n)
+    return QP(
+        P=P, q=q, A=A, b=A @ x, G=no_rows(n), h=np.zeros(0),
+        lb=np.where(np.arange(n) < n // 2, -np.inf, 0.0), ub=np.full(n, np.inf),
+    )  # fmt: skip
+
+
+def outer_loop(problem, x, *, tol, max_steps=20_000, energy=0.0):
+    """Run from x, with the constants of which the penalty is far too small."""
+    inner = InnerSolver(
+        Rules(1.0, "mixed", "cg"),
+        partial(problem.plain_model, alpha=1.9),
+        precondition=lambda rho: None,
+    )
+    start = first_iterate(problem, x, np.zeros(len(problem.rows.C)), M=1.0, rho=0.1)
+    constants = Constants(1.0, 0.5, 0.1, 1.0, max_steps, energy)
+    return smalbe(problem, constants, inner, tol, start)
+
+
+def problem_of(qp):
+    return projected_problem(qp, partial(by_lanczos, steps=10))
+
+
+@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+def test_an_energy_error_that_is_too_large_costs_some_more_products(seed):
+    """A quarter more, and what the last inner run takes: the estimate is never met."""
+    qp = drawn(seed)
+    products, found = [], []
+    for energy, tol in ((0.0, 1e-3), (1e-6, 1e-3), (0.0, 1e-12)):
+        problem = problem_of(qp)
+        begun = problem.F.count
+        run = outer_loop(problem, np.zeros(60), tol=tol, energy=energy)
+        assert run.status is Status.SOLVED
+        products.append(problem.F.count - begun)
+        found.append(run.nu + problem.rows.x_tilde)
+    errors = [np.sqrt((x - found[2]) @ qp.P @ (x - found[2])) for x in found[:2]]
+
+    assert 1.1 * products[0] < products[1] < 1.5 * products[0]
+    assert errors[1] < errors[0] / 2
+
+
+def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts():
+    """Relative to b, not to the gradient at the start, which is small there already."""
+    free = dict(A=no_rows(60), b=np.zeros(0), lb=np.full(60, -np.inf))
+    problem = problem_of(replace(drawn(271828), **free))
+    near = outer_loop(problem, np.zeros(60), tol=1e-8)
+    again = outer_loop(problem, problem.rows.x_tilde + near.nu, tol=1e-6)
+
+    assert near.status is again.status is Status.SOLVED
+    assert len(near.steps) > 20
+    assert again.steps == ""
+
+
+@pytest.mark.parametrize("most", [0, 1, 5, 20])
+def test_steps_and_outer_iterations_end_at_their_limit(most):
+    found = outer_loop(
+        problem_of(drawn(271828)), np.zeros(60), tol=1e-8, max_steps=most
+    )
+
+    assert found.status is Status.ITERATION_LIMIT
+    assert len(found.steps) + len(found.outer) <= most + 1
+
+
+def test_of_a_stall_with_rows_that_are_met_the_gradient_is_asked_for_more():
+    problem = problem_of(drawn(271828))
+    zero = np.zeros(60)
+    at = Iterate(nu=zero, g=zero, mu=np.zeros(2), M=1.0, rho=3.0)
+
+    stricter = _after_stall(problem, at, met=True)
+    assert (stricter.M, stricter.rho) == (0.1, 3.0)
+    assert _after_stall(problem, at._replace(M=1e-12), met=True) is None
+
+
+def test_of_a_stall_with_rows_that_are_not_met_the_penalty_grows():
+    problem = problem_of(drawn(271828))
+    nu = np.linspace(0, 1, 60)
+    at = Iterate(nu=nu, g=problem.H(nu, 3.0), mu=np.zeros(2), M=1.0, rho=3.0)
+
+    stricter = _after_stall(problem, at, met=False)
+    assert (stricter.M, stricter.rho) == (1.0, 30.0)
+    assert stricter.g == pytest.approx(problem.H(nu, 30.0))
+    assert _after_stall(problem, at._replace(rho=1e12), met=False) is None
+
+
+@pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, unit):
+    """x ≥ lb and a positive row whose right-hand side only x = lb meets, or nothing."""
+    rng = np.random.default_rng(seed)
+    A, lb = rng.uniform(0.1, 1, (1, 6)), rng.uniform(1, 2, 6)
+
+    def told(b):
+        rows = orthonormal_rows(A, unit * b)
+        nu = unit * lb - rows.x_tilde
+        return infeasible(rows, (nu, np.full(6, np.inf)), nu)
+
+    assert not told(A @ lb)
+    assert told((1 - 1e-6) * (A @ lb))
