@@ -38,7 +38,7 @@ ROUNDED = 1 + 1e-9  #: local solves are those of doubles
 NOISE = 1e-7  #: relative error from which on effectivities are measured
 
 
-class Truth(NamedTuple):
+class KnownSolution(NamedTuple):
     """The solution of the whole to rounding; on every rank."""
 
     u: np.ndarray  #: (n,) extended
@@ -64,7 +64,7 @@ def true(build, ranks):
     if ranks.rank == 0:
         mechanics = build().mechanics.whole
         point = reference_point(mechanics, reference_solution)
-        told = Truth(
+        told = KnownSolution(
             point.u, point.multipliers, point.norm, point.bound * point.norm,
             mechanics.rigid,
         )  # fmt: skip
@@ -100,7 +100,7 @@ def disturbed(s, rng, rigid):
     return (drifted, pressed, jumped)[kind - len(DISTURBANCES)](s, size, rng, rigid)
 
 
-class Search:
+class BoundSearch:
     """Certificates of answers to one problem, beside their errors."""
 
     def __init__(self, name, ranks):
@@ -207,7 +207,7 @@ def main():
     if not sys.argv[2:]:
         found = [refused(ranks, 1, push=0.1), refused(ranks, -1)]
     else:
-        found = {name: Search(name, ranks).result(count) for name in sys.argv[2:]}
+        found = {name: BoundSearch(name, ranks).result(count) for name in sys.argv[2:]}
     if ranks.rank == 0:
         print(json.dumps(found))
 
