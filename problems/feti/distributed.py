@@ -521,7 +521,7 @@ def condensed_by_ranks(
         n: ours[n].kind.border_factor(ours[n].touched)
         for n in given + kept if n not in alone
     }  # fmt: skip
-    found = dict[str, Condensed]()
+    found = dict[str, Dense]()  # (2, b, b) of what several ranks have
 
     def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
         for n in some:
@@ -529,27 +529,27 @@ def condensed_by_ranks(
             if n in alone:
                 yield place[n], kind.condensed(touched)
             else:
-                found[n] = kind.blocks(touched, factors.pop(n))
+                found[n] = np.stack(kind.blocks(touched, factors.pop(n)))
 
     before = meanwhile(tasks, me)
     yield from formed(kept[:before])
     came = _exchanged(
         ranks,
-        [(tasks[n].blocks, np.ascontiguousarray(factors[n].T)) for n in given],
+        [(tasks[n].blocks, np.ascontiguousarray(factors.pop(n).T)) for n in given],
         [(tasks[n].factor, (border[n], border[n])) for n in taken],
     )
     factors |= {n: L.T for n, L in zip(taken, came, strict=True)}
     yield from formed(kept[before:] + taken)
-    made = {n: np.stack(both) for n, both in found.items()}
     others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
-    to = [(r, n) for n in tasks if n in made for r in tasks[n].have if r != me]
+    to = [(r, n) for n in tasks if n in found for r in tasks[n].have if r != me]
     came = _exchanged(
         ranks,
-        [(r, made[n]) for r, n in to],
+        [(r, found[n]) for r, n in to],
         [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
     )
-    found |= {n: Condensed(*both) for n, both in zip(others, came, strict=True)}
-    yield from ((place[n], blocks) for n, blocks in found.items())
+    found |= dict(zip(others, came, strict=True))
+    del came
+    yield from ((place[n], Condensed(*found.pop(n))) for n in list(found))
 
 
 def _exchanged(
