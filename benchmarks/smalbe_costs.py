@@ -19,7 +19,7 @@ others on the same processor change less.
 
 from __future__ import annotations
 
-import sys
+from argparse import ArgumentParser
 from collections.abc import Callable
 from dataclasses import replace
 from time import process_time
@@ -28,7 +28,8 @@ import numpy as np
 from scipy.linalg.blas import dsymv
 
 import mortarbench as mb
-from harness import QP, Solution, kkt_residuals
+from harness import QP, InputError, Solution, kkt_residuals
+from harness.errors import unknown
 from harness.plugin import Solver
 from harness.record import VERIFIED_FACTOR
 from problems import PROBLEMS
@@ -198,15 +199,39 @@ def _kept(form: str, qp: QP, tol: float) -> None:
         )
 
 
-def race(case: str, solvers: str, rounds: str, tolerances: str = "1e-6,1e-8") -> None:
-    """Solve a case by several solvers in turn, to each tolerance."""
+def positive(text: str) -> float:
+    """Read a positive number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < np.inf:
+        raise InputError(f"tolerance {text!r}; expected a positive number")
+    return value
+
+
+def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
+    """Solve a case by several solvers in turn, to each tolerance.
+
+    Raises
+    ------
+    InputError
+        When a name, the rounds or a tolerance is none.
+
+    """
+    names = solvers.split(",")
+    for name in names:
+        if name not in SOLVERS:
+            raise unknown("solver", name, SOLVERS)
+    if rounds < 1:
+        raise InputError(f"{rounds} rounds; expected at least one")
     qp = mb.build(case).qp
-    for tol in map(float, tolerances.split(",")):
+    for tol in map(positive, tolerances.split(",")):
         told = in_turn(
-            int(rounds),
+            rounds,
             **{
                 name: timed(lambda name=name, tol=tol: SOLVERS[name].prepare(qp, tol)())
-                for name in solvers.split(",")
+                for name in names
             },
         )
         for name, (typical, fast) in told.items():
@@ -220,6 +245,24 @@ def race(case: str, solvers: str, rounds: str, tolerances: str = "1e-6,1e-8") ->
             )
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Read the command line, and do what it says."""
+    parser = ArgumentParser(description="What a solve of SMALBE costs.")
+    tables = parser.add_subparsers(dest="table", required=True)
+    for name in ("dense", "sparse", "kept"):
+        tables.add_parser(name)
+    of_race = tables.add_parser("race", help="solve a case by several solvers in turn")
+    of_race.add_argument("case")
+    of_race.add_argument("solvers", help="names, separated by commas")
+    of_race.add_argument("rounds", type=int)
+    of_race.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
+    given = vars(parser.parse_args())
     chosen = {"dense": dense, "sparse": sparse, "kept": kept, "race": race}
-    chosen[sys.argv[1]](*sys.argv[2:])
+    try:
+        chosen[given.pop("table")](**given)
+    except InputError as e:
+        parser.error(str(e))
+
+
+if __name__ == "__main__":
+    main()

@@ -109,11 +109,7 @@ def test_what_supports_eliminate_is_certified_in_subdomains_that_float(found):
 )
 def test_quantities_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
-        by_ranks, by_one = (
-            flat(answer[one]["quantities"]) for one in ("by_ranks", "by_one")
-        )
-        # each rank has blocks of its own of the kinds that it has
-        del by_ranks["/explicit_mib"], by_one["/explicit_mib"]
+        by_ranks, by_one = quantities_of_both(answer)
 
         assert list(by_ranks) == list(by_one)
         for name, value in by_one.items():
@@ -125,10 +121,7 @@ def test_quantities_by_ranks_are_those_of_one_process(found, case):
 @pytest.mark.parametrize("case", [HELD[2], ELIMINATED, REDUNDANT])
 def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
     for answer in found[case]:
-        by_ranks, by_one = (
-            flat(answer[one]["quantities"]) for one in ("by_ranks", "by_one")
-        )
-        del by_ranks["/explicit_mib"], by_one["/explicit_mib"]
+        by_ranks, by_one = quantities_of_both(answer)
 
         assert list(by_ranks) == list(by_one)
         for name, value in by_one.items():
@@ -204,6 +197,17 @@ def test_a_load_that_nothing_balances_is_refused_in_the_words_of_one_process():
     assert lifted[0] == lifted[1]
     assert "nothing balances the load of body upper along x" in pushed[0]
     assert "contact would have to pull" in lifted[0]
+
+
+def quantities_of_both(answer):
+    """Numbers by ranks and by one process, but for the memory of blocks.
+
+    Each rank has blocks of its own of the kinds that it has.
+    """
+    both = [flat(answer[one]["quantities"]) for one in ("by_ranks", "by_one")]
+    for found in both:
+        del found["/explicit_mib"]
+    return both
 
 
 def flat(quantities, prefix=""):

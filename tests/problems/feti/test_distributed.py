@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from problems.feti.distributed import AFTER_FACTOR, forming, meanwhile
+from problems.feti.distributed import AFTER_FACTOR, Forming, forming, meanwhile
 
 
 def loads(work):
@@ -30,6 +30,18 @@ def test_blocks_fill_the_time_until_factors_are_given_away():
 
     assert meanwhile(tasks, more) == 0
     assert meanwhile(tasks, less) == 3  # blocks take a third of a factor
+
+
+def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
+    tasks = {
+        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
+        "b": Forming(4, [1], factor=1, blocks=1),
+        "c": Forming(4, [1], factor=1, blocks=1),
+        "d": Forming(40, [0], factor=0, blocks=0),  # which nobody waits for
+    }
+
+    assert meanwhile(tasks, 1) == 1
+    assert meanwhile(tasks, 0) == 0
 
 
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
