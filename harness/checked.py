@@ -1,13 +1,16 @@
 """Plain data that a user wrote, checked: what is wrong, where, what would be right.
 
-All functions raise `InputError`; `where` names the value as the user knows it.
+The data are of a file, or arguments of a Python program. All functions raise
+`InputError`; `where` names the value as the user knows it.
 """
 
 from __future__ import annotations
 
+import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from harness.errors import InputError, shown, unknown
@@ -90,3 +93,43 @@ def table(where: str, value: object, *, instead: str = "a table") -> dict[str, A
     if not isinstance(value, dict):
         raise InputError(f"{where} = {shown(value)}; expected {instead}")
     return value
+
+
+def path(where: str, value: object) -> Path:
+    """Take a path, as a text or a path of Python, that a file system can have."""
+    if not isinstance(value, str | os.PathLike) or not isinstance(
+        text := os.fspath(value), str
+    ):
+        raise InputError(f"{where} = {shown(value)}; expected a path, a str or a Path")
+    if not text:
+        raise InputError(f"{where} is empty; expected a path")
+    try:
+        os.stat(text)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as e:  # a NUL or a lone surrogate
+        why = e.strerror if isinstance(e, OSError) else "no name of a file"
+        raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
+    return Path(text)
+
+
+def texts(where: str, value: object) -> tuple[str, ...]:
+    """Take several texts; one by itself is a list of its characters by mistake."""
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
+        found = tuple(value)
+        if all(isinstance(each, str) for each in found):
+            return found
+    raise InputError(f"{where} = {shown(value)}; expected a list of texts")
+
+
+def flag(where: str, value: object) -> bool:
+    """Take True or False; 0 and 1 stand for them."""
+    if not isinstance(value, int) or value not in (0, 1):
+        raise InputError(f"{where} = {shown(value)}; expected True or False")
+    return bool(value)
+
+
+def function(where: str, value: object) -> None:
+    """Refuse what cannot be called."""
+    if not callable(value):
+        raise InputError(f"{where} = {shown(value)}; expected a function")

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from hashlib import sha256
-from typing import IO
+from typing import IO, TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from hashlib import _Hash
+
+Digest: TypeAlias = "_Hash"  #: of parts so far; ``update`` takes another one
 
 _PIECE = 2**20  #: bytes that are read at once
 
@@ -14,10 +19,15 @@ def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
 
     digits : 64 at most; each has 4 bits
     """
+    return running_digest(parts).hexdigest()[:digits]
+
+
+def running_digest(parts: Iterable[bytes]) -> Digest:
+    """Hash `parts`, one after another, so that more can follow by ``update``."""
     content = sha256()
     for part in parts:
         content.update(part)
-    return content.hexdigest()[:digits]
+    return content
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:

@@ -20,6 +20,9 @@ class InputError(Exception):
     The command line prints it without a traceback and exits with code 2.
     """
 
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())  # of names, too
+
 
 class PastEndError(InputError):
     """There are fewer problems than that, as of a fixed point that has settled before.

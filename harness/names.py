@@ -74,6 +74,11 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
         key=value, a value of the wrong type, and whatever ``family.check`` refuses.
 
     """
+    if not isinstance(text, str):
+        raise InputError(
+            f"case = {shown(text)}; expected its name as a text, such as "
+            "beam-ring/Nr=4/Nh=3/dual, or file:PATH"
+        )
     head = re.split("[:/]", text, maxsplit=1)[0]
     if head not in families:
         if (named := _as_file(text, families)) is not None:

@@ -134,6 +134,8 @@ class Fields:
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     contact_forces: NDArray[Any] | None = None  #: (c, 2) force on each slave node, N/m
     contacts: tuple[ContactSide, ...] = ()  #: each pair on its own
+    #: (E,) subdomain of each cell, from 0; None for bodies that are not torn
+    subdomains: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

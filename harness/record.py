@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from msgspec.json import Decoder
 
 #: version of the journal line; raised whenever a field changes its meaning.
-#: 2: the four residuals have other scales (docs/mathematics.md)
+#: 2: the four residuals have other scales (docs/verdicts.md)
 SCHEMA = 2
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
 READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
@@ -42,15 +42,27 @@ class Verdict(StrEnum):
     """Our judgement of a measurement, whatever the solver claimed."""
 
     VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` where known
+    #: claimed infeasible, and proven by a certificate: `harness.verify.infeasibility`
+    VERIFIED_INFEASIBLE = "verified_infeasible"
     INACCURATE = "inaccurate"  #: claimed solved; at least half the digits are there
     WRONG = "wrong"  #: claimed solved, refuted
-    INFEASIBLE_CLAIM = "infeasible_claim"
+    INFEASIBLE_CLAIM = "infeasible_claim"  #: not proven
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     MEMORY_LIMIT = "memory_limit"
     CRASHED = "crashed"  #: the process died
     FAILED = "failed"  #: it raised or gave up
     DECLINED = "declined"  #: it said beforehand why it cannot
+
+    @property
+    def words(self) -> str:
+        """The verdict as text."""
+        return self.value.replace("_", " ")
+
+    @property
+    def is_verified(self) -> bool:
+        """True for a right answer: a solution, or a proof that there is none."""
+        return self in (Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -136,7 +148,8 @@ class Record(Measurement):
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: "reference" where `optimum_error` decided the verdict, and not the residuals
+    #: "reference" where `optimum_error` decided the verdict, and not the residuals;
+    #: "certificate" where a claim of infeasibility was proven
     decided_by: str = "residuals"
     optimum_error: float | None = (
         None  #: against the proven optimum, harness.verify.optimum
@@ -172,6 +185,11 @@ class Record(Measurement):
     def judged_at(self) -> float:
         """The tolerance that the verdict is about."""
         return self.asked_tol if self.accuracy is None else self.accuracy
+
+    @property
+    def claims_answer(self) -> bool:
+        """True if the solver claims a solution, or rightly that there is none."""
+        return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
     def but(self, **changes: Any) -> Self:
         """Copy with some fields changed."""
@@ -342,6 +360,8 @@ def _check(r: Record) -> None:
                 name = journal_name(name)
                 raise ValueError(f"{name} = {value!r}; expected no negative number")
             _check_nested(journal_name(name), value, 0)
+    if not 1 <= r.ranks <= LARGEST_INTEGER:
+        raise ValueError(f"ranks = {r.ranks!r}; expected a number of ranks, 1 or more")
     _check_seconds(r)
     _check_nested("iterations", r.iterations, 0)
     _check_nested("reported", r.reported, MOST_LEVELS)

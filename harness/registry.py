@@ -36,7 +36,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from harness.digest import hex_digest, pieces
-from harness.errors import PLUGINS, InputError, unknown
+from harness.errors import PLUGINS, InputError, shown, unknown
 from harness.plugin import Family, Solver, as_family
 
 if TYPE_CHECKING:
@@ -516,14 +516,12 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 f"{where}: {name} is of type {_type(offered)}; expected dict"
             )
         for key, thing in offered.items():
+            at = f"{where}: {name}[{key!r}]"
             if isinstance(thing, type):
+                raise InputError(f"{at} is a class; expected an instance")
+            if not isinstance(key, str) or not _has(parts, thing):
                 raise InputError(
-                    f"{where}: {name}[{key!r}] is a class; expected an instance"
-                )
-            lacking = [part for part in parts if not hasattr(thing, part)]
-            if not isinstance(key, str) or lacking:
-                raise InputError(
-                    f"{where}: {name}[{key!r}] is of type {_type(thing)}; "
+                    f"{at} is of type {_type(thing)}; "
                     f"expected a {kind}, under a name, with {', '.join(parts)}"
                 )
     for key, family in problems.items():
@@ -535,6 +533,32 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
     families = {name: as_family(offered) for name, offered in problems.items()}
     return Plugin(solvers=dict(solvers), problems=families, origin=where)
+
+
+def check_solver(thing: object) -> None:
+    """Refuse a `thing` that is neither the name of a solver nor a solver.
+
+    Raises
+    ------
+    InputError
+        With the expected names of methods.
+
+    """
+    methods = " and ".join(_SOLVER_PARTS)
+    if isinstance(thing, type) and _has(_SOLVER_PARTS, thing):
+        raise InputError(
+            f"solver = {thing.__name__} is a class; expected an instance, such as "
+            f"{thing.__name__}()"
+        )
+    if not isinstance(thing, str) and not _has(_SOLVER_PARTS, thing):
+        raise InputError(
+            f"solver = {shown(thing)}; expected the name of a solver, or an object "
+            f"with the methods {methods}"
+        )
+
+
+def _has(parts: Sequence[str], thing: object) -> bool:
+    return all(hasattr(thing, part) for part in parts)
 
 
 def _check_names(where: str, family: Any) -> None:

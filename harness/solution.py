@@ -48,7 +48,8 @@ class Status(StrEnum):
 class Solution:
     """A primal-dual point in the sign convention of `QP`; NaN where there is none.
 
-    At a solution  P x + q + Aᵀy + Gᵀz + z_box = 0.
+    At a solution  P x + q + Aᵀy + Gᵀz + z_box = 0.  With a claim of infeasibility, y, z
+    and z_box may be a certificate: see `without_point`.
     """
 
     status: Status
@@ -67,10 +68,27 @@ class Solution:
     )  #: columns of one length, a row per iteration; see the top of this module
 
     @classmethod
-    def without_point(cls, qp: QP, status: Status, message: str = "") -> Solution:
-        """Report that no point was found: NaN vectors of the right shapes."""
+    def without_point(
+        cls,
+        qp: QP,
+        status: Status,
+        message: str = "",
+        *,
+        y: Vector | None = None,
+        z: Vector | None = None,
+        z_box: Vector | None = None,
+    ) -> Solution:
+        """Report that no point was found: NaN vectors of the right shapes.
+
+        y, z, z_box : a certificate that no point is feasible, where the solver has one:
+            Aᵀy + Gᵀz + z_box = 0, z ≥ 0, and the sum of bᵀy, hᵀz and of z_box times its
+            bounds is negative
+        """
         n, m, p = (np.full(v.size, np.nan) for v in (qp.q, qp.b, qp.h))
-        return cls(status=status, x=n, y=m, z=p, z_box=n, message=message)
+        return cls(
+            status=status, message=message, x=n, y=m if y is None else y,
+            z=p if z is None else z, z_box=n if z_box is None else z_box,
+        )  # fmt: skip
 
     def mismatch(self, qp: QP) -> str | None:
         """Say which vector has a shape that does not fit `qp`, or None."""

@@ -3,6 +3,8 @@
 # Usage: tools/setup.sh PYTHON [browser|docs]   (called by make; does only what is missing)
 # browser: what the tests of the report's page need besides, chromium and its driver
 # docs: what builds the site
+# System packages are named before they are installed, and asked for on a terminal;
+# elsewhere they are installed where root, or sudo without a password, allows it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1
@@ -30,13 +32,18 @@ missing_packages() {
 }
 
 install_packages() {
-    local install=(apt-get install -y --no-install-recommends "$@") as_root=()
-    if [ "$(id -u)" -ne 0 ]; then
+    local install=(apt-get install -y --no-install-recommends "$@") as_root=() answer
+    echo "setup: missing system packages: $*"
+    [ "$(id -u)" -eq 0 ] || as_root=(sudo)
+    if [ -t 0 ] && [ -t 2 ]; then
+        read -r -p "setup: run ${as_root[*]} ${install[*]}? [y/N] " answer || answer=
+        [[ $answer =~ ^[Yy] ]] || die "nothing was installed; run: sudo ${install[*]}"
+    elif [ ${#as_root[@]} -gt 0 ]; then
         as_root=(sudo -n)
         sudo -n true 2>/dev/null ||
-            die "missing system packages; run: sudo ${install[*]}"
+            die "no terminal to ask for a password; run: sudo ${install[*]}"
     fi
-    echo "setup: installing $*"
+    echo "setup: installing $* by ${as_root[*]} apt-get"
     "${as_root[@]}" apt-get update -qq || echo "setup: apt-get update failed; going on" >&2
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq >/dev/null ||
         die "could not install system packages; run: sudo ${install[*]}"
@@ -58,9 +65,11 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
     "$python" -m venv --clear .venv ||
     die "could not make .venv with $python"
 
-# The variables pin what wheels are built with, too (new pip reads the second).
+# The variables pin what wheels are built with, too (new pip reads the second). They are
+# lists, split at spaces, which an address has none of.
 echo "setup: installing Python packages into .venv"
-export PIP_CONSTRAINT="$PWD/constraints.txt" PIP_BUILD_CONSTRAINT="$PWD/constraints.txt"
+constraints=$(.venv/bin/python -c 'import pathlib; print(pathlib.Path("constraints.txt").resolve().as_uri())')
+export PIP_CONSTRAINT=$constraints PIP_BUILD_CONSTRAINT=$constraints
 .venv/bin/python -m pip install -q --disable-pip-version-check -e ".[${extra:-fleet,mpi,dev}]"
 # what pip does for packages that it copies: no process has to compile ours
 .venv/bin/python -m compileall -q harness problems solvers reports mortarbench

@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, eigh, lapack, qr
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -34,6 +34,9 @@ from harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
+DEPENDENT = 1e-13  #: pivots of rows of length one below this are rounding
+UNSTUCK = 1e-15  #: added to the diagonal so that no pivot of dependent rows is zero
+PIVOT = 1e-3  #: by which a pivot may miss its least value, for the rounding of both
 FILL = 8  #: entries for each row of A that the dense factor of the shared rows may have
 
 
@@ -124,10 +127,8 @@ class LocalFactor:
             y[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
         return y
 
-    def completed(self, scale: float = 1.0, less: Dense | None = None) -> SummedFactor:
-        """Factorise scale·A − Σ_p `less`_p, which differs from scale·A on borders.
-
-        less : (b, b)
+    def completed(self) -> SummedFactor:
+        """Factorise A.
 
         Raises
         ------
@@ -135,35 +136,35 @@ class LocalFactor:
             Where that is not positive definite.
 
         """
-        ranks, c, place = self.at.ranks, self.changing, self.at.place
-        T = scale * self.complement
-        if less is not None:
-            T -= less
-        s = self.at.shared.size
-        told = np.zeros(s**2 + 1)
-        S = told[:-1].reshape(s, s)
+        ranks, c = self.at.ranks, self.changing
+        fails, L_cc = 0.0, self.complement[:c, :c]
         try:
-            L_cc = _cholesky(T[:c, :c])
-            L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
-            S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
-        except np.linalg.LinAlgError:  # to be said by all ranks alike
-            told[-1] = 1.0
-        told = ranks.total(told)
+            L_cc = _cholesky(L_cc)
+        except np.linalg.LinAlgError:
+            fails = 1.0
+        if ranks.extreme(fails, np.max):  # raised by all ranks alike
+            raise DependentRowsError("the rows depend on each other")
+        L_sc, S = self._onto_shared(self.complement, L_cc)
         try:
-            if told[-1]:
-                raise np.linalg.LinAlgError
-            L_ss = _cholesky(told[:-1].reshape(s, s))
+            return SummedFactor(self, 1.0, L_cc, L_sc, _cholesky(S))
         except np.linalg.LinAlgError:
             raise DependentRowsError("the rows depend on each other") from None
-        return SummedFactor(self, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
+
+    def _onto_shared(self, T: Dense, L_cc: Dense) -> tuple[Dense, Dense]:
+        """Eliminate changing rows of T (b, b): L_sc, and the sum over ranks (s, s)."""
+        c, s, place = self.changing, self.at.shared.size, self.at.place
+        L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
+        S = np.zeros((s, s))
+        S[place[:, None], place] = T[c:, c:] - L_sc @ L_sc.T
+        return L_sc, self.at.ranks.total(S.ravel()).reshape(s, s) if s else S
 
 
 @dataclass(frozen=True, eq=False)
 class SummedFactor:
-    """LLᵀ = scale·A − Σ_p less_p over ranks."""
+    """LLᵀ = A, or (1 + κ)A − Σ_p less_p, over ranks."""
 
     local: LocalFactor
-    root: float  #: √scale
+    root: float  #: √(1 + κ)
     L_cc: Dense  #: (c, c) of the changing rows of this rank
     L_sc: Dense  #: (s_p, c) of its shared rows
     L_ss: Dense  #: (s, s) of the shared rows of all, the same on all ranks
@@ -177,6 +178,20 @@ class SummedFactor:
             self.root * of_inner, np.diag(self.L_cc), np.diag(self.L_ss),
         ])  # fmt: skip
         return self.local.at.ranks.extreme(float(own.min(initial=np.inf)), np.min)
+
+    def shifted(self, shift: float, less: Dense) -> SummedFactor:
+        """Factorise (1 + shift)A − Σ_p `less`_p with the factor of A.
+
+        less : (b, b) on the border, with Σ_p `less`_p ≤ A. Schur complements grow with
+            their matrix, so that those met here are at least `shift` times those of A,
+            which L_cc and L_ss are factors of.
+        """
+        local, c, scale = self.local, self.local.changing, 1 + shift
+        T = scale * local.complement - less
+        L_cc = factor_above(T[:c, :c], shift, self.L_cc)
+        L_sc, S = local._onto_shared(T, L_cc)
+        L_ss = factor_above(S, shift, self.L_ss)
+        return SummedFactor(local, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
 
     def forward(self, t: Dense) -> DistributedVector:
         """Take an additive t (k,) to L⁻¹t (k - s_p + s,), orthonormal."""
@@ -270,6 +285,63 @@ def local_factor(
     if at.ranks.extreme(fails, np.max):
         raise DependentRowsError("the rows depend on each other")
     return LocalFactor(at, order, second.size, factor, np.asarray(L_bb))
+
+
+def independent_rows(gram: Matrix) -> Rows:
+    """Return rows G of a matrix that are independent and span all, from GGᵀ (r, r).
+
+    A row counts as dependent where its pivot, the square of its distance from the span
+    of the rows before it, is at most `DEPENDENT` of the square of its length. The first
+    such row is left out, then all pivots are computed anew: those behind are rounding.
+
+    Returns
+    -------
+    (k,) their numbers, ascending
+
+    """
+    size = np.sqrt(gram.diagonal())
+    kept = np.flatnonzero(size > 0)
+    while kept.size:
+        inverse = diags_array(1 / size[kept])
+        unit = inverse @ csc_array(gram)[kept][:, kept] @ inverse
+        shifted = with_int32(unit + diags_array(np.full(kept.size, UNSTUCK)))
+        factor = analyze(shifted, mode="simplicial", use_long=False)
+        factor.cholesky_inplace(shifted)
+        dependent = np.flatnonzero(factor.D() <= DEPENDENT)
+        if not dependent.size:
+            break
+        kept = np.delete(kept, factor.P()[dependent[0]])
+    return kept
+
+
+def factor_above(M: Dense, share: float, L_0: Dense) -> Dense:
+    """Return L with LLᵀ = M, for an M that exact arithmetic has at least share·L₀L₀ᵀ.
+
+    M is a difference of matrices as large as L₀L₀ᵀ. Where the share is less than what
+    they cancel to, its eigenvalues are rounding, of either sign. The pivots of M are no
+    less than those of share·L₀L₀ᵀ; where they are, the matrix L₀⁻¹ML₀⁻ᵀ ≥ share·I is
+    decomposed instead, its eigenvalues λ are raised to the share, and
+
+        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   from a QR factorisation of √λ QᵀL₀ᵀ,
+
+    which forms no difference, and has that floor whatever was cancelled.
+
+    M : (k, k) symmetric
+    L_0 : (k, k) lower triangular
+    """
+    try:
+        L = _cholesky(M)
+        if (np.diag(L) ** 2 >= (1 - PIVOT) * share * np.diag(L_0) ** 2).all():
+            return L
+    except np.linalg.LinAlgError:
+        pass
+    inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
+    size, Q = eigh((inner + inner.T) / 2)
+    root = np.sqrt(np.maximum(size, share))
+    half = blas.dtrmm(1.0, L_0, Q * root, lower=1)
+    (R,) = qr(half.T, mode="r", overwrite_a=True)
+    L = np.asfortranarray(R.T)
+    return L * np.where(np.diag(L) < 0, -1.0, 1.0)
 
 
 def _cholesky(M: Dense) -> Dense:

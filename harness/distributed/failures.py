@@ -9,11 +9,13 @@ end of all processes ends that (`abort`).
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NoReturn, TypeVar
 
 import numpy as np
@@ -23,10 +25,10 @@ from harness.distributed.vectors import Ranks
 T = TypeVar("T")
 
 ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others
+#: environment variable with the file descriptor where `harness.processes.ranks.launch`
+#: reads how ranks failed; what a solver prints is not looked at
+RECORD = "MORTARBENCH_RANK_RECORD"
 _PAUSE_SECONDS = 1e-3  #: between two looks whether they have come
-#: that mpiexec is given to hand on what was said: it drops what it has not read when
-#: it ends all
-_FORWARDED_SECONDS = 0.3
 _LONGEST = 500  #: bytes that are told of a failure
 
 
@@ -73,18 +75,23 @@ def agreed(ranks: Ranks, work: Callable[[], T]) -> T:
 
 
 def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
-    """Say on stderr which rank failed and how, and end all ranks."""
-    traceback.print_exception(failure)
-    say(_named(ranks.rank, ranks, in_a_line(failure)))
-    time.sleep(_FORWARDED_SECONDS)
+    """Record which rank failed and how, and end all ranks."""
+    record(ranks.rank, _named(ranks.rank, ranks, in_a_line(failure)))
+    with suppress(OSError, ValueError):  # a solver may have closed it
+        traceback.print_exception(failure)
+        sys.stderr.flush()
     ranks.comm.Abort(1)
     raise SystemExit(1)
 
 
-def say(line: str) -> None:
-    """Write a line to stderr at once, so that lines of several ranks do not mix."""
-    sys.stderr.flush()
-    os.write(sys.stderr.fileno(), f"{line}\n".encode())
+def record(rank: int, failure: str) -> None:
+    """Report the failure of a rank to the process that launched the ranks, if any.
+
+    One line, written at once, so that lines of several ranks do not mix.
+    """
+    what = {"rank": rank, "failed": failure[:_LONGEST]}
+    with suppress(OSError, KeyError):
+        os.write(int(os.environ[RECORD]), f"{json.dumps(what)}\n".encode())
 
 
 def in_a_line(failure: BaseException) -> str:

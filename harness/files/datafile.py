@@ -101,10 +101,9 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
     """
     with opened(path, expected) as file:
         if path.suffix.lower() != ".gz":
-            check_size(
-                f"{path}: what it says", copies * os.fstat(file.fileno()).st_size
-            )
-            return file.read()
+            size = os.fstat(file.fileno()).st_size
+            check_size(f"{path}: what it says", copies * size)
+            return file.read(size)
         try:
             most, size = most_bytes() // copies, 0
             with gzip.GzipFile(fileobj=file) as pieces:

@@ -1,9 +1,7 @@
-"""Files that outlive a crash: whole or not there, or line by line; and full disks.
+"""Files that outlive a crash: whole or not there; and full disks.
 
 A process may die, and a disk may be full, at any instant. A file that is replaced holds
-either its old content or all of its new one. A file of lines holds whole lines and at
-most one partial line at the end, which counts for nothing: readers skip it, the next
-writer cuts it off.
+either its old content or all of its new one. Files of lines: `harness.files.lines`.
 """
 
 from __future__ import annotations
@@ -11,12 +9,11 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
-from types import TracebackType
-from typing import IO, Self
+from typing import IO
 
 from harness.errors import InputError
 
@@ -27,7 +24,6 @@ _OLD = ("suite.tmp", "environment.tmp")
 #: of an OSError: the disk, or our share of it, takes no more
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _PROBE_BYTES = 2**16
-_CHUNK = 2**16
 _MIB = 2**20
 
 
@@ -61,13 +57,13 @@ def keep_private(path: Path, content: bytes) -> None:
         _sync(file)
         with suppress(FileExistsError):
             os.link(new, path)
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
 
 
 def move_file(whole: Path, path: Path) -> None:
     """Have a file that is on the disk take the place of `path`, in the same folder."""
     os.replace(whole, path)
-    _sync_folder(path.parent)
+    sync_folder(path.parent)
 
 
 @contextmanager
@@ -99,93 +95,6 @@ def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:
         found += [path for pattern in _OTHERS for path in one.glob(pattern)]
     for path in found:
         path.unlink(missing_ok=True)
-
-
-class Lines:
-    """The writer's end of a file of lines, of which nobody else writes.
-
-    restored : told in a line when the file had to be written again
-    """
-
-    def __init__(self, path: Path, restored: Callable[[str], None]) -> None:
-        self._path = path
-        self._restored = restored
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._open()
-
-    def append(self, text: str) -> None:
-        """Write one line and return when it is on the disk, or raise and write none.
-
-        Raises
-        ------
-        InputError
-            When something else writes to the file.
-        OSError
-            When the disk is full, say.
-
-        """
-        self.restore()
-        line = memoryview(f"{text}\n".encode())
-        size = len(line)
-        try:
-            while line:  # a write to a disk that is nearly full may be short
-                line = line[os.write(self._fd, line) :]
-            os.fsync(self._fd)
-        except OSError:
-            os.ftruncate(self._fd, self._end)
-            raise
-        self._end += size
-
-    def restore(self) -> None:
-        """Write the file again if it was deleted or replaced since it was opened.
-
-        All that was in it is in the file that we hold open, whatever its name leads to.
-        Lines that a file in its place has and ours has not are kept.
-
-        Raises
-        ------
-        InputError
-            When the file has been made shorter or longer by something else.
-
-        """
-        held = os.fstat(self._fd)
-        if held.st_size != self._end:
-            raise InputError(
-                f"{self._path} was changed by another program while the run wrote it; "
-                "the same command continues with what it holds now"
-            )
-        with suppress(FileNotFoundError):
-            if os.path.samestat(held, self._path.stat()):
-                return
-        there = _whole_lines(self._path)
-        known = set(there)
-        mine = os.pread(self._fd, self._end, 0).splitlines(keepends=True)
-        lost = [line for line in mine if line not in known]
-        replace_file(self._path, b"".join([*there, *lost]))
-        os.close(self._fd)
-        self._open()
-        self._restored(
-            f"{self._path} was deleted or replaced; its {len(lost)} "
-            f"line{'s' * (len(lost) != 1)} that were missing are there again"
-        )
-
-    def _open(self) -> None:
-        flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
-        self._fd = os.open(self._path, flags, 0o666)
-        self._end = _end_of_lines(self._fd)
-        os.ftruncate(self._fd, self._end)
-        _sync_folder(self._path.parent)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        os.close(self._fd)
 
 
 @contextmanager
@@ -250,31 +159,10 @@ def _full(path: Path, code: int) -> str:
     )
 
 
-def _sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk, too."""
+def sync_folder(folder: Path) -> None:
+    """Flush the names in a folder to the disk."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)
     finally:
         os.close(fd)
-
-
-def _end_of_lines(fd: int) -> int:
-    """Find the offset behind the last newline."""
-    end = os.fstat(fd).st_size
-    while end > 0:
-        start = max(0, end - _CHUNK)
-        newline = os.pread(fd, end - start, start).rfind(b"\n")
-        if newline != -1:
-            return start + newline + 1
-        end = start
-    return 0
-
-
-def _whole_lines(path: Path) -> list[bytes]:
-    """Read a file but for a partial last line; no lines where there is no file."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        return []
-    return content[: content.rfind(b"\n") + 1].splitlines(keepends=True)

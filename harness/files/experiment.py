@@ -13,11 +13,11 @@ import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from harness.errors import InputError
+from harness.files.csvfile import csv_text
 from harness.files.durable import replace_file
 from harness.files.reading import read_json
 from harness.files.store import load_fields, save_fields
@@ -73,11 +73,9 @@ def load_experiment(folder: Path) -> Experiment:
 
 def _write_csv(path: Path, rows: Iterable[Row]) -> None:
     rows = list(rows)
-    text = StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    replace_file(path, text.getvalue().encode())
+    heads = list(rows[0])
+    text = csv_text(heads, ([row[head] for head in heads] for row in rows))
+    replace_file(path, text.encode())
 
 
 def _read_csv(path: Path) -> list[Row]:

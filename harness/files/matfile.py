@@ -23,14 +23,12 @@ from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, content, json_object, parsing
 from harness.files.durable import replacing
 from harness.files.qpfile import (
-    canonical,
     check_dense,
-    check_symmetric,
     compressed,
     explicit_matrices,
     listed_dense,
 )
-from harness.qp import QP, Matrix, Vector
+from harness.qp import QP, Matrix, Vector, canonical, check_symmetric
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"

@@ -30,8 +30,8 @@ from scipy.sparse import csc_array, issparse
 from harness.errors import InputError, shortened
 from harness.files.datafile import check_size, json_object, most_bytes, opened
 from harness.files.durable import replacing
-from harness.files.qpfile import check_symmetric, explicit_matrices, listed_dense
-from harness.qp import QP, Matrix, Vector, no_rows
+from harness.files.qpfile import explicit_matrices, listed_dense
+from harness.qp import QP, Matrix, Vector, check_symmetric, no_rows
 
 _MATRICES = ("P", "G", "A")
 _KEY = "mortarbench"

@@ -26,17 +26,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, issparse
+from scipy.sparse import csc_array
 
 from harness.errors import InputError, shortened, unknown
 from harness.files.datafile import check_size, json_object
 from harness.files.npz import write_mappable
 from harness.files.store import digest_of, mapped_arrays
 from harness.operators import Maker, SerialisableOperator, assembled
-from harness.qp import QP, Matrix, Structure, Vector, no_rows
-
-SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
-_STRIP = 256  #: rows of a dense matrix that are compared at once
+from harness.qp import QP, Matrix, Structure, Vector, canonical, check_symmetric
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -184,19 +181,8 @@ def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
                 raise unknown("array", name, (*_VECTORS, *_MATRICES))
         matrices = {name: _plain_matrix(arrays, name) for name in _MATRICES}
         vectors = {name: _plain_vector(arrays, name) for name in _VECTORS}
-        P, q = matrices["P"], vectors["q"]
-        if P is None or q is None:
-            raise ValueError(f"{'P' if P is None else 'q'} is missing")
-        for M, side in (("G", "h"), ("A", "b")):
-            if (matrices[M] is None) != (vectors[side] is None):
-                here, gone = (side, M) if matrices[M] is None else (M, side)
-                raise ValueError(f"{gone} is missing beside {here}")
-        n = q.size
-        free = {"lb": np.full(n, -np.inf), "ub": np.full(n, np.inf)}
-        none = {"G": no_rows(n), "A": no_rows(n), "h": np.zeros(0), "b": np.zeros(0)}
-        given = {k: v for k, v in (matrices | vectors).items() if v is not None}
-        qp = QP(**(free | none | given))
-        check_symmetric(qp.P)
+        arguments: dict[str, Any] = {**matrices, **vectors}
+        qp = QP.from_arrays(**arguments)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
     except InputError as e:
@@ -253,43 +239,6 @@ def check_dense(name: str, M: Matrix) -> None:
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
-
-
-def check_symmetric(P: Matrix) -> None:
-    """Refuse a P that is not symmetric up to rounding: solvers would read another one.
-
-    Raises
-    ------
-    ValueError
-        With the entries that differ most.
-
-    """
-    where, worst = _asymmetry(P)
-    largest = abs(P).max() if prod(P.shape) else 0.0
-    if worst > SYMMETRIC * largest:
-        i, j = where
-        raise ValueError(
-            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
-        )
-
-
-def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
-    """Find the largest entry of |P − Pᵀ|; of a dense one in strips."""
-    if issparse(P):
-        difference = coo_array(abs(P - P.T))
-        if not difference.nnz:
-            return (0, 0), 0.0
-        at = int(difference.data.argmax())
-        i, j = (int(k[at]) for k in difference.coords)
-        return (i, j), float(difference.data[at])
-    found = (0, 0), 0.0
-    for begin in range(0, len(P), _STRIP):
-        strip = slice(begin, begin + _STRIP)
-        difference = abs(P[strip] - P[:, strip].T)
-        i, j = np.unravel_index(difference.argmax(), difference.shape)
-        if difference[i, j] > found[1]:
-            found = (begin + int(i), int(j)), float(difference[i, j])
-    return found
 
 
 def _check_foreign(
@@ -381,15 +330,3 @@ def compressed(
     M = csc_array((data, indices, indptr), shape=shape)
     M.check_format(full_check=True)
     return canonical(M)
-
-
-def canonical(M: Matrix) -> Matrix:
-    """Sort the entries of a sparse matrix and add up those of one place.
-
-    Somebody else's need not be so, and what is frozen cannot be made so later.
-    """
-    if M.has_canonical_format:
-        return M
-    M = M.copy()
-    M.sum_duplicates()
-    return M

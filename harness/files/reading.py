@@ -1,8 +1,9 @@
 """Text files that somebody else wrote, read within bounds.
 
-What is read is a regular file (a device or a pipe could last for ever), not larger than
-a limit that users can raise, UTF-8, and nested as deeply as data are. All functions
-raise `InputError`, with the place and what would be right.
+What is read is a regular file (a device or a pipe could last for ever), of the size
+that it declares (files of /proc declare none), not larger than a limit that users can
+raise, UTF-8, and nested as deeply as data are. All functions raise `InputError`, with
+the place and what would be right.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 from harness.errors import InputError
+from harness.files.durable import FULL
 
 VARIABLE = "MORTARBENCH_TEXT_MIB"  #: the largest text file that is read
 MOST_TOML = 1.0  #: MiB, where the variable is not set: a second to parse
@@ -53,7 +55,17 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         wrong = "a folder" if path.is_dir() else "a device or a pipe"
         raise InputError(f"{path}: {wrong}; expected {expected}")
     with os.fdopen(fd, "rb") as file:
-        yield file
+        try:
+            if os.fstat(fd).st_size == 0 and os.pread(fd, 1, 0):
+                raise InputError(
+                    f"{path}: of no size that it declares, as files of the kernel; "
+                    f"expected {expected}"
+                )
+            yield file
+        except OSError as e:  # of reading: others name a file, or tell of a full disk
+            if e.errno in (None, *FULL) or e.filename is not None:
+                raise
+            raise InputError(f"{path}: {e.strerror}; expected {expected}") from None
 
 
 def read_text(

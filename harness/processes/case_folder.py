@@ -24,7 +24,9 @@ from secrets import token_bytes
 from typing import Any
 
 from harness.digest import hex_digest, pieces
+from harness.errors import InputError
 from harness.files.durable import keep_private, move_file, replace_file
+from harness.files.reading import read_text
 
 _KEY_BYTES = 32
 
@@ -63,10 +65,12 @@ def entry(
             move_file(new, folder / f"{digest}.npz")
         finally:
             new.unlink(missing_ok=True)
-        index = {"digest": digest, "name": identity, "meta": meta}
+        path = folder / f"{digest}.npz"
+        size = path.stat().st_size
+        index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
         text = json.dumps({**index, "signature": _signature(index)})
         replace_file(folder / f"{key}.json", text.encode())
-        return Entry(qp=folder / f"{digest}.npz", digest=digest, meta=meta)
+        return Entry(qp=path, digest=digest, meta=meta)
 
 
 def content_digest(path: Path) -> str:
@@ -78,15 +82,20 @@ def content_digest(path: Path) -> str:
 def _found(folder: Path, key: str) -> Entry | None:
     """Look up an entry; None where there is none, or none that can be trusted."""
     try:
-        index = json.loads((folder / f"{key}.json").read_text("utf-8"))
+        index = json.loads(read_text(folder / f"{key}.json"))
         signature = index.pop("signature")
         if not compare_digest(signature, _signature(index)):
             return None
         path = folder / f"{index['digest']}.npz"
+        if path.stat().st_size != index["bytes"]:  # it would be read to its end
+            return None
         if content_digest(path) != index["digest"]:
             return None
         return Entry(qp=path, digest=index["digest"], meta=index["meta"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (
+        InputError, OSError, ValueError, KeyError, TypeError, AttributeError,
+        RecursionError,
+    ):  # fmt: skip
         return None
 
 

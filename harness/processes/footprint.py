@@ -3,7 +3,8 @@
 Resident memory (VmRSS) counts shared memory only where it is mapped and touched. A file
 in /dev/shm, a memfd or a file of another tmpfs holds memory without being mapped, and a
 named one after its makers are gone: these are found among the open files of the tree,
-each counted once, and named ones that the tree made are removed with it.
+each counted once, and named ones that the tree made are removed with it. System V
+segments tell who created them: those of the tree are counted and removed alike.
 """
 
 from __future__ import annotations
@@ -14,14 +15,18 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from harness.processes import reaper
+
 SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Looks at a tree of processes again and again, and remembers files it has made."""
+    """Looks at a tree of processes again and again, and remembers what it has made."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
+        self._segments_before = reaper.segments().keys()
+        self._processes: set[int] = set()  # of the tree, as seen so far
         self._in_memory = _memory_devices()
         self._made: dict[str, int] = {}  # in SHARED, seen in the tree's hands: inodes
 
@@ -44,6 +49,7 @@ class Footprint:
 
     def notice(self, tree: Iterable[int]) -> None:
         """Take note of the files in SHARED that processes of a tree hold and made."""
+        self._processes.update(tree := list(tree))
         new = dict(set(_listed().items()) - self._before)
         for process in tree if new.keys() - self._made.keys() else ():
             for path in (*_open_files(process), *_mapped_files(process)):
@@ -51,8 +57,8 @@ class Footprint:
                 if path.startswith(f"{SHARED}/") and name in new:
                     self._made[name] = new[name]
 
-    def remove_files(self) -> None:
-        """Remove what a tree that has ended left in SHARED."""
+    def remove_shared(self) -> None:
+        """Remove what a tree that has ended left in SHARED, and its segments."""
         for path in self._left():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():
@@ -60,6 +66,8 @@ class Footprint:
                 else:
                     path.unlink()
         self._made.clear()
+        reaper.remove_segments(self._processes, self._segments_before)
+        self._processes.clear()
 
     def _left(self) -> list[Path]:
         """List the files that the tree made and that are still there, and ours."""
@@ -72,7 +80,10 @@ class Footprint:
         return left
 
     def _files(self, tree: list[int]) -> float:
-        """Sum up files in memory that the tree has open, or has made; in MiB."""
+        """Sum up files in memory that the tree has open, or has made; in MiB.
+
+        Segments are among them: like files, they are mapped or not.
+        """
         self.notice(tree)
         sizes: dict[tuple[int, int], int] = {}
         for process in tree:
@@ -86,7 +97,12 @@ class Footprint:
                 with suppress(OSError):
                     at = path.lstat()
                     sizes[at.st_dev, at.st_ino] = 512 * at.st_blocks
-        return sum(sizes.values()) / 2**20
+        segments = sum(
+            held
+            for segment, (creator, held) in reaper.segments().items()
+            if creator in self._processes and segment not in self._segments_before
+        )
+        return (sum(sizes.values()) + segments) / 2**20
 
 
 def _open_files(process: int) -> dict[str, str]:

@@ -32,6 +32,7 @@ from harness.processes import reaper
 Serve = Callable[[int, int], None]
 
 _POLL_SECONDS = 0.001
+_ENDED = os.WEXITED | os.WNOHANG
 
 
 def is_safe() -> bool:
@@ -50,6 +51,9 @@ class Fork:
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
+        self._pinned = os.pidfd_open(
+            pid
+        )  # its number is another's once it is collected
         self.stdin = stdin  #: its tree is killed when this is closed, or we are dead
 
     def wait(self, timeout: float | None = None) -> None:
@@ -63,15 +67,16 @@ class Fork:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         with suppress(ChildProcessError):  # it was collected with its tree
-            while os.waitpid(self.pid, os.WNOHANG)[0] == 0:
+            while os.waitid(os.P_PIDFD, self._pinned, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
                 time.sleep(_POLL_SECONDS)
+        os.close(self._pinned)
 
     def kill(self) -> None:
         """Send SIGKILL."""
         with suppress(ProcessLookupError):
-            os.kill(self.pid, signal.SIGKILL)
+            signal.pidfd_send_signal(self._pinned, signal.SIGKILL)
 
     def end_orphans(self) -> None:
         """End what came to be below us because the sub-reaper was killed."""
@@ -103,6 +108,9 @@ def fork(
         return Fork(pid, os.fdopen(ours, "wb"))
     try:
         os.setsid()
+        for number in (signal.SIGTERM, signal.SIGHUP):  # which may unwind the parent
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)
         _keep_open(theirs, log, pipes)
         os.environ.update(environment)
         reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)

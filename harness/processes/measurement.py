@@ -349,7 +349,7 @@ def _within(limit: float, record: Record) -> Record:
     if peak is not None and peak > limit:
         message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
         return noted(record.but(verdict=Verdict.MEMORY_LIMIT), message)
-    succeeded = record.verdict in (Verdict.VERIFIED, Verdict.INACCURATE)
+    succeeded = record.verdict.is_verified or record.verdict is Verdict.INACCURATE
     if not succeeded and out_of_memory(record.message, peak, limit):
         return record.but(verdict=Verdict.MEMORY_LIMIT)
     return record

@@ -17,8 +17,9 @@ tells the time.
 
 from __future__ import annotations
 
+import json
 import os
-import re
+import signal
 import subprocess
 import sys
 import time
@@ -26,6 +27,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from select import EPOLLIN, PIPE_BUF, epoll
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,11 +36,11 @@ from scipy.sparse.linalg import LinearOperator
 
 from harness.distributed.failures import (
     ALONE_SECONDS,
+    RECORD,
     RankFailedError,
     abort,
     agreed,
     in_a_line,
-    say,
 )
 from harness.distributed.mpi import MISSING, mpiexec
 from harness.distributed.network import network
@@ -53,6 +55,7 @@ from harness.errors import InputError
 from harness.files.qpfile import load_qp
 from harness.operators import Maker, SerialisableOperator
 from harness.plugin import Solver
+from harness.processes import reaper
 from harness.qp import QP, no_rows
 from harness.solution import Solution
 from harness.verify.measure import memory_mib
@@ -60,14 +63,14 @@ from harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: tag of what rank 0 tells the others to do
 _IDLE_SECONDS = 2e-4  #: between two looks for an order
-#: how a rank tells `launch` its process, and how mpiexec tells which one ended, and why
-_STARTED = re.compile(r"rank (\d+) is process (\d+)$")
-_ENDED = re.compile(r"PID (\d+) RUNNING")
-_WHY = re.compile(r"EXIT STRING: (.*)$")
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
     """Start `command` on so many ranks, wait until they have ended, and say how.
+
+    Above each rank is a process that records its end (`harness.processes.reaper`). The
+    rank that ended first is named: others end because it did. One that ends while the
+    others go on ends them, too, whatever its exit code. What ranks print is not read.
 
     The last two words of the command are file descriptors, which the ranks inherit.
     """
@@ -79,33 +82,105 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
+    read, write = os.pipe()
+    above = [sys.executable, "-I", "-S", reaper.__file__, "rank", str(write)]
     process = subprocess.Popen(
-        [start, "-n", str(ranks), *command], pass_fds=fds, stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace",
+        [start, "-n", str(ranks), *above, *command], stdin=subprocess.DEVNULL,
+        pass_fds=(*fds, write), env=os.environ | {RECORD: str(write)},
     )  # fmt: skip
-    for fd in fds:
+    for fd in (*fds, write):
         os.close(fd)
-    said, which, why = "", "", ""
-    rank_of: dict[str, str] = {}
-    assert process.stdout is not None
-    for line in process.stdout:
-        if match := _STARTED.match(line):
-            rank_of[match[2]] = match[1]
-            continue
-        if line.startswith("rank "):
-            said = line.strip()
-        elif match := _ENDED.search(line):
-            which = rank_of.get(match[1], "")
-        elif match := _WHY.search(line):
-            why = match[1].strip()
-        sys.stderr.write(line)
-        sys.stderr.flush()
-    code = process.wait()
-    if code:
-        one = f"rank {which}" if which else "one"
-        ended = f"{one} of {ranks} ranks ended: {why or f'mpiexec says {code}'}"
-        print(said or ended, file=sys.stderr)
-    return 1 if code else 0
+    first = _Ends(read, ranks).first(process.pid)
+    code = process.poll()
+    if code != 0 or first:
+        said = first or f"one of {ranks} ranks ended: mpiexec says {code}"
+        print(f"\n{said}", file=sys.stderr)  # after a line that has no end
+    return 0 if code == 0 else 1
+
+
+class _Ends:
+    """The ends of ranks, in the order of time.
+
+    The kernel lists what becomes ready in that order, see epoll(7), however late we
+    look. The exit status of a rank comes from the process above it, and is not known
+    where that one was killed first.
+    """
+
+    def __init__(self, record: int, ranks: int) -> None:
+        os.set_blocking(record, False)
+        self._record = record
+        self._ranks = ranks
+        self._unread = b""
+        self._rank_of: dict[int, int] = {}  # by a file descriptor of its process
+        self._first: int | str | None = None  # a rank, or what one said of its failure
+        self._way: dict[int, str] = {}  # how ranks ended
+        self._events = epoll()
+        self._events.register(record, EPOLLIN)
+
+    def first(self, mpiexec: int) -> str:
+        """Wait until mpiexec has ended, and describe the end of the first rank.
+
+        The others have `ALONE_SECONDS` to end after it, whatever its exit code. Empty
+        where mpiexec was the first to end.
+        """
+        mpi, deadline = os.pidfd_open(mpiexec), np.inf
+        self._events.register(mpi, EPOLLIN)
+        has_ended = False
+        while not has_ended and (left := deadline - time.monotonic()) > 0:
+            ready = [fd for fd, _ in self._events.poll(min(left, ALONE_SECONDS))]
+            has_ended = mpi in ready
+            for fd in ready:
+                if fd in self._rank_of:
+                    self._note(self._rank_of.pop(fd))
+                    os.close(fd)
+                else:
+                    self._take_records()
+                if fd == mpi:  # ranks that end now, end because it has
+                    self._note("")
+            if self._first is not None and deadline == np.inf:
+                deadline = time.monotonic() + ALONE_SECONDS
+        if self._first is None or isinstance(self._first, str):
+            return self._first or ""
+        one = f"rank {self._first}" if self._first >= 0 else "one"
+        way = self._way.get(self._first, "killed, as was the process above it")
+        return f"{one} of {self._ranks} ranks ended: {way}"
+
+    def _take_records(self) -> None:
+        with suppress(BlockingIOError):
+            while chunk := os.read(self._record, 2**16):
+                *lines, self._unread = (self._unread + chunk).split(b"\n")
+                self._unread = self._unread[:PIPE_BUF]
+                for line in lines:
+                    with suppress(ValueError, KeyError, TypeError, OSError):
+                        self._take(json.loads(line))
+            with suppress(FileNotFoundError):  # nobody can write any longer
+                self._events.unregister(self._record)
+
+    def _take(self, line: Mapping[str, Any]) -> None:
+        if "failed" in line:
+            self._note(line["failed"])
+        elif "status" in line:
+            self._way[line["rank"]] = _way_to_end(line["status"])
+        else:
+            for number in (line["process"], line["above"]):
+                try:
+                    process = os.pidfd_open(number)
+                except ProcessLookupError:  # it has ended already
+                    self._note(line["rank"])
+                else:
+                    self._rank_of[process] = line["rank"]
+                    self._events.register(process, EPOLLIN)
+
+    def _note(self, first: int | str) -> None:
+        if self._first is None:
+            self._first = first
+
+
+def _way_to_end(status: int) -> str:
+    if os.WIFSIGNALED(status):
+        number = os.WTERMSIG(status)
+        return f"{signal.strsignal(number)} (signal {number})"
+    return f"exit code {os.waitstatus_to_exitcode(status)}"
 
 
 def this_rank() -> Ranks:
@@ -117,9 +192,9 @@ def this_rank() -> Ranks:
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
-    ranks = Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
-    say(f"rank {ranks.rank} is process {os.getpid()}")
-    return ranks
+    if RECORD in os.environ:
+        os.set_inheritable(int(os.environ[RECORD]), False)
+    return Ranks(MPI.COMM_WORLD, network=network(MPI.COMM_WORLD))
 
 
 def follow(

@@ -10,6 +10,14 @@ that no double fork and no setsid leaves its tree. The tree is killed
 * when the other end of its standard input is closed: the process that started it does
   that, or is dead, even by SIGKILL.
 
+System V segments of shared memory that COMMAND has created are removed with it: they
+outlive every process.
+
+Run as ``reaper.py rank RECORD COMMAND…`` it stands above one rank of MPI: it starts
+COMMAND, writes to the file descriptor RECORD which process that is and with which
+status it ended, and ends alike. Until then it keeps open what COMMAND has inherited, so
+that mpiexec ends no other rank before the record is written.
+
 A process of its own rather than the run itself is the sub-reaper, because it outlives a
 run that is killed, tells the trees of two workers apart, and leaves a Python session
 that uses us as a library as it is.
@@ -28,11 +36,18 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from functools import partial
 
+TYPE_CHECKING = False  # to load typing, or json, would take each worker 10 ms
+if TYPE_CHECKING:
+    from typing import NoReturn
+
 MARK = "MORTARBENCH_TREE"  #: environment variable that names the tree to its processes
+SEGMENTS = "/proc/sysvipc/shm"  #: see proc(5)
 END_SECONDS = 5.0  #: within which processes that were sent SIGKILL are gone
 
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
+_IPC_RMID = 0  # shmctl(2)
+_RANKS = ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "PMIX_RANK")  #: variables, by MPI
 _NOT_STARTED = 127  #: exit code, as of a shell that finds no command
 
 
@@ -56,15 +71,25 @@ def descendants(root: int) -> list[int]:
 
 def marked(mark: str) -> list[int]:
     """List the processes, wherever they are, that were started with that `MARK`."""
-    wanted, found = f"{MARK}={mark}".encode(), []
-    for name in os.listdir("/proc"):
-        with suppress(OSError):  # ended meanwhile, or somebody else's
-            if name.isdigit():
-                with open(f"/proc/{name}/environ", "rb") as file:
-                    data = file.read()
-                if wanted in data and wanted in data.split(b"\0") and lives(int(name)):
-                    found.append(int(name))
-    return found
+    numbers = (int(name) for name in os.listdir("/proc") if name.isdigit())
+    return [process for process in numbers if _is_marked(process, mark)]
+
+
+def _is_marked(process: int, mark: str) -> bool:
+    wanted = f"{MARK}={mark}".encode()
+    try:
+        with open(f"/proc/{process}/environ", "rb") as file:
+            data = file.read()
+    except OSError:  # ended meanwhile, or somebody else's
+        return False
+    return wanted in data and wanted in data.split(b"\0") and lives(process)
+
+
+def _is_below(process: int, root: int) -> bool:
+    """Return True if a process descends from `root`, by the parents in /proc."""
+    while process > 0 and process != root:
+        process = int(_status(process, 1) or 0)
+    return process == root > 0
 
 
 def lives(process: int) -> bool:
@@ -74,13 +99,16 @@ def lives(process: int) -> bool:
 
 def state(process: int, task: int | None = None) -> str:
     """Give the letter of a process's or thread's state, see proc(5); "" for none."""
-    path = (
-        f"/proc/{process}/stat" if task is None else f"/proc/{process}/task/{task}/stat"
-    )
+    where = str(process) if task is None else f"{process}/task/{task}"
+    return _status(where, 0)
+
+
+def _status(where: int | str, field: int) -> str:
+    """Read a field of /proc/WHERE/stat after the name; "" where there is none."""
     try:
-        with open(path, "rb") as file:
-            return file.read().rpartition(b")")[2].split()[0].decode()
-    except OSError:
+        with open(f"/proc/{where}/stat", "rb") as file:
+            return file.read().rpartition(b")")[2].split()[field].decode()
+    except (OSError, IndexError):
         return ""
 
 
@@ -92,6 +120,7 @@ def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> None:
     kernel holds is waited for `END_SECONDS` at most; none is left without its signal,
     however slow the machine.
 
+    root : 0 where it has ended
     mark : of the tree, to find those that are not below `root` any more
     """
     deadline = time.monotonic() + END_SECONDS
@@ -99,12 +128,12 @@ def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> None:
         stopped: set[int] = set()
         while new := _found(root, mark) - stopped - set(spared):
             for process in new:
-                _send(process, signal.SIGSTOP)
+                _send(process, signal.SIGSTOP, root, mark)
             stopped |= new
         if not stopped:
             return
         for process in stopped:
-            _send(process, signal.SIGKILL)
+            _send(process, signal.SIGKILL, root, mark)
         if root == os.getpid():
             _reap()
         if time.monotonic() > deadline:
@@ -117,9 +146,43 @@ def _found(root: int, mark: str) -> set[int]:
     return outside.union(descendants(root))
 
 
-def _send(process: int, number: int) -> None:
-    with suppress(ProcessLookupError, PermissionError):
-        os.kill(process, number)
+def _send(process: int, number: int, root: int, mark: str) -> None:
+    """Send a signal to a process of the tree, and to no other that got its number.
+
+    The file descriptor stands for one process. Where that is in the tree after it was
+    opened, it is the one that is meant.
+    """
+    with suppress(OSError):  # it has ended, or another user's program took its place
+        opened = os.pidfd_open(process)
+        try:
+            if _is_below(process, root) or (mark and _is_marked(process, mark)):
+                signal.pidfd_send_signal(opened, number)
+        finally:
+            os.close(opened)
+
+
+def segments() -> dict[int, tuple[int, int]]:
+    """List this user's System V segments: number, creator and bytes in memory."""
+    found = {}
+    with suppress(OSError), open(SEGMENTS) as file:  # a kernel without them
+        names = file.readline().split()
+        for line in file:
+            row = dict(zip(names, map(int, line.split()), strict=False))
+            if row["cuid"] == os.getuid():
+                held = row.get("rss", row["size"]) + row.get("swap", 0)
+                found[row["shmid"]] = row["cpid"], held
+    return found
+
+
+def remove_segments(creators: Collection[int], before: Collection[int]) -> None:
+    """Remove the System V segments of processes that have ended.
+
+    creators : their numbers; one that belongs to a living process is not theirs now
+    before : segments that were there before them
+    """
+    for segment, (creator, _) in segments().items():
+        if segment not in before and creator in creators and not lives(creator):
+            ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
 
 
 def _reap() -> dict[int, int]:
@@ -133,6 +196,8 @@ def _reap() -> dict[int, int]:
 
 def main(arguments: list[str]) -> None:
     """Start the command, see that nothing is left of it, and end as it ended."""
+    if arguments[0] == "rank":
+        _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments
     begin = partial(_execute, [*command, requests, replies])
     supervise(begin, int(cpu), (int(requests), int(replies)))
@@ -144,17 +209,13 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     begin : what the worker, a fork of this process, does; it does not return
     pipes : the worker's, which it has to itself
     """
-    prctl = ctypes.CDLL(None).prctl
-    prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
-    reaper = os.getpid()
-    worker = os.fork()
+    reaper, before = os.getpid(), segments().keys()
+    worker = _mortal_fork()
     if worker == 0:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        if os.getppid() != reaper:
-            os._exit(_NOT_STARTED)
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.close(woken)
@@ -169,16 +230,48 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     events = select.poll()
     events.register(0, select.POLLIN)
     events.register(woken, select.POLLIN)
-    status = None
-    while status is None:
+    ended: dict[int, int] = {}
+    while worker not in ended:
         if 0 in dict(events.poll()):
             break
         with suppress(BlockingIOError):
             os.read(woken, 4096)
-        status = _reap().get(worker)
+        ended |= _reap()
+    status = ended.get(worker)
+    creators = {worker, *ended, *descendants(reaper)}
     end_all(reaper)
     _reap()  # or they stay in the table of processes where init collects nothing
+    remove_segments(creators, before)
     _end_as(status)
+
+
+def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
+    rank = int(next((os.environ[name] for name in _RANKS if name in os.environ), -1))
+    child = _mortal_fork()
+    if child == 0:
+        _execute(command)
+    _write(record, rank=rank, process=child, above=os.getpid())
+    status = os.waitpid(child, 0)[1]
+    _write(record, rank=rank, status=status)
+    _end_as(status)
+
+
+def _write(record: int, **what: int) -> None:
+    """Write one line of JSON at once, so that lines of several ranks do not mix."""
+    line = ", ".join(f'"{name}": {value}' for name, value in what.items())
+    with suppress(OSError):  # who reads them has ended
+        os.write(record, f"{{{line}}}\n".encode())
+
+
+def _mortal_fork() -> int:
+    """Fork a process that is killed when this one ends; returns as `os.fork`."""
+    parent = os.getpid()
+    child = os.fork()
+    if child == 0:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        if os.getppid() != parent:
+            os._exit(_NOT_STARTED)
+    return child
 
 
 def _detach(cpu: int) -> None:
@@ -189,7 +282,7 @@ def _detach(cpu: int) -> None:
     os.sched_setaffinity(0, {cpu})
 
 
-def _execute(command: list[str]) -> None:
+def _execute(command: list[str]) -> NoReturn:
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by this interpreter
         signal.signal(ignored, signal.SIG_DFL)
     try:
@@ -199,14 +292,15 @@ def _execute(command: list[str]) -> None:
         os._exit(_NOT_STARTED)
 
 
-def _end_as(status: int | None) -> None:
+def _end_as(status: int | None) -> NoReturn:
     """End as a wait status says; None: the parent wishes it."""
     if status is None or os.WIFEXITED(status):
         os._exit(0 if status is None else os.WEXITSTATUS(status))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with suppress(OSError):  # SIGKILL has no handler
         signal.signal(os.WTERMSIG(status), signal.SIG_DFL)
-    os.kill(os.getpid(), os.WTERMSIG(status))
+    signal.raise_signal(os.WTERMSIG(status))
+    os._exit(_NOT_STARTED)  # a signal that ends no process
 
 
 if __name__ == "__main__":

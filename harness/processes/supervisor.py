@@ -8,11 +8,14 @@ address space counts what libraries reserve and never touch. Needs Linux's /proc
 What a worker says is not believed (`harness.processes.protocol`), its times least of
 all: they must agree with the clock of the parent and with the CPU time that the kernel
 counts. While one worker is asked, those that share its CPU are stopped by SIGSTOP:
-nothing that a solver leaves running in its process disturbs another's measurement.
+nothing that a solver leaves running in its process disturbs another's measurement. So
+threads of one process ask in turn. Signals go to file descriptors of processes, see
+pidfd_open(2), and never to numbers, which the kernel gives to others.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import re
@@ -26,8 +29,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from select import select
-from threading import Lock
+from select import poll, select
 from typing import Any, ClassVar
 from weakref import WeakSet
 
@@ -45,6 +47,7 @@ from harness.processes.protocol import (
     kind_of,
     measures,
 )
+from harness.processes.turns import Turn
 from harness.record import Verdict
 from harness.verify.measure import one_line
 
@@ -59,7 +62,11 @@ BUSY = 0.5  #: share of the time between answer and request that is too much CPU
 LEAST_BUSY_SECONDS = 0.01  #: CPU time between answer and request that is nothing
 LOG_BYTES = 2**20  #: what a solver may print before we drop it
 LAST_WORDS = 300  #: characters of its last line that a message holds
+_LAST_BYTES = 2**16  #: of the log, among which its last line is looked for
+_LEAST_FD = 3  #: of a pipe: those below are the standard streams, even if closed
 NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
+
+_TURN = Turn()  #: of the thread that starts, asks, stops or ends a worker
 
 REPLACED = "the worker was busy while idle, and was replaced"
 
@@ -107,19 +114,22 @@ class WorkerProcess:
     reads requests, where it replies. It runs in a session of its own, on one CPU (the
     last one that we may use), with one thread in every library that obeys its
     environment variable. What it prints goes to the file `log`.
+
+    Threads of one process may have workers, or share one: each request waits until the
+    one before is answered. What this process forks has none of its workers.
     """
 
     first_seconds: dict[Hashable, float]  #: for who asks: what took how long at first
 
     _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
-    _listing: ClassVar[Lock] = Lock()
 
     def __init__(self, command: list[str], log: Path) -> None:
         self.first_seconds = {}
         self._command = command
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
-        self._worker = 0  # its child
+        self._worker = 0  # its child, once it is ready
+        self._pinned = self._pinned_worker = -1  # file descriptors of both
         self._mark = ""
         self._cpu = -1
         self._requests = self._replies = -1  # our ends of the two pipes
@@ -133,9 +143,13 @@ class WorkerProcess:
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # what was told of the QP
-        with self._listing:
-            self._all.add(self)
+        self._add()
 
+    @_TURN
+    def _add(self) -> None:
+        self._all.add(self)
+
+    @_TURN
     def fork(self, serve: Serve) -> None:
         """Start at once, as a fork of this process that calls `serve`.
 
@@ -150,6 +164,7 @@ class WorkerProcess:
         except (_EndedError, OSError):
             self._kill()
 
+    @_TURN
     def ask(
         self, request: Mapping[str, Any], *, time_limit: float, memory_limit: float
     ) -> Reply:
@@ -202,19 +217,24 @@ class WorkerProcess:
             **facts,
         )
 
+    @_TURN
     def close(self) -> None:
         """Let the worker end by itself, soon; its children end with it."""
-        if self._process is None:
-            return
-        self._resume()
-        if self._process is None:
-            return
-        os.close(self._requests)
-        self._requests = -1
-        deadline = time.monotonic() + CLOSE_SECONDS
-        while time.monotonic() < deadline and not self._is_dead():
-            time.sleep(POLL_SECONDS / 4)
-        self._kill()
+        try:
+            self._resume()
+            self._close("_requests")
+            deadline = time.monotonic() + CLOSE_SECONDS
+            while time.monotonic() < deadline and not self._is_dead():
+                time.sleep(POLL_SECONDS / 4)
+        finally:
+            self._kill()
+
+    @classmethod
+    def forget_all(cls) -> None:
+        """Leave all workers to the process that this one is a fork of."""
+        for worker in tuple(cls._all):
+            worker._disown()
+        cls._all.clear()
 
     def _asked(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
@@ -333,8 +353,8 @@ class WorkerProcess:
         self._cpu, self._mark = max(usable), secrets.token_hex(16)
         self._footprint = Footprint()
         self._unread = bytearray()
-        their_requests, self._requests = os.pipe()
-        self._replies, their_replies = os.pipe()
+        their_requests, self._requests = _pipe()
+        self._replies, their_replies = _pipe()
         pipes = (their_requests, their_replies)
         environment = ONE_THREAD | {
             limits.VARIABLE: str(memory_limit), reaper.MARK: self._mark,
@@ -364,11 +384,14 @@ class WorkerProcess:
         finally:
             os.close(their_requests)
             os.close(their_replies)
+        self._pinned = os.pidfd_open(self._process.pid)
         self._await("ready", START_SECONDS, memory_limit)
-        tree = self._tree()
-        if not tree:
+        for worker in self._tree()[:1]:  # what comes later is listed later
+            self._pinned_worker = os.pidfd_open(worker)
+            if worker in self._tree():  # or its number could be another's by now
+                self._worker = worker
+        if not self._worker:
             raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
-        self._worker = tree[0]  # what comes later is listed later
 
     def _send(self, request: Mapping[str, Any]) -> None:
         with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
@@ -447,7 +470,10 @@ class WorkerProcess:
 
     def _tree(self) -> list[int]:
         """List the worker, what it has started, and what these have."""
-        return [] if self._process is None else reaper.descendants(self._process.pid)
+        if self._process is None:
+            return []
+        found = reaper.descendants(self._process.pid)
+        return [] if self._is_dead() else found  # of somebody who got its number
 
     def _others(self) -> list[int]:
         return [process for process in self._tree() if process != self._worker]
@@ -468,9 +494,7 @@ class WorkerProcess:
     def _stop_others(self) -> None:
         """Stop the workers that share our CPU until they are asked again."""
         cpu = max(os.sched_getaffinity(0))
-        with self._listing:
-            others = [w for w in self._all if w is not self and w._cpu == cpu]
-        for worker in others:
+        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
 
     def _stop(self) -> None:
@@ -480,8 +504,7 @@ class WorkerProcess:
             self._kill()  # started since it answered
             return
         self._was_busy = self._was_busy or self._has_been_busy()
-        with suppress(ProcessLookupError):
-            os.kill(self._worker, signal.SIGSTOP)
+        self._signal(signal.SIGSTOP)
         self._is_stopped = True
 
     def _resume(self) -> bool:
@@ -492,8 +515,7 @@ class WorkerProcess:
         if self._process is None:
             return False
         if self._is_stopped:
-            with suppress(ProcessLookupError):
-                os.kill(self._worker, signal.SIGCONT)
+            self._signal(signal.SIGCONT)
             self._is_stopped = False
         else:
             self._was_busy = self._has_been_busy()
@@ -501,6 +523,12 @@ class WorkerProcess:
         if was_busy or self._is_dead():
             self._kill()
         return was_busy
+
+    def _signal(self, number: signal.Signals) -> None:
+        """Send a signal to the worker, if it is there."""
+        if self._pinned_worker != -1:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pinned_worker, number)
 
     def _has_been_busy(self) -> bool:
         if self._idle_since is None:
@@ -531,33 +559,34 @@ class WorkerProcess:
         return False
 
     def _is_dead(self) -> bool:
-        """Look without reaping: until then nobody else can get its number."""
-        assert self._process is not None
-        look = os.WEXITED | os.WNOHANG | os.WNOWAIT
-        return os.waitid(os.P_PID, self._process.pid, look) is not None
+        """Look without collecting it; whoever does that, the descriptor stands for it.
+
+        True where there is none.
+        """
+        if self._pinned == -1:
+            return True
+        look = poll()
+        look.register(self._pinned)
+        return bool(look.poll(0))
 
     def _death(self) -> tuple[str, int]:
         """How a dead worker ended, its last words included, and by which signal."""
-        assert self._process is not None
-        end = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
-        assert end is not None
-        number = 0
-        if end.si_code == os.CLD_EXITED:
-            how = f"exit code {end.si_status}"
-        else:
-            number = end.si_status
-            names = {s.value: s.name for s in signal.Signals}
-            how = names.get(number, f"signal {number}")
+        how, number = "ended, and other code of this process took its exit code", 0
+        with suppress(ChildProcessError):
+            how, number = _way_to_end(self._pinned)
         last = ""
-        with suppress(OSError):
-            text = self._log.read_text(errors="replace")
+        with suppress(OSError), self._log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _LAST_BYTES))
+            text = file.read(_LAST_BYTES).decode(errors="replace")
             last = text.strip().rpartition("\n")[2][-LAST_WORDS:]
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
         """End all processes, and remove what they left in shared memory."""
         if self._process is not None:
-            reaper.end_all(self._process.pid, mark=self._mark)
+            self._footprint.notice(self._tree())
+            root = 0 if self._is_dead() else self._process.pid
+            reaper.end_all(root, mark=self._mark)
             if isinstance(self._process, Fork):
                 self._process.end_orphans()
             if self._process.stdin is not None:
@@ -567,15 +596,67 @@ class WorkerProcess:
             except subprocess.TimeoutExpired:  # a solver has stopped it
                 self._process.kill()
                 self._process.wait()
-            self._footprint.remove_files()
+            self._footprint.remove_shared()
+        self._forget()
+
+    def _disown(self) -> None:
+        """Forget a worker of the process that this one is a fork of.
+
+        An end of its pipes that stayed open here would keep it alive.
+        """
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
+        self._forget()
+
+    def _forget(self) -> None:
         self._process = None
         self._is_warm = False
         self._worker, self._is_stopped, self._was_busy = 0, False, False
         self._idle_since = None
-        for fd in (self._replies, self._requests):
-            if fd != -1:
-                os.close(fd)
-        self._replies = self._requests = -1
+        for name in ("_replies", "_requests", "_pinned", "_pinned_worker"):
+            self._close(name)
+
+    def _close(self, name: str) -> None:
+        """Close a file descriptor once: its number may be another file's afterwards."""
+        fd: int = getattr(self, name)
+        setattr(self, name, -1)
+        if fd != -1:
+            os.close(fd)
+
+
+os.register_at_fork(after_in_child=WorkerProcess.forget_all)
+
+
+def _pipe() -> tuple[int, int]:
+    """Open a pipe whose numbers a program can inherit beside its standard streams."""
+    ends = os.pipe()
+    if min(ends) >= _LEAST_FD:
+        return ends
+    try:
+        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _LEAST_FD) for e in ends)
+    finally:
+        for end in ends:
+            os.close(end)
+    return read, write
+
+
+def _way_to_end(process: int) -> tuple[str, int]:
+    """Describe the end of a process, and return the signal that ended it; 0: none.
+
+    process : a file descriptor, see pidfd_open(2)
+
+    Raises
+    ------
+    ChildProcessError
+        When it was collected, or is no child of this process.
+
+    """
+    end = os.waitid(os.P_PIDFD, process, os.WEXITED | os.WNOWAIT)
+    assert end is not None
+    if end.si_code == os.CLD_EXITED:
+        return f"exit code {end.si_status}", 0
+    names = {s.value: s.name for s in signal.Signals}
+    return names.get(end.si_status, f"signal {end.si_status}"), end.si_status
 
 
 class _EndedError(Exception):

@@ -8,12 +8,14 @@ the same command makes it.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from harness.errors import InputError, some
+from harness.files.lines import read_lines
 
 FAULTS = "faults.jsonl"
 
@@ -45,17 +47,14 @@ def read_faults(folder: Path) -> list[Fault]:
     Raises
     ------
     InputError
-        When a line other than a partial last one is damaged.
+        When a line other than a partial last one is damaged, or the file is none that
+        `harness.files.lines.read_lines` takes.
 
     """
     path = folder / FAULTS
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return []
-    except OSError as e:
-        raise InputError(f"{path}: {e.strerror}") from None
-    lines = content[: content.rfind(b"\n") + 1].splitlines()
+    lines = read_lines(path, "the faults of a result folder")
     return [_parsed(line, path, number) for number, line in enumerate(lines, 1)]
 
 

@@ -16,16 +16,17 @@ from harness.environment.environment import VOLATILE
 from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
-from harness.files.reading import MOST_TOML, read_json, read_text, read_toml, toml
+from harness.files.reading import MOST_TOML, opened, read_json, read_text, toml
 from harness.results.faults import FAULTS
 from harness.suite.growth import refused
-from harness.suite.suite import Suite
+from harness.suite.suite import Suite, read_stored
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
 _CONCLUDED = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
 REMEDY = "choose another --out or use --fresh"
+MOST_LEVELS = 30  #: of folders in those of a run, which nests three
 _LOCK = ".lock"
 _MARK = b"held by runs of mortarbench\n"  #: what is in it
 _DIGEST = re.compile(r"[\w.-]{1,64}")
@@ -38,32 +39,50 @@ def refuse_links(folder: Path) -> None:
     """Refuse a result folder that leads out of itself, or to what is no file.
 
     It may come from anybody. A link in it would have us write over, or delete, a file
-    elsewhere; a pipe would have us wait for ever.
+    elsewhere; a pipe would have us wait for ever; folders nested without end lead any
+    recursion astray.
 
     Raises
     ------
     InputError
-        With the first link, device or pipe.
+        With the first link, device or pipe, a folder that is nested too deeply, or one
+        that cannot be listed.
 
     """
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name in (*_FOLDERS, _SCRATCH):
-                if not _is_plain(entry):
-                    raise _not_plain(entry.path, "a folder of its own")
-                if entry.is_dir(follow_symlinks=False):
-                    _only_plain(entry.path)
-            elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
-                raise _not_plain(entry.path, "a file of its own")
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if entry.name in (*_FOLDERS, _SCRATCH):
+                    if not _is_plain(entry):
+                        raise _not_plain(entry.path, "a folder of its own")
+                    if entry.is_dir(follow_symlinks=False):
+                        _only_plain(entry.path)
+                elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
+                    raise _not_plain(entry.path, "a file of its own")
+    except OSError as e:
+        raise InputError(
+            f"{e.filename}: {e.strerror}; expected a folder that can be read"
+        ) from None
 
 
 def _only_plain(folder: str) -> None:
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if not _is_plain(entry):
-                raise _not_plain(entry.path, "a file or folder of its own")
-            if entry.is_dir(follow_symlinks=False):
-                _only_plain(entry.path)
+    """Refuse links, pipes and devices in a folder, and folders nested too deeply."""
+    level = [folder]
+    for _ in range(MOST_LEVELS):
+        inner = []
+        for each in level:
+            with os.scandir(each) as entries:
+                for entry in entries:
+                    if not _is_plain(entry):
+                        raise _not_plain(entry.path, "a file or folder of its own")
+                    if entry.is_dir(follow_symlinks=False):
+                        inner.append(entry.path)
+        level = inner
+    if level:
+        raise InputError(
+            f"{folder}: folders nested deeper than {MOST_LEVELS} levels; expected "
+            "those that a run writes; move the deep ones away"
+        )
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
@@ -93,8 +112,8 @@ def refuse_foreign(folder: Path) -> None:
         return
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
-    with suppress(OSError):
-        if (folder / _LOCK).read_bytes() == _MARK:  # of a run that was cut off at once
+    with suppress(InputError), opened(folder / _LOCK) as lock:
+        if lock.read(len(_MARK) + 1) == _MARK:  # of a run that was cut off at once
             return
     ours = (*_FOLDERS, *_FILES, *_CONCLUDED)
     taken = [name for name in ours if os.path.lexists(folder / name)]
@@ -267,13 +286,15 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
 
     """
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
-    now, then = toml(suite.text), None
+    has_grown = False
     if suite_file.exists():
-        then = _toml(suite_file)
-        if then is not None and then != now and (changed := _refused(then, now)):
+        try:
+            before, now = read_stored(suite_file), toml(suite.text)
+        except InputError as e:
+            raise InputError(f"{e}; restore it, or use --fresh") from None
+        has_grown = before != now
+        if has_grown and (changed := refused(before, now)):
             raise InputError(f"{out} holds another suite ({changed}); {REMEDY}")
-        if then is None:
-            raise InputError(f"{suite_file} is no suite; restore it, or use --fresh")
     if environment_file.exists():
         then = _environment(environment_file)
         if then["digest"] != environment["digest"]:
@@ -282,15 +303,7 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
                 f"{out} was measured in another environment ({then['digest']}, now "
                 f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
-    return then is not None and then != now
-
-
-def _refused(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Say what makes the suite another one; nobody has checked the older one."""
-    try:
-        return refused(then, now)
-    except (TypeError, ValueError, AttributeError):
-        return "its suite.toml is none that a run wrote"
+    return has_grown
 
 
 def suite_text(folder: Path) -> str:
@@ -299,10 +312,12 @@ def suite_text(folder: Path) -> str:
     Raises
     ------
     InputError
-        When it is missing, or no text.
+        When it is missing, or no suite.
 
     """
-    return read_text(folder / "suite.toml", "the suite of a result folder", MOST_TOML)
+    path = folder / "suite.toml"
+    read_stored(path)
+    return read_text(path, "the suite of a result folder", MOST_TOML)
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:
@@ -347,11 +362,15 @@ def differences(
             yield key, a, b
 
 
-def _toml(path: Path) -> dict[str, Any] | None:
-    try:
-        return read_toml(path)
-    except InputError:  # no suite of ours
-        return None
+def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether two environments agree in all that can change a time.
+
+    A plug-in that only one of them has changes no time of what both can measure.
+    """
+    return all(
+        key.startswith("plugins.") and None in values
+        for key, *values in differences(one, other)
+    )
 
 
 def _environment(path: Path) -> dict[str, Any]:

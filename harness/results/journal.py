@@ -7,21 +7,18 @@ it off.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from itertools import count
 from json import JSONDecodeError
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from harness.errors import InputError, shown, some
-from harness.files.durable import Lines
-from harness.files.reading import opened
+from harness.files.lines import Lines, read_lines
 from harness.record import Record
 from harness.results.folder import refuse_links
-
-LONGEST_LINE = 2**24  #: bytes that are read of one
 
 
 class Journal:
@@ -82,7 +79,7 @@ class Journal:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._files.close()
+        self._files.__exit__(kind, error, trace)
 
 
 def read_journal(
@@ -103,8 +100,8 @@ def read_journal(
         run_id.
 
     """
-    if not folder.is_dir():
-        wrong = "a file" if folder.exists() else "no such folder"
+    if not os.path.isdir(folder):
+        wrong = "a file" if os.path.exists(folder) else "no such folder"
         raise InputError(f"{folder}: {wrong}; expected a result folder")
     refuse_links(folder)
     paths = sorted((folder / "journal").glob("*.jsonl"))
@@ -148,7 +145,7 @@ def _first_place(paths: Iterable[Path], run_id: str) -> str:
 def _records(path: Path) -> Iterator[tuple[int, Record]]:
     """Read the records of one file with the numbers of their lines."""
     shared: dict[Any, Any] = {}
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in enumerate(read_lines(path, "a journal"), 1):
         try:
             yield number, Record.from_json(line, shared)
         except (JSONDecodeError, UnicodeDecodeError):
@@ -158,24 +155,3 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
             ) from None
         except ValueError as e:
             raise InputError(f"{path}, line {number}: {e}") from None
-
-
-def _lines(path: Path) -> Iterator[bytes]:
-    """Read the whole lines of a file one by one; a partial one at the end is none."""
-    with opened(path, "a journal") as file:
-        for number in count(1):
-            line = file.readline(LONGEST_LINE)
-            if line.endswith(b"\n"):
-                yield line
-            elif len(line) < LONGEST_LINE:
-                return
-            else:
-                raise InputError(
-                    f"{path}, line {number}: longer than {LONGEST_LINE >> 20} MiB; "
-                    "expected a journal line, as a run appends it"
-                )
-
-
-def _whole_lines(text: bytes) -> bytes:
-    """Drop what follows the last newline."""
-    return text[: text.rfind(b"\n") + 1]

@@ -20,7 +20,6 @@ from typing import Any
 from harness.digest import hex_digest
 from harness.errors import InputError
 from harness.files.durable import full_disk_told, replace_file
-from harness.files.reading import MOST_TOML, read_text, toml
 from harness.files.store import copy_stored
 from harness.record import Record
 from harness.results.faults import FAULTS, read_faults
@@ -33,6 +32,7 @@ from harness.results.folder import (
 )
 from harness.results.journal import read_journal
 from harness.suite.growth import as_toml, united
+from harness.suite.suite import read_stored
 
 _AGAIN = "are there already, and count once"
 JOURNAL = "merged"  #: name of the only journal of a folder that was merged
@@ -79,15 +79,13 @@ def merge(
     ------
     InputError
         When a folder holds no measurements or a link, when suites differ in what
-        measurements depend on, when `out` is one of the folders, holds a run or
-        something foreign, or its disk is full. `out` is then as it was.
+        measurements depend on, when `out` is one of the folders, lies in one or holds
+        one, holds a run or something foreign, or its disk is full. `out` is then as it
+        was.
 
     """
     for source in sources:
-        if out.exists() and source.exists() and out.samefile(source):
-            raise InputError(
-                f"--out {out} is one of the folders to merge; expected another one"
-            )
+        _refuse_nested(source, out)
     read = {source: _read(source, tell) for source in dict.fromkeys(sources)}
     refuse_foreign(out)
     _refuse_run(out)
@@ -135,6 +133,21 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
     return [r if r.session else r.but(session=sessions[r.environment]) for r in records]
 
 
+def _refuse_nested(source: Path, out: Path) -> None:
+    """Refuse to write into a folder that is read, or beside what is read in ours."""
+    here, there = out.resolve(), source.resolve()
+    if here == there:
+        raise InputError(
+            f"--out {out} is one of the folders to merge; expected another one"
+        )
+    for inner, outer in ((here, there), (there, here)):
+        if outer in inner.parents:
+            raise InputError(
+                f"--out {out}: {inner} lies inside of {outer}; expected a folder apart "
+                "from those to merge"
+            )
+
+
 def _refuse_run(out: Path) -> None:
     """Refuse to add to a folder that a run wrote: it would be neither."""
     if not out.is_dir():
@@ -159,11 +172,7 @@ def _united_suite(folders: Sequence[Path]) -> str:
     for folder in folders:
         path = folder / "suite.toml"
         if path.exists():
-            text = read_text(path, "the suite of a result folder", MOST_TOML)
-            try:
-                tables[str(folder)] = toml(text)
-            except InputError as e:
-                raise InputError(f"{path}: {e}") from None
+            tables[str(folder)] = read_stored(path)
     return as_toml(united(tables))
 
 

@@ -160,6 +160,7 @@ def _with_options(
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:
     """Remind of the plug-ins that a measurement was made with."""
-    plugins = environment.get("plugins") or ()
-    options = " ".join(f"--plugin {name}" for name in plugins)
+    plugins = environment.get("plugins")
+    named = plugins if isinstance(plugins, list | Mapping) else ()
+    options = " ".join(f"--plugin {name}" for name in named)
     return f"; it was measured with plug-ins, give {options}" if options else ""

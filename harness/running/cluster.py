@@ -15,7 +15,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing import resource_tracker
+from multiprocessing import current_process, get_context, resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import current_thread, main_thread
@@ -46,6 +46,7 @@ LOCAL = "local"
 CONNECT_SECONDS = 10
 LOOK_SECONDS = 2.0  #: for workers that joined or were lost
 MOST_LOST = 4  #: workers that a block may cost
+_UNGUARDED = 75  #: exit code of a process whose main script starts a run at its import
 
 Keep = Callable[[str, Mapping[str, Any]], None]
 
@@ -263,16 +264,23 @@ class _Cluster:
         task.future.add_done_callback(lambda _: self._told.put(key))
 
     def _with_news(self) -> Iterator[_Task]:
-        """Wait a moment for something to come from a block; list those with news."""
+        """Wait a moment for something to come from a block; list those with news.
+
+        Where nothing comes, a worker may be busy with a run whose parent has died, and
+        the scheduler have noticed only now.
+        """
+        keys: dict[str, None] = {}
         with suppress(Empty):
-            keys = {self._told.get(timeout=LOOK_SECONDS): None}
+            keys[self._told.get(timeout=LOOK_SECONDS)] = None
             while not self._told.empty():
                 keys[self._told.get()] = None
-            for key in keys:
-                if key in self._under_way:
-                    yield self._under_way[key]
+        for key in keys:
+            if key in self._under_way:
+                yield self._under_way[key]
         if self._client.status != "running":
             raise _SchedulerGoneError
+        if not keys:
+            _forget_lost_runs(self._client)
 
     def _collected(self, task: _Task) -> Iterator[Outcome]:
         """Fetch what a worker has measured; nothing if it cannot be reached."""
@@ -354,6 +362,7 @@ def _connected(address: str, stack: ExitStack) -> Any:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we tell ourselves
     if address == LOCAL:
         with _interrupted_later():
+            _refuse_unguarded_script()
             cluster = LocalCluster(
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
@@ -365,20 +374,48 @@ def _connected(address: str, stack: ExitStack) -> Any:
             return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except TypeError as e:
-        if not address.startswith("tls:"):
-            raise
-        raise InputError(
-            f"--dask {address}: Dask's configuration has no certificate for it; "
-            "expected distributed.comm.tls: ca-file, client.cert and client.key, in a "
-            "file or as DASK_DISTRIBUTED__COMM__TLS__CA_FILE in the environment"
-        ) from e
-    except (OSError, ValueError) as e:
+    except Exception as e:  # of any library that a scheme of addresses asks for
+        if isinstance(e, TypeError) and address.startswith("tls:"):
+            raise InputError(
+                f"--dask {address}: Dask's configuration has no certificate for it; "
+                "expected distributed.comm.tls: ca-file, client.cert and client.key, "
+                "in a file or as DASK_DISTRIBUTED__COMM__TLS__CA_FILE in the "
+                "environment"
+            ) from e
         why = " ".join(str(e).split()) or type(e).__name__
         raise InputError(
             f"--dask {address}: no scheduler answers ({why}); expected 'local', or the "
             "address that `dask scheduler` prints, such as tcp://HOST:8786"
         ) from None
+
+
+def _refuse_unguarded_script() -> None:
+    """Refuse a main script that would start this run again in every Dask worker.
+
+    Python imports it there before anything else. One process shows what that does, as
+    the first of Dask's would; in that process, this function ends the import.
+
+    Raises
+    ------
+    InputError
+        When the script starts a run, or fails, where it is imported.
+
+    """
+    if getattr(current_process(), "_inheriting", False):
+        raise SystemExit(_UNGUARDED)
+    first = get_context("spawn").Process(target=int)
+    first.start()
+    first.join()
+    if first.exitcode == _UNGUARDED:
+        raise InputError(
+            "the processes of Dask import the main script, which starts this run once "
+            'more there; put what runs below `if __name__ == "__main__":`'
+        )
+    if first.exitcode:
+        raise InputError(
+            "the processes of Dask import the main script, which fails there (exit "
+            f"code {first.exitcode})"
+        )
 
 
 @contextmanager
@@ -434,7 +471,9 @@ def _scheduler_there(client: Any, address: str) -> Iterator[None]:
 
 
 def _end(client: Any, name: str) -> None:
-    """Have workers end the processes of this run, unless the scheduler is gone.
+    """End the processes of this run and of lost ones, by their workers.
+
+    Unless the scheduler is gone.
 
     It may go while it is asked, as a local one does at Ctrl-C (CommClosedError is an
     OSError), or not know of us yet (KeyError); then nothing is lost.
@@ -442,6 +481,7 @@ def _end(client: Any, name: str) -> None:
     with suppress(OSError, KeyError):
         if client.status == "running":
             client.unregister_worker_plugin(name)
+            _forget_lost_runs(client)
 
 
 def _sharing(client: Any) -> int:

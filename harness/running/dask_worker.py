@@ -76,6 +76,7 @@ class ExecutorPlugin(WorkerPlugin):
 
         The kernel kills solver processes with the thread that started them.
         """
+        self._worker = worker.id
         self._busy = Lock()
         self._outcomes: list[Outcome] = []  # of the block `_key`, not yet fetched
         self._key = ""
@@ -170,7 +171,7 @@ class ExecutorPlugin(WorkerPlugin):
         if self._sharing > 1:
             environment["machine"]["shared_by_workers"] = self._sharing
         with ExitStack() as stack:
-            cpu = own_cpu(stack)
+            cpu = stack.enter_context(cpu_of(self._worker))
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
             operators: Mapping[str, Maker] = self._operators
@@ -235,6 +236,45 @@ class _Open:
     environment: dict[str, Any]
     digest: str
     stack: ExitStack
+
+
+class _Held:
+    """A CPU that a Dask worker holds, and the number of executors that use it."""
+
+    def __init__(self) -> None:
+        self.stack = ExitStack()
+        self.cpu = own_cpu(self.stack)
+        self.users = 0
+
+
+_held: dict[str, _Held] = {}  # by the Dask worker of this process
+_holding = Lock()
+
+
+@contextmanager
+def cpu_of(worker: str) -> Iterator[int]:
+    """Hold a CPU for a Dask worker, which all its executors share.
+
+    There are several where several runs measure there, or where one has died and its
+    scheduler has not noticed yet. A Dask worker carries out one block at a time.
+
+    Raises
+    ------
+    InputError
+        As `own_cpu`.
+
+    """
+    with _holding:
+        held = _held[worker] = _held.get(worker) or _Held()
+        held.users += 1
+    try:
+        yield held.cpu
+    finally:
+        with _holding:
+            held.users -= 1
+            if not held.users:
+                held.stack.close()
+                del _held[worker]
 
 
 def own_cpu(stack: ExitStack) -> int:

@@ -7,20 +7,20 @@ carries out the blocks. So a run is the same on one machine and on many.
 from __future__ import annotations
 
 import logging
-import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from secrets import token_hex
-from threading import current_thread, main_thread
 from typing import Any
 
 from harness.errors import InputError, shown
-from harness.files.durable import Lines, full_disk_told
+from harness.files.durable import full_disk_told
+from harness.files.lines import Lines
 from harness.files.store import save
 from harness.plugin import Solver
+from harness.processes.termination import TerminatedError, ended_by_signals
 from harness.record import Record, finite
 from harness.registry import SolverSpec, options_of
 from harness.results.faults import FAULTS, Fault
@@ -84,7 +84,12 @@ def run(
     """
     refuse_foreign(out)
     environment = {"digest": digest, **environment}
-    with _ended_by_sigterm(progress), full_disk_told(out), locked(out) as held:
+    with (
+        ended_by_signals(),
+        _continuation_told(progress),
+        full_disk_told(out),
+        locked(out) as held,
+    ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
         if not fresh:
@@ -214,23 +219,12 @@ class _Book:
 
 
 @contextmanager
-def _ended_by_sigterm(progress: Progress) -> Iterator[None]:
-    """Have SIGTERM end a run as Ctrl-C does: its processes, then itself, by 143."""
-
-    def end(*_: object) -> None:
-        raise SystemExit(128 + signal.SIGTERM)
-
-    if current_thread() is not main_thread():  # which alone can be told
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, end)
+def _continuation_told(progress: Progress) -> Iterator[None]:
     try:
         yield
-    except SystemExit:
+    except TerminatedError:
         progress.warn("terminated; the same command continues")
         raise
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _measured(out: Path) -> list[Record]:

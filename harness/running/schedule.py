@@ -110,7 +110,7 @@ class Schedule:
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
-        failed = {r.solver for r in records if r.verdict is not Verdict.VERIFIED}
+        failed = {r.solver for r in records if not r.verdict.is_verified}
         times: dict[str, dict[Block, float]] = {}
         for solver in {r.solver for r in records} - failed:
             mine = [r for r in records if r.solver == solver and r.total_seconds]

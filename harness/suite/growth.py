@@ -71,7 +71,7 @@ def _said(value: object) -> str:
 def united(tables: Mapping[str, Table]) -> dict[str, Any]:
     """Unite suites: the first one's settings, and all that any of them asks for.
 
-    tables : by the folder that each is from
+    tables : by the folder that each is from, as `harness.suite.suite.read_stored` reads
 
     Raises
     ------
@@ -82,13 +82,8 @@ def united(tables: Mapping[str, Table]) -> dict[str, Any]:
     whole: dict[str, Any] = {}
     of = ""
     for folder, table in tables.items():
-        try:
-            _refuse_unequal(of, whole, folder, table)
-            _add(whole, table)
-        except (TypeError, AttributeError):
-            raise InputError(
-                f"{folder}/suite.toml is no suite; expected the file that a run wrote"
-            ) from None
+        _refuse_unequal(of, whole, folder, table)
+        _add(whole, table)
         of = of or folder
     return whole
 
@@ -150,7 +145,7 @@ def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
 
 def as_toml(table: Table) -> str:
     """Write a suite as TOML: what is nested stands in one line."""
-    lines = [f"{k} = {_value(v)}" for k, v in table.items() if k != "problems"]
+    lines = [f"{_key(k)} = {_value(v)}" for k, v in table.items() if k != "problems"]
     for block in table.get("problems", ()):
         lines += [
             "",

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -28,6 +29,7 @@ _NUMBERS = {
     ),
 }  # digits of other scripts and 1_0 are numbers to Python alone
 _TRUTH = {"true": True, "false": False}
+_PLAIN = (bool, Real, str, NoneType)  #: types of values from a Python program
 _MOST = 1000  #: solvers that a sweep may span
 
 
@@ -52,11 +54,32 @@ def given_options(texts: Iterable[str]) -> dict[str, list[str]]:
 
 
 def as_given(options: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Write options that a Python program gives as the command line does."""
-    return {
-        key: [*map(_text, value if isinstance(value, list | tuple) else [value])]
-        for key, value in options.items()
-    }
+    """Write options that a Python program gives as the command line does.
+
+    Raises
+    ------
+    InputError
+        When they are no mapping from names to plain values or lists of these.
+
+    """
+    if not isinstance(options, Mapping):
+        raise InputError(
+            f'options = {shown(options)}; expected a dict such as {{"max_iter": 50}}'
+        )
+    given: dict[str, list[str]] = {}
+    for key, value in options.items():
+        if not isinstance(key, str) or not _KEY.fullmatch(key):
+            raise InputError(
+                f"options: {shown(key)} is no name; expected one such as max_iter"
+            )
+        values = value if isinstance(value, list | tuple) else [value]
+        if not values or not all(isinstance(v, _PLAIN) for v in values):
+            raise InputError(
+                f"options: {key} = {shown(value)}; expected a number, a text, True, "
+                "False or None, or a list of these"
+            )
+        given[key] = [*map(_text, values)]
+    return given
 
 
 def options_for(
@@ -184,6 +207,10 @@ def _text(value: object) -> str:
             return str(value).lower()
         case str():
             return "_".join(value.split())
+        case Integral():  # of numpy, too
+            return repr(int(value))
+        case Real():
+            return repr(float(value))
     return repr(value)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +13,7 @@ from typing import Any, NamedTuple
 from harness import checked
 from harness.distributed.mpi import ranks_asked
 from harness.errors import InputError, shown, unknown
-from harness.files.reading import MOST_TOML, read_text, toml
+from harness.files.reading import MOST_TOML, read_text, read_toml, toml
 from harness.names import CaseId
 from harness.plugin import Family, Solver
 from harness.record import TIGHTENING
@@ -33,6 +35,10 @@ DEFAULTS: Mapping[str, Any] = {
     "copies": False,
     "max_cases": 100_000,
 }
+_NUMBERS = tuple(
+    key for key, value in DEFAULTS.items()
+    if not isinstance(value, bool | list) and key != "null_arm"
+)  # fmt: skip
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _SOLVER_KEYS = ("name", "label", "options")
 NULL = " (A/A)"  #: after the label of a solver that is measured once more
@@ -97,7 +103,28 @@ def load_suite(
 
     """
     text = read_text(path, "a TOML file", MOST_TOML)
-    with checked.located(f"{path}"):
+    return parse_suite(text, f"{path}", path.parent, families, solvers)
+
+
+def parse_suite(
+    text: str,
+    where: str,
+    folder: Path,
+    families: Mapping[str, Family],
+    solvers: Mapping[str, Solver],
+) -> Suite:
+    """Parse the TOML of a suite and check all of it.
+
+    where : name of the text in messages
+    folder : where relative paths of the suite start
+
+    Raises
+    ------
+    InputError
+        With the place in it, and what would be right.
+
+    """
+    with checked.located(where):
         table = {**DEFAULTS, **toml(text)}
         checked.only_keys(table, _SUITE_KEYS)
         for key in ("name", "solvers", "problems"):
@@ -111,7 +138,7 @@ def load_suite(
         cases, sequences = planned(
             table["problems"],
             families,
-            path.parent,
+            folder,
             checked.at_least_one("max_cases", table["max_cases"], most=10**9),
         )
         return Suite(
@@ -138,6 +165,90 @@ def load_suite(
             tighten=_tightening(table, sequences),
             text=text,
         )
+
+
+def read_stored(path: Path) -> dict[str, Any]:
+    """Read the suite of a result folder, and check the types of its values.
+
+    Solvers, families and ranges are not: another version, or a plug-in, may know them.
+
+    Raises
+    ------
+    InputError
+        With the file and the first value of another type than a run writes.
+
+    """
+    table = read_toml(path, "the suite of a result folder")
+    try:
+        for key in ("tolerances", "tighten", "ranks"):
+            numbers = checked.any_list(key, table.get(key, []))
+            if not all(map(_is_finite, numbers)):
+                raise InputError(f"{key} = {shown(numbers)}; expected numbers")
+        for key in _NUMBERS:
+            if key in table and not _is_finite(table[key]):
+                raise InputError(f"{key} = {shown(table[key])}; expected a number")
+        for key in ("name", "null_arm"):
+            if key in table:
+                checked.text(key, table[key])
+        for i, entry in enumerate(
+            checked.any_list("solvers", table.get("solvers", []))
+        ):
+            with checked.located(f"solvers[{i}]"):
+                _spec(entry)
+        for block in checked.any_list("problems", table.get("problems", [])):
+            checked.table("problems", block, instead="tables")
+    except InputError as e:
+        raise InputError(f"{path} is no suite that a run wrote: {e}") from None
+    return table
+
+
+def _is_finite(value: Any) -> bool:
+    return checked.is_number(value) and abs(value) <= sys.float_info.max
+
+
+def suite_text(suite: Mapping[str, Any]) -> str:
+    """Write a suite as TOML, a line per key.
+
+    Raises
+    ------
+    InputError
+        When it holds what TOML cannot, such as None.
+
+    """
+    lines = [f"{_toml_key(k)} = {_toml_value(str(k), v)}" for k, v in suite.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _toml_key(key: object) -> str:
+    if not isinstance(key, str):
+        raise InputError(f"key {shown(key)}; expected a text")
+    return json.dumps(key) if re.search(r"[^\w-]|^$", key, re.ASCII) else key
+
+
+def _toml_value(where: str, value: Any) -> str:
+    """Write a value as TOML, on one line; arrays of numpy and ranges as lists."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    match value:
+        case bool():
+            return str(value).lower()
+        case int() | float():
+            return repr(value)
+        case str() | Path():
+            return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        case Mapping():
+            pairs = [
+                f"{_toml_key(k)} = {_toml_value(f'{where}.{k}', v)}"
+                for k, v in value.items()
+            ]
+            return f"{{ {', '.join(pairs)} }}"
+        case list() | tuple() | range():
+            entries = [_toml_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
+            return f"[{', '.join(entries)}]"
+    raise InputError(
+        f"{where} = {shown(value)}; expected a text, a number, true or false, a list "
+        "or a dict; leave out keys without a value"
+    )
 
 
 def asked_solvers(text: str) -> dict[str, SolverSpec]:

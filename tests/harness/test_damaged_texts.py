@@ -1,16 +1,40 @@
-"""Every reader of text takes or refuses a damaged one: no traceback, no hang."""
+"""Whatever is damaged or odd is taken or refused: no traceback, no hang, no GiB.
+
+Texts of every reader, files of result folders, names, options, command lines, arguments
+from Python. Data files: `tests/harness/files/test_hostile_files.py`.
+"""
 
 import json
 import random
+import shutil
 import warnings
+from decimal import Decimal
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from harness import InputError
+import mortarbench as mb
+from harness import InputError, Solution, Status
+from harness.crossval import discretisation
+from harness.files.reading import toml
+from harness.files.store import (
+    load_fields,
+    load_history,
+    load_solution,
+    point_arrays,
+    save,
+)
 from harness.names import parse
-from harness.results.folder import environment_of
+from harness.registry import SolverSpec
+from harness.results.faults import FAULTS
+from harness.results.folder import environment_of, refuse_other
 from harness.results.journal import read_journal
-from harness.suite.suite import load_suite
+from harness.suite.growth import as_toml
+from harness.suite.solver_options import as_given, options_for, swept
+from harness.suite.suite import load_suite, read_stored
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from problems import PROBLEMS
@@ -19,7 +43,8 @@ from problems.models.description import described_bodies
 from reports.data.evidence import read_evidence
 from reports.folder import compose, write_report
 from solvers import SOLVERS
-from tests.support import damaged_texts, synthetic_results
+from tests.support import damaged_files, damaged_texts, synthetic_results
+from tests.support.bounded import bounded
 
 FEW, MANY = 30, 1000
 COUNTS = pytest.mark.parametrize(
@@ -124,7 +149,7 @@ ENVIRONMENT = {
 def tried(text, read):
     """Read one text: whether it was taken; anything but an InputError is a fault."""
     try:
-        with damaged_texts.no_hang(), warnings.catch_warnings():
+        with bounded(), warnings.catch_warnings():
             warnings.simplefilter("error")
             read()
     except InputError:
@@ -222,6 +247,188 @@ def test_an_odd_environment_is_refused_or_reported(tmp_path, count):
 
 
 @COUNTS
+def test_a_damaged_suite_of_a_folder_is_refused_or_reported_and_merged(tmp_path, count):
+    chance = random.Random(count)
+    for name in ("a", "b"):
+        synthetic_results.write(tmp_path / name, 1, 1, 1)
+        (tmp_path / name / "suite.toml").write_text(SUITE)
+    table = toml(SUITE)
+    for i in range(count):
+        text = (
+            in_lines(without_none(damaged_texts.distorted(table, chance)))
+            if i % 2
+            else damaged_texts.damaged(SUITE, chance)
+        )
+        written(tmp_path / "b" / "suite.toml", text)
+        taken = tried(text, lambda: read_evidence(tmp_path / "b"))
+        if taken and i % 10 == 0:
+            assert tried(text, lambda: compose(read_evidence(tmp_path / "b")))
+        if i % 10 == 1:
+            shutil.rmtree(tmp_path / "c", ignore_errors=True)
+            folders = [tmp_path / "a", tmp_path / "b"]
+            if tried(text, lambda f=folders: mb.merge(*f, out=tmp_path / "c")):
+                assert tried(text, lambda: read_stored(tmp_path / "c" / "suite.toml"))
+        suite = tmp_path / "s.toml"
+        suite.write_text(SUITE)
+        now = load_suite(suite, PROBLEMS, SOLVERS)
+        tried(text, lambda now=now: refuse_other(tmp_path / "b", now, {"digest": ""}))
+
+
+def in_lines(table):
+    """Write any table as TOML, what is in it in a line each."""
+    return as_toml({f"{key}_": value for key, value in table.items()}).replace(
+        "_ = ", " = "
+    )
+
+
+def without_none(data):
+    """Drop what TOML cannot hold."""
+    match data:
+        case dict():
+            return {k: without_none(v) for k, v in data.items() if v is not None}
+        case list():
+            return [without_none(v) for v in data if v is not None]
+    return data
+
+
+@COUNTS
+def test_damaged_faults_are_refused_or_reported(tmp_path, count):
+    chance = random.Random(count)
+    synthetic_results.write(tmp_path, 1, 1, 1)
+    fault = {
+        "time": "2026-01-01", "run_id": "a", "case": "c", "solver": "s", "what": "w",
+        "tried_again": False,
+    }  # fmt: skip
+    for i in range(count):
+        text = json.dumps(damaged_texts.distorted(fault, chance)) + "\n"
+        text = damaged_texts.damaged(text, chance) if chance.random() < 0.3 else text
+        written(tmp_path / FAULTS, text)
+        taken = tried(text, lambda: read_evidence(tmp_path))
+        if taken and i % 10 == 0:
+            assert tried(text, lambda: compose(read_evidence(tmp_path)))
+
+
+@COUNTS
+def test_a_damaged_history_of_meshes_is_refused_or_reported(tmp_path, count):
+    chance, path = random.Random(count), tmp_path / discretisation.FILE
+    level = {"case": "c", "unknowns": 3, "distance": 0.1, "allowed": 0.01}
+    whole = {
+        "schema": 1,
+        "cases": [{"case": "c", "params": {"n": 4}, "levels": [level, level]}],
+    }
+    for _ in range(count):
+        text = json.dumps(damaged_texts.distorted(whole, chance))
+        text = damaged_texts.damaged(text, chance) if chance.random() < 0.3 else text
+        written(path, text)
+        tried(text, lambda: discretisation.read_discretisation(tmp_path))
+
+
+@COUNTS
+def test_damaged_vectors_are_read_or_refused(tmp_path, count):
+    chance = np.random.default_rng(count)
+    point = Solution(
+        status=Status.SOLVED, x=np.ones(5), y=np.ones(2), z=np.ones(0),
+        z_box=np.zeros(5), iterations=3, counts={},
+        history={"objective": np.arange(3.0), "step": np.array(["a", "b", "c"])},
+    )  # fmt: skip
+    fields = {
+        "points": np.zeros((4, 2)), "cells": np.array([[0, 1, 2, 3]]),
+        "bodies": np.zeros(1, dtype=int), "displacement": np.zeros((4, 2)),
+    }  # fmt: skip
+    digests = save(tmp_path, point_arrays(point)), save(tmp_path, fields)
+    paths = [tmp_path / "vectors" / f"{digest}.npz" for digest in digests]
+    whole = [path.read_bytes() for path in paths]
+    for i in range(count):
+        data = damaged_files.damaged(chance, whole[i % 2], whole)
+        paths[i % 2].write_bytes(data)
+        for load in (load_fields, load_history, load_claim):
+            tried(data, lambda load=load, i=i: load(tmp_path, digests[i % 2]))
+
+
+def load_claim(folder, digest):
+    return load_solution(folder, digest, Status.SOLVED)
+
+
+@COUNTS
+def test_damaged_options_are_taken_or_refused(count):
+    chance = random.Random(count)
+    options = ("max_iter=50", "eps_abs=1e-8", "polish=true", "max_iter=5,10", "rho=")
+    for _ in range(count):
+        text = damaged_texts.damaged(chance.choice(options), chance)
+        tried(text, lambda text=text: options_for("osqp", [text], SOLVERS))
+        value = chance.choice((*damaged_texts.VALUES, *ODD))
+        key = chance.choice(("max_iter", "eps_abs", "polish", *ODD))
+        tried(
+            (key, value),
+            lambda key=key, value=value: swept(
+                [SolverSpec(name="osqp", label="osqp")],
+                as_given({key: value} if isinstance(key, str) else value),
+                SOLVERS,
+            ),
+        )
+
+
+#: what a Python program may pass by mistake
+ODD = (
+    None, True, False, 0, 3, -1, 2.5, float("nan"), float("inf"), 10**400, 1j, "", "x",
+    "a b", "\0", "\ud800", "x" * 5000, "nowhere/x", "/dev/zero", "/proc/self/mem", "-",
+    b"x", Path("nowhere"), Path(), Path("a\0b"), (), (3,), ("x",), (None,), ("a", 5),
+    frozenset({"x"}), frozenset(), range(3), str, InputError, np.float64(0.5),
+    np.int64(2), np.bool_(True), np.str_("x"), Decimal(1), Fraction(1, 3), ...,
+)  # fmt: skip
+#: functions, sound arguments by position and by name
+ENTRIES = (
+    (mb.build, ["obstacle/dim=1/n=4/primal"], {"plugins": ()}),
+    (mb.load, ["run"], {"warn": len}),
+    (mb.merge, ["run", "run"], {"out": "merged", "tell": len}),
+    (mb.problems, [], {"plugins": (), "registries": None}),
+    (mb.report, ["run", None], {
+        "formats": ("csv",), "factor": 10.0, "fail_on": (), "pool_forms": False,
+        "registries": None,
+    }),
+    (mb.run, ["small.toml"], {
+        "out": "measured", "solvers": (), "cases": (), "repeats": 1, "time_limit": 60,
+        "memory_limit": 4096, "options": None, "fresh": False, "dask": None,
+        "plugins": (), "progress": False, "registries": None,
+    }),
+    (mb.solvers, [], {"plugins": (), "registries": None}),
+    (mb.suites, [], {"registries": None}),
+    (mb.validate, ["nowhere"], {
+        "budget": 0, "plugins": (), "progress": len, "registries": None,
+    }),
+    (lambda path: mb.build("obstacle/dim=1/n=4/primal").save(path), ["qp.npz"], {}),
+)  # fmt: skip
+
+
+@COUNTS
+def test_odd_arguments_from_python_are_taken_or_refused(tmp_path, monkeypatch, count):
+    monkeypatch.chdir(tmp_path)
+    synthetic_results.write(tmp_path / "run", 1, 1, 1)
+    (tmp_path / "small.toml").write_text(
+        'name = "small"\nrepeats = 1\nsolvers = ["clarabel"]\n[[problems]]\n'
+        'family = "obstacle"\nforms = ["primal"]\nparams = { dim = 1, n = 4 }\n'
+    )
+    mb.run("small.toml", out="measured")
+    calls = [
+        (function, given, named, place, odd)
+        for function, given, named in ENTRIES
+        for place in (*range(len(given)), *named)
+        for odd in (*ODD, [], [3], ["x"], [[]], {}, {5: 5}, {"max_iter": object()})
+        if not (place == "dask" and isinstance(odd, str))
+    ]
+    random.Random(count).shuffle(calls)
+    assert len(calls) > MANY
+    for function, given, named, place, odd in calls[:count] if count == FEW else calls:
+        changed = dict(enumerate(given)) | named | {place: odd}
+        call = partial(
+            function,
+            *(changed[i] for i in range(len(given))),
+            **{name: changed[name] for name in named},
+        )
+        tried((function, place, odd), call)
+
+
+@COUNTS
 def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
     tmp_path, monkeypatch, capsys, count
 ):
@@ -241,7 +448,7 @@ def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
         argv[at] = damaged_texts.damaged(argv[at], chance).replace("\x00", "")
         if argv in commands or "\n" in argv[at] or "-h" in argv[at]:
             continue
-        with damaged_texts.no_hang():
+        with bounded():
             assert main(registries, argv) == 2, argv
         message = capsys.readouterr().err
         assert message.count("\n") == 1, argv

@@ -2,9 +2,7 @@
 
 import io
 import json
-import signal
 import struct
-from contextlib import contextmanager
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -17,6 +15,7 @@ from harness.files.parquetfile import save_parquet
 from harness.files.qpfile import save_qp
 from problems import PROBLEMS
 from problems.fem.gmsh_mesh import read_msh
+from tests.support.bounded import bounded
 
 EXTREMES = (
     0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),
@@ -269,26 +268,6 @@ def read(path):
     return True
 
 
-class HangError(BaseException):
-    """No exception that a reader could catch."""
-
-
-@contextmanager
-def alarm(seconds):
-    """Raise `HangError` in what takes longer."""
-
-    def ring(*_):
-        raise HangError
-
-    before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
 def fuzz(kind, count, seed, folder, seconds):
     """Read `count` damaged files of a kind; count those that were read all the same."""
     rng = np.random.default_rng(seed)
@@ -298,6 +277,6 @@ def fuzz(kind, count, seed, folder, seconds):
     for _ in range(count):
         data = damaged(rng, whole[rng.integers(0, len(whole))], whole)
         path.write_bytes(data)
-        with alarm(seconds):
+        with bounded(seconds):
             survived += read(path)
     return survived

@@ -1,8 +1,6 @@
 """Texts damaged at random from a seed: what readers must take or refuse in a line."""
 
 import json
-import signal
-from contextlib import contextmanager
 from copy import deepcopy
 
 WORDS = (
@@ -56,19 +54,3 @@ def distorted(data, random):
             at[key] = deepcopy(random.choice(VALUES))
             break
     return data
-
-
-@contextmanager
-def no_hang(seconds=30):
-    """Raise where a reader does not come back."""
-
-    def stop(*_):
-        raise TimeoutError("hangs")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)

@@ -107,8 +107,8 @@ def factors(ranks):
     own = held[ranks.rank][k[local.border]]
     A, less = (sum(g @ g.T for g in parts) for parts in (G, held))
     errors = []
-    for scale, of_border, M in ((1, None, A), (1.5, own @ own.T, 1.5 * A - less)):
-        whole = local.completed(scale, of_border)
+    full = local.completed()
+    for whole, M in ((full, A), (full.shifted(0.5, own @ own.T), 1.5 * A - less)):
         a, b = (whole.forward(rows.additive(v[k])) for v in (t, s))
         y = np.linalg.solve(M, t)
         errors += [

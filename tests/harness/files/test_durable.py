@@ -16,7 +16,6 @@ import pytest
 from harness import InputError
 from harness.errors import FaultError
 from harness.files.durable import (
-    Lines,
     full_disk_told,
     keep_private,
     refuse_full_disk,
@@ -24,6 +23,7 @@ from harness.files.durable import (
     replace_file,
     replacing,
 )
+from harness.files.lines import Lines
 from harness.processes import measurement as remote
 from harness.registry import load_plugin
 from harness.results.faults import FAULTS, Fault, in_words, left, read_faults
@@ -166,17 +166,48 @@ def test_a_file_in_place_of_ours_keeps_its_lines_and_gets_those_it_lacks(lines):
     assert lines.path.read_text().split() == ["other", "two", "one", "three"]
 
 
-@pytest.mark.parametrize("change", [b"", b"one\nforeign\n"])
+@pytest.mark.parametrize("change", [b"", b"one\nforeign\n", b"two\n", b"one "])
 def test_a_file_that_another_program_writes_is_left_to_it_in_one_line(lines, change):
-    with lines() as file:
+    changed = pytest.raises(InputError, match="changed by another program")
+    with changed, lines() as file:
         file.append("one")
         with lines.path.open("r+b") as other:
             other.truncate()
             other.write(change)
-        with pytest.raises(InputError, match="changed by another program"):
-            file.append("two")
+        file.append("two")
 
     assert lines.path.read_bytes() == change
+
+
+def test_a_line_that_another_program_edits_after_the_last_of_ours_is_noticed(lines):
+    changed = pytest.raises(InputError, match="changed by another program")
+    with changed, lines() as file:
+        file.append("one")
+        times = lines.path.stat()
+        lines.path.write_text("two\n")
+        os.utime(lines.path, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+
+def test_a_file_of_lines_that_is_only_touched_or_linked_is_written_on(lines):
+    with lines() as file:
+        file.append("one")
+        lines.path.touch()
+        file.append("two")
+        os.link(lines.path, lines.path.with_name("backup"))
+        file.append("three")
+
+    assert lines.path.read_text().split() == ["one", "two", "three"]
+    assert lines.told == []
+
+
+def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
+    with lines() as file:
+        file.append("one")
+    lines.path.write_text("two\n")
+    with lines() as file:
+        file.append("three")
+
+    assert lines.path.read_text().split() == ["two", "three"]
 
 
 def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):

@@ -174,7 +174,7 @@ def test_a_sparse_matrix_may_be_given_by_its_parts(tmp_path):
         ({"A": None}, "A is missing beside b"),
         ({"Aeq": np.eye(2)}, "unknown array 'Aeq'; known: A, G, P, b, h, lb, q, ub"),
         ({"P": None, "P_data": np.ones(1)}, "P_indices, P_indptr, P_shape missing be"),
-        ({"P": np.eye(3)}, "QP.P has shape (3, 3), expected (2, 2)"),
+        ({"P": np.eye(3)}, "P has shape (3, 3); expected (2, 2)"),
         ({"P": np.ones(4)}, "P has shape (4,); expected two dimensions"),
         ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),
         ({"G": np.array([[np.nan, 1.0]])}, "G holds NaN or inf; expected finite num"),

@@ -1,6 +1,8 @@
 """What becomes of a measurement where one of its ranks fails, stage by stage."""
 
+import json
 import os
+import select
 import subprocess
 import sys
 from contextlib import suppress
@@ -74,12 +76,19 @@ def left(mark):
     return found
 
 
-def test_lines_of_ranks_do_not_mix(monkeypatch):
+def test_records_of_ranks_do_not_mix(monkeypatch):
+    """Each is one line, written at once, and not longer than a pipe takes at once."""
     written = []
-    monkeypatch.setattr(os, "write", lambda _, data: written.append(data))
-    failures.say("rank 1 is process 2")
+    monkeypatch.setattr(os, "write", lambda fd, data: written.append((fd, data)))
+    monkeypatch.setenv(failures.RECORD, "7")
+    failures.record(1, "ValueError: \n" + "δ" * 10_000)
 
-    assert written == [b"rank 1 is process 2\n"]
+    ((fd, line),) = written
+    assert fd == 7
+    assert line.count(b"\n") == 1
+    assert line.endswith(b"\n")
+    assert len(line) < select.PIPE_BUF
+    assert json.loads(line)["rank"] == 1
 
 
 def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
@@ -106,6 +115,25 @@ def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, 
     assert record.verdict == "crashed"
     assert KILLED in record.message
     assert named(record.message, stage)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", MEASURING + EVALUATING)
+@pytest.mark.parametrize("rank", ["0", "1"])
+def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, rank):
+    record = measured(stage, "exits", rank=rank)
+
+    assert record.verdict == "crashed"
+    assert f"rank {rank} of 2 ranks ended: exit code 0" in record.message
+    assert named(record.message, stage)
+
+
+@pytest.mark.parametrize("stage", ["solve"])
+def test_what_a_rank_prints_is_not_taken_for_the_reason(measured, stage):
+    record = measured(stage, "prints")
+
+    assert record.verdict == "crashed"
+    assert record.message.endswith(f"{KILLED} (signal 9)")
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from harness.record import Record
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from tests.support import ROOT, SUPPORT
+from tests.support.press import described
 from tests.support.waiting import soon
 
 pytestmark = pytest.mark.together
@@ -101,6 +102,30 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
     assert first.record.reported["ranks"] == 2
     assert first.record.objective == pytest.approx(alone.record.objective, rel=1e-12)
     assert first.record.run_id != alone.record.run_id
+
+
+def test_faces_that_a_body_hardly_feels_have_a_factor_on_ranks():
+    """What free components leave of some rows is less than they cancel to."""
+    case = "contact-patch/ratio=1e-10/feti=2/dual"
+    answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
+    assert answer.record.claimed in ("solved", "iteration_limit")
+    # no rank has the assembled K: the bound holds for any that rounding may store
+    assert answer.energy_bound <= 1e-3
+
+
+@pytest.mark.parametrize("parts", [6, 20])
+def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
+    """Rows of node to segment do not feel it roll: equality rows are dependent."""
+    description = described(tmp_path)
+    text = description.read_text().replace('"mortar"', '"nts"')
+    held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
+    assert held in text
+    description.write_text(text.replace(held, ""))
+    case = mb.build(f"bodies:{description}/parts={parts}/dual")
+    ranks, alone = (mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 1))
+    assert ranks.verdict == alone.verdict == "verified"
+    assert ranks.energy_bound <= 1e-6
+    assert ranks.record.objective == pytest.approx(alone.record.objective, rel=1e-8)
 
 
 def test_records_tell_what_ranks_spent_on_the_solve(answers):

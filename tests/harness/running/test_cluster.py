@@ -23,7 +23,7 @@ from harness.results.folder import environment_of
 from harness.results.journal import read_journal
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
-from tests.support import TOY_PROBLEM
+from tests.support import ROOT, TOY_PROBLEM
 from tests.support.waiting import soon
 
 if find_spec("distributed") is None:
@@ -243,7 +243,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
 
 def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
     monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
-    for address in ("tcp://127.0.0.1:9", "nonsense://x", ""):
+    for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
         assert code == 2
         assert err.splitlines()[-1].startswith(f"mortarbench: --dask {address}:")
@@ -344,11 +344,8 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     assert soon(lambda: set(descendants(worker.pid)) == before)
 
 
-@pytest.mark.slow
-def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
-    cli, cluster, tmp_path
-):
-    worker = cluster.join(serves=False)
+def started(*arguments):
+    """Start a run of the toy problem in a process of its own."""
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
@@ -360,25 +357,95 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
         "report=lambda *_, **__: [], **nothing, "
         "start=(sys.executable, '-P', toy_problem.__file__)), sys.argv[2:])"
     )
-    command = [
-        sys.executable,
-        "-c",
-        program,
-        str(TOY_PROBLEM.parent),
-        "run",
-        "toy.toml",
-    ]
-    run = subprocess.Popen([*command, "--out", "d", "--dask", cluster.address])
+    command = [sys.executable, "-c", program, str(TOY_PROBLEM.parent)]
+    return subprocess.Popen([*command, "run", "toy.toml", *arguments])
+
+
+@pytest.mark.slow
+def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
+    cli, cluster, tmp_path
+):
+    worker = cluster.join(serves=False)
+    run = started("--out", "d", "--dask", cluster.address)
     assert soon(lambda: halved("d"))  # the worker is in the middle of a block
     run.kill()
     run.wait()
     before = measured("d")
 
-    assert cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)[0] == 0
+    code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
+    assert code == 0, err
     cli("run", "toy.toml", "--out", "alone")
     assert measured("d") == measured("alone")
     assert 0 < len(before) < len(measured("d"))
     assert soon(lambda: not descendants(worker.pid))
+
+
+@pytest.fixture
+def one_cpu():
+    """What is started may use one CPU, as a worker of pytest does."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(before)})
+    yield
+    os.sched_setaffinity(0, before)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_cpu")
+def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_missed_yet(
+    cli, cluster, tmp_path
+):
+    """A scheduler learns of a dead client later, on a busy machine after the next run.
+
+    A parent that stands still looks the same to it.
+    """
+    worker = cluster.join(serves=False)
+    run = started("--out", "d", "--dask", cluster.address)
+    assert soon(lambda: halved("d"))
+    run.send_signal(signal.SIGSTOP)
+    try:
+        code, _, err = cli("run", "toy.toml", "--out", "e", "--dask", cluster.address)
+        assert code == 0, err
+        assert len(measured("e")) == 6 * SOLVERS
+    finally:
+        run.kill()
+        run.wait()
+    few = ("run", "toy.toml", "--out", "f", "--case", "well/depth=2/dual")
+    assert cli(*few, "--dask", cluster.address)[0] == 0
+    assert soon(lambda: not descendants(worker.pid))
+
+
+UNGUARDED = """
+import sys
+import mortarbench as mb
+
+try:
+    mb.run("string.toml", out="d", dask="local")
+except mb.InputError as e:
+    sys.exit(str(e))
+"""
+
+
+def test_a_script_that_would_run_in_the_workers_too_is_refused_in_a_line(tmp_path):
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    text = (
+        SUITE.format(repeats=1).replace("well", "string").replace('"dual"', '"primal"')
+    )
+    (tmp_path / "string.toml").write_text(
+        re.sub(
+            "params.*",
+            "params = { n = 10 }",
+            re.sub("solvers.*", 'solvers = ["smalbe"]', text),
+        )
+    )
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert '`if __name__ == "__main__":`' in done.stderr
+    assert not (tmp_path / "d").exists()
 
 
 @pytest.mark.slow

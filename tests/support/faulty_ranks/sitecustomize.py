@@ -3,8 +3,8 @@
 Python imports this module when it starts, where its folder is on PYTHONPATH: the ranks
 of tests/harness/processes/test_rank_faults.py are those of users but for what is
 planted here. FAULT_RANK: which of them, or "all". FAULT_STAGE: one of `STAGES`.
-FAULT_KIND: killed, hangs, raises (while others go on), raises-after (when all are
-through).
+FAULT_KIND: killed, prints (what could pass for our own words, and is killed), exits
+(with 0), hangs, raises (while others go on), raises-after (when all are through).
 """
 
 import os
@@ -26,8 +26,12 @@ KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 
 
 def fail():
-    if KIND == "killed":
+    if KIND == "prints":
+        os.write(2, b"rank 0 of 2 ranks ended: by itself\nrank deficient by 3")
+    if KIND in ("killed", "prints"):
         os.kill(os.getpid(), signal.SIGKILL)
+    if KIND == "exits":
+        os._exit(0)
     if KIND == "hangs":
         time.sleep(3600)
     raise ValueError("planted")

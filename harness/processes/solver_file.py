@@ -1,0 +1,115 @@
+"""A solver object as a file, by which a worker process receives a copy of it.
+
+cloudpickle stores functions and classes of `__main__` (a script or a notebook) with
+their code, which pickle cannot. It refers to those of modules by name, so code that a
+worker would not find under the same name is stored, too: modules beside the script,
+since a worker does not search the working directory, and plug-ins.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import cache
+from importlib.machinery import PathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from harness.errors import FaultError, InputError, one_line
+from harness.plugin import Solver
+
+
+def write_solver(path: Path, solver: Solver) -> None:
+    """Store a copy of a solver.
+
+    Raises
+    ------
+    InputError
+        When it refers to something that cannot be copied, such as an open file.
+
+    """
+    import cloudpickle  # late: most solvers have names
+
+    kind = type(solver).__name__
+    with ExitStack() as stack:
+        for module in _unknown_to_workers():
+            cloudpickle.register_pickle_by_value(module)
+            stack.callback(cloudpickle.unregister_pickle_by_value, module)
+        try:
+            content = cloudpickle.dumps(solver)
+        except Exception as e:  # its own __reduce__, or whatever it refers to
+            raise InputError(
+                f"solver {kind} cannot be copied into a worker process: "
+                f"{one_line(str(e) or type(e).__name__)}; expected attributes that can "
+                "be pickled, or its name and plugins=[FILE.py]"
+            ) from None
+    path.write_bytes(content)
+
+
+def read_solver(path: Path) -> Any:
+    """Load the copy that `write_solver` stored; it comes from this user's process.
+
+    Raises
+    ------
+    InputError
+        When a module that it refers to cannot be imported, or it cannot be rebuilt.
+
+    """
+    try:
+        return pickle.loads(path.read_bytes())
+    except Exception as e:  # its own __setstate__, or a module that is imported
+        reason = f"{type(e).__name__}: {e}"
+        raise InputError(
+            f"the solver cannot be rebuilt in a worker process: {one_line(reason)}; "
+            "expected its name and plugins=[FILE.py]"
+        ) from None
+
+
+def _unknown_to_workers() -> Iterator[ModuleType]:
+    """List loaded Python modules that a worker would not find, or find elsewhere."""
+    known: dict[str, bool] = {}
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if not isinstance(module, ModuleType) or not str(file).endswith(".py"):
+            continue
+        if name == "__main__" or module.__name__ != name:
+            continue
+        top = name.partition(".")[0]
+        if top not in known:
+            known[top] = top in sys.stdlib_module_names or _is_found(
+                sys.modules.get(top)
+            )
+        if not known[top]:
+            yield module
+
+
+def _is_found(module: ModuleType | None) -> bool:
+    """Return whether a worker would import this module under its name."""
+    if module is None:
+        return False
+    spec = PathFinder.find_spec(module.__name__, [*_worker_path()])
+    if spec is None:
+        return False
+    here = (getattr(module, "__file__", None), *getattr(module, "__path__", ()))
+    there = (spec.origin, *(spec.submodule_search_locations or ()))
+    return bool({*filter(None, here)} & {*filter(None, there)})
+
+
+@cache
+def _worker_path() -> tuple[str, ...]:
+    """Ask an interpreter that is started like a worker where it finds modules."""
+    program = "import json, sys; print(json.dumps(sys.path))"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise FaultError(f"{sys.executable}: {one_line(done.stderr)}")
+    return tuple(json.loads(done.stdout))

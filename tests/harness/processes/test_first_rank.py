@@ -1,0 +1,44 @@
+"""Of ranks that die, the first one is named, whatever they print and the others do."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.support import ROOT, SUPPORT
+from tests.support.dying_ranks import WAYS
+
+#: keeps CPUs busy until its standard input is closed
+BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]: pass"
+
+
+def wrongly_named(tmp_path, count, trials, seed):
+    """Trials in which another rank was named; what ranks print is in the same file."""
+    command = [sys.executable, str(SUPPORT / "dying_ranks.py")]
+    with (tmp_path / "out").open("w+b") as out:
+        subprocess.run(
+            [*command, *map(str, (count, trials, seed))], stdout=out,
+            stderr=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)},
+            check=True,
+        )  # fmt: skip
+        out.seek(max(0, out.seek(0, os.SEEK_END) - 2**16))
+        return json.loads(out.read().splitlines()[-1])
+
+
+def test_the_rank_that_ended_first_is_named_however_it_ended(tmp_path):
+    assert wrongly_named(tmp_path, 3, len(WAYS), seed=1) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("burners", [0, 2])
+def test_a_hundred_ranks_that_die_are_named_also_on_a_busy_machine(tmp_path, burners):
+    command = [sys.executable, "-S", "-c", BURNS]
+    busy = [subprocess.Popen(command, stdin=subprocess.PIPE) for _ in range(burners)]
+    try:
+        assert wrongly_named(tmp_path, 4, 100, seed=2 + burners) == []
+    finally:
+        for process in busy:
+            process.kill()
+            process.communicate()

@@ -1,0 +1,354 @@
+"""Threads that solve at the same time, forks, closed streams, and numbers of others."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from threading import Event, Thread
+
+import pytest
+
+from harness.processes import reaper
+from harness.processes.supervisor import WorkerProcess
+from harness.processes.turns import Turn
+from tests.harness.processes.test_supervisor import SHOWS
+from tests.support.waiting import soon
+
+LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
+COMMAND = [sys.executable, "-c", SHOWS]
+CASE = "string/n=10/primal"
+#: solves by several threads in a session of its own, and prints what came of it
+THREADS = """
+import gc, json, os, sys, tempfile
+from pathlib import Path
+from threading import Thread
+import mortarbench as mb
+from harness.processes.reaper import descendants
+
+threads, times, case, acts = *map(int, sys.argv[1:3]), sys.argv[3], sys.argv[4:]
+suite = Path(tempfile.gettempdir()) / "suite.toml"
+suite.write_text('''
+name = "threads"
+repeats = 1
+time_limit = 60
+solvers = ["smalbe"]
+[[problems]]
+family = "string"
+forms = ["primal"]
+params = { n = [10] }
+''')
+answers, errors = [], []
+
+def solved(number):
+    answer = mb.solve(case, "smalbe")
+    return [str(answer.verdict), answer.record.objective, list(answer.solution.x)]
+
+def built(number):
+    return [mb.build(case).qp.q.size]
+
+def ran(number):
+    out = Path(tempfile.gettempdir()) / f"out-{number}"
+    return [[str(r.verdict), r.objective] for r in mb.run(suite, out=out).records]
+
+does = {"solve": solved, "build": built, "run": ran}
+
+def work(number):
+    for i in range(times):
+        act = acts[(number + i) % len(acts)]
+        try:
+            answers.append((act, does[act](f"{number}-{i}")))
+        except BaseException as e:
+            errors.append(f"{act}: {type(e).__name__}: {e}")
+
+def open_files():
+    return sorted(os.listdir("/proc/self/fd"))
+
+expected = {act: does[act]("first") for act in acts}
+before, stdout = open_files(), sys.stdout
+crew = [Thread(target=work, args=(i,)) for i in range(threads)]
+for thread in crew:
+    thread.start()
+for thread in crew:
+    thread.join()
+gc.collect()
+print(json.dumps(dict(
+    answers=len(answers), errors=errors,
+    other=[a for a in answers if a[1] != expected[a[0]]], expected=expected,
+    opened=len(open_files()) - len(before), same_stdout=sys.stdout is stdout,
+    left=descendants(os.getpid()),
+    scratch=[p.name for p in Path(tempfile.gettempdir()).glob("mortarbench-*")],
+)), file=sys.__stdout__)
+"""
+
+
+def of_threads(tmp_path, threads, times, *acts):
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS, str(threads), str(times), CASE, *acts],
+        env=os.environ | {"TMPDIR": str(tmp_path)}, start_new_session=True,
+        stdout=subprocess.PIPE, text=True, timeout=1800, check=True,
+    )  # fmt: skip
+    return json.loads(done.stdout)
+
+
+def assert_all_right(found, count):
+    assert found["errors"] == []
+    assert found["answers"] == count
+    assert found["other"] == []
+    assert found["expected"]["solve"][0] == "verified"
+    assert found["opened"] == 0
+    assert found["same_stdout"]
+    assert found["left"] == []
+    assert found["scratch"] == []
+
+
+def test_threads_that_build_solve_and_run_at_the_same_time_take_turns(tmp_path):
+    found = of_threads(tmp_path, 3, 2, "solve", "build", "run")
+    assert_all_right(found, 6)
+
+
+@pytest.mark.slow
+def test_four_hundred_solves_of_eight_threads_are_right_and_leave_nothing(tmp_path):
+    found = of_threads(tmp_path, 8, 50, "solve")
+    assert_all_right(found, 400)
+
+
+@pytest.fixture
+def worker(tmp_path):
+    worker = WorkerProcess(COMMAND, tmp_path / "log")
+    yield worker
+    worker.close()
+
+
+def test_threads_that_share_a_worker_or_close_it_get_an_answer_each(worker):
+    answers = []
+
+    def ask():
+        answers.append(worker.ask({}, **LIMITS).answer)
+        worker.close()
+
+    threads = [Thread(target=ask) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert [answer is not None for answer in answers] == [True] * 4
+
+
+def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
+    worker.ask({}, **LIMITS)
+    worker.close()
+    others = [(tmp_path / f"{i}").open("w") for i in range(8)]
+    worker.close()
+    for file in others:
+        file.write("still open")
+        file.close()
+
+
+def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
+    """From the start of a worker to its end, stops of others included."""
+    other = WorkerProcess(COMMAND, tmp_path / "other")
+
+    def refuse(*what):
+        raise AssertionError(what)
+
+    monkeypatch.setattr(os, "kill", refuse)
+    monkeypatch.setattr(os, "killpg", refuse)
+    try:
+        for asked in (worker, other, worker):
+            assert asked.ask({}, **LIMITS).answer is not None
+        pid = other.ask({}, **LIMITS).answer["pid"]
+    finally:
+        other.close()
+    assert soon(lambda: not reaper.lives(pid))
+
+
+def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
+    """Its number may have been that of one of ours a moment ago."""
+    with subprocess.Popen(["sleep", "60"], start_new_session=True) as stranger:
+        found = [{stranger.pid}, {stranger.pid}, set(), set()]
+        monkeypatch.setattr(reaper, "_found", lambda *_: found.pop(0))
+        reaper.end_all(0, mark="of another tree")
+        assert reaper.state(stranger.pid) in "SR"
+        stranger.kill()
+
+
+def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
+    first = worker.ask({}, **LIMITS).answer["pid"]
+    os.kill(first, signal.SIGKILL)
+    with suppress(ChildProcessError):
+        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD does
+
+    second = worker.ask({}, **LIMITS)
+    assert second.answer["pid"] != first
+
+
+def test_a_fork_of_a_process_leaves_its_workers_alone(worker):
+    pid = worker.ask({}, **LIMITS).answer["pid"]
+    if (child := os.fork()) == 0:
+        code = 1
+        try:
+            worker.close()
+            own = WorkerProcess(COMMAND, worker._log.with_name("fork"))
+            answer = own.ask({}, **LIMITS).answer
+            own.close()
+            code = 0 if answer["pid"] != pid else 2
+        finally:
+            os._exit(code)
+
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert worker.ask({}, **LIMITS).answer["pid"] == pid
+
+
+def test_a_fork_does_not_wait_for_a_thread_that_is_not_in_it():
+    turn, taken, done = Turn(), Event(), Event()
+
+    def hold():
+        with turn:
+            taken.set()
+            done.wait()
+
+    thread = Thread(target=hold)
+    thread.start()
+    taken.wait()
+    if (child := os.fork()) == 0:
+        signal.alarm(20)
+        with turn:
+            os._exit(0)
+    done.set()
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_streams_cost_no_answer(tmp_path, closed):
+    solve = f"{sys.executable} -m mortarbench solve {CASE} --solver smalbe {closed}"
+    library = (
+        "import mortarbench as mb; from pathlib import Path; "
+        f"verdict = str(mb.solve('{CASE}', 'smalbe').verdict); "
+        f"Path('{tmp_path}/verdict').write_text(verdict)"
+    )
+    assert subprocess.run(["sh", "-c", solve], env=env(tmp_path)).returncode == 0
+    script = f'{sys.executable} -c "{library}" {closed}'
+    assert subprocess.run(["sh", "-c", script], env=env(tmp_path)).returncode == 0
+    assert (tmp_path / "verdict").read_text() == "verified"
+
+
+def env(tmp_path):
+    return os.environ | {"TMPDIR": str(tmp_path)}
+
+
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)],
+)
+def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, code):
+    plugin = tmp_path / "hangs.py"
+    plugin.write_text(HANGS)
+    solve = subprocess.Popen(
+        [sys.executable, "-m", "mortarbench", "solve", CASE, "--solver", "hangs",
+         "--plugin", str(plugin)],
+        env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert soon((tmp_path / "started").exists)
+    process = int((tmp_path / "started").read_text())
+    solve.send_signal(number)
+    solve.send_signal(number)  # cleaning up is not interrupted
+    said = solve.communicate()[1]
+
+    assert solve.returncode == code
+    assert len(said.splitlines()) == 1, said
+    assert not list(tmp_path.glob("mortarbench-*"))
+    assert soon(lambda: not reaper.lives(process))
+
+
+HANGS = """
+import os, time
+from dataclasses import dataclass
+from pathlib import Path
+
+@dataclass(frozen=True)
+class Hangs:
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        if qp.q.size == 32:  # the warm-up
+            raise ValueError("it does not warm up")
+        started = Path(os.environ["STARTED"])
+        started.with_suffix(".new").write_text(str(os.getpid()))
+        started.with_suffix(".new").rename(started)
+        time.sleep(3600)
+
+SOLVERS = {"hangs": Hangs()}
+"""
+
+
+def test_a_signal_that_is_ignored_stays_so(tmp_path):
+    """As nohup does with SIGHUP."""
+    script = (
+        "import os, signal; from harness.processes.termination import *\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "with ended_by_signals():\n"
+        "    os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    print('goes on', flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True)
+    assert (done.returncode, done.stdout) == (143, b"goes on\n")
+
+
+#: a worker that creates a System V segment of 64 MiB, fills it, and writes which it is:
+#: other programs of the machine create segments meanwhile
+SEGMENT = SHOWS.replace(
+    '    reply(event="start")\n',
+    '    reply(event="start")\n'
+    "    import ctypes\n"
+    "    libc = ctypes.CDLL(None)\n"
+    "    libc.shmat.restype = ctypes.c_void_p\n"
+    "    segment = libc.shmget(0, 2**26, 0o1600)\n"
+    "    open(FILE, 'w').write(str(segment))\n"
+    "    at = libc.shmat(segment, None, 0)\n"
+    "    ctypes.memset(at, 1, 2**26)\n"
+    "    libc.shmdt(ctypes.c_void_p(at))\n"
+    "    import time; time.sleep(0.5)\n",
+)
+
+
+@pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
+@pytest.mark.parametrize("memory_limit", [2000.0, 60.0])
+def test_segments_of_a_worker_count_for_its_limit_and_go_with_it(
+    tmp_path, memory_limit
+):
+    file = tmp_path / "segment"
+    script = SEGMENT.replace("FILE", repr(str(file)))
+    worker = WorkerProcess([sys.executable, "-c", script], tmp_path / "log")
+    try:
+        reply = worker.ask({}, time_limit=30.0, memory_limit=memory_limit)
+        if memory_limit == 60.0:
+            assert reply.verdict == "memory_limit"
+        else:
+            assert reply.peak_mib > 64
+            assert int(file.read_text()) in reaper.segments()
+    finally:
+        worker.close()
+    assert int(file.read_text()) not in reaper.segments()
+
+
+@pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
+def test_segments_of_a_worker_go_when_its_parent_is_killed(tmp_path):
+    file = tmp_path / "segment"
+    script = SEGMENT.replace("FILE", repr(str(file)))
+    asks = (
+        "import sys; from pathlib import Path\n"
+        "from harness.processes.supervisor import WorkerProcess\n"
+        f"worker = WorkerProcess([sys.executable, '-c', {script!r}],"
+        " Path(sys.argv[1]))\n"
+        "worker.ask({}, time_limit=60, memory_limit=2000)\n"
+        "import os; os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", asks, str(tmp_path / "log")])
+    assert soon(lambda: int(file.read_text()) not in reaper.segments())

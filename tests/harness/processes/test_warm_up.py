@@ -1,0 +1,67 @@
+"""Seconds of dualising are those of a process that has dualised before."""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_array
+
+from harness import QP, Case, Family, no_rows
+from harness.processes import case_worker
+from harness.processes.case_worker import CaseWorker
+
+
+@dataclass(frozen=True)
+class Slow(Family):
+    """A family whose first dual case takes longer, as first calls do."""
+
+    name: str = "slow"
+    forms: tuple = ("primal", "dual")
+    defaults: dict = field(default_factory=lambda: {"n": 1})
+    built: list = field(default_factory=list)
+
+    def build(self, form, params, reference):
+        self.built.append(form)
+        seconds = None
+        if form == "dual":
+            seconds = 0.01 if self.built.count("dual") == 1 else 0.001
+        if params["n"] > 1:
+            time.sleep(0.05)
+        A, b = no_rows(2), np.zeros(0)
+        qp = QP(P=csc_array(np.eye(2)), q=np.ones(2), A=A, b=b, G=A, h=b,
+                lb=np.zeros(2), ub=np.ones(2))  # fmt: skip
+        return Case(
+            qp=qp, recover=lambda s: s.x, quantities=lambda _: {},
+            dualise_seconds=seconds,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def build(tmp_path):
+    family = Slow()
+    worker = CaseWorker({"slow": family}, lambda _: None)
+
+    def ask(form, n=1):
+        request = {
+            "build": {"family": "slow", "params": {"n": n}, "form": form,
+                      "name": f"slow/n={n}/{form}"},
+            "qp": str(tmp_path / f"{n}-{form}.npz"), "keep": 1,
+        }  # fmt: skip
+        return worker.answer(request)["meta"]["dualise_seconds"]
+
+    ask.family = family
+    return ask
+
+
+def test_the_first_dual_case_of_a_process_is_built_twice_and_the_second_counts(build):
+    assert build("primal") is None
+    assert build("dual") == 0.001
+    assert build("dual", n=2) == 0.001
+    assert build.family.built == ["primal", "dual", "dual", "dual"]
+
+
+def test_a_case_that_takes_long_is_not_built_twice(build, monkeypatch):
+    monkeypatch.setattr(case_worker, "WARM_UP", 0.02)
+    assert build("dual", n=2) == 0.01
+    assert build.family.built == ["dual"]

@@ -1,0 +1,207 @@
+"""Every file of a result folder, in place of which something else lies."""
+
+import os
+import shutil
+import subprocess
+from contextlib import suppress
+
+import pytest
+
+import mortarbench as mb
+from harness import InputError
+from harness.files.lines import Lines
+from harness.results.faults import FAULTS, Fault
+from harness.results.folder import keep_environment
+from harness.results.journal import read_journal
+from mortarbench.cli.main import main
+from mortarbench.registries import Registries
+from tests.support.bounded import bounded
+
+pytestmark = pytest.mark.together  # one result folder for all of them
+
+SUITE = """
+name = "s"
+repeats = 1
+solvers = [{ name = "smalbe", options = { history = true } }, "clarabel"]
+[[problems]]
+family = "contact-patch"
+forms = ["dual"]
+"""
+SPARSE = 3 * 2**30  #: bytes that a file declares, of which none is on the disk
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, svg_only):
+    """A folder that has every kind of file, and lacks one measurement of its suite."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    suite = folder.with_name("s.toml")
+    suite.write_text(SUITE)
+    results = mb.run(suite, out=folder)
+    fault = Fault(
+        time="", run_id="x", case="c", solver="s", what="w", tried_again=False
+    )
+    with Lines(folder / FAULTS, print) as lines:
+        lines.append(fault.to_json())
+    (record,) = (r for r in results.records if r.solver == "smalbe")
+    keep_environment(folder, record.environment, {"machine": {}})
+    with svg_only():
+        mb.validate(folder, budget=1)
+        mb.report(folder)
+    (journal,) = (folder / "journal").iterdir()
+    journal.write_text(record.to_json() + "\n")
+    return folder
+
+
+def kinds_of_files(folder):
+    """One path for each kind of file there is: by folder and ending; of reports one."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            name = path.relative_to(folder)
+            suffix = name.suffix if name.parts[0] != "report" else ""
+            found[name.parts[0], suffix] = name
+    return [str(path) for path in found.values()]
+
+
+def sparse(path, _outside):
+    with path.open("wb") as file:
+        file.truncate(SPARSE)
+
+
+def grown(path, _outside):
+    """What was there, and then zeros: by themselves the first lines are sound."""
+    with path.open("r+b") as file:
+        file.truncate(SPARSE)
+
+
+def lesser(path, _outside):
+    """Below the limit of data files, above that of a line."""
+    with path.open("r+b") as file:
+        file.truncate(2**31 - 2**20)
+
+
+def pipe(path, _outside):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def a_folder(path, _outside):
+    path.unlink()
+    path.mkdir()
+
+
+def dangling(path, outside):
+    path.unlink()
+    path.symlink_to(outside / "nothing")
+
+
+def foreign(path, outside):
+    path.unlink()
+    path.symlink_to(outside / "precious")
+
+
+def endless(path, _outside):
+    path.unlink()
+    path.symlink_to("/dev/zero")
+
+
+def empty(path, _outside):
+    path.write_bytes(b"")
+
+
+KINDS = (sparse, grown, lesser, pipe, a_folder, dangling, foreign, endless, empty)
+
+
+@pytest.fixture
+def read_by_every_command(tmp_path, capsys, monkeypatch, only_svg):
+    """Run every command that reads a folder, within bounds; none may raise."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
+    suite = tmp_path / "s.toml"
+    suite.write_text(SUITE)
+
+    def read(folder, run_id):
+        for arguments in (
+            ("report", folder), ("report", folder, folder), ("replay", folder, run_id),
+            ("merge", folder, "--out", tmp_path / "merged"),
+            ("validate", folder, "--budget", "0"), ("run", suite, "--out", folder),
+        ):  # fmt: skip
+            with bounded():
+                code = main(Registries(), [*map(str, arguments)])
+            said = capsys.readouterr().err.splitlines()
+            assert code in (0, 1, 2), "\n".join([*map(str, arguments), *said])
+            lines = [line for line in said if line.startswith("mortarbench: ")]
+            assert code < 2 or (lines and len(lines[-1]) < 1500), (arguments, said)
+            assert not any("Traceback" in line for line in said), said
+            shutil.rmtree(tmp_path / "merged", ignore_errors=True)
+        with bounded(), suppress(InputError):
+            assert mb.load(folder).df.shape[0] >= 1
+
+    return read
+
+
+def tried(whole, tmp_path, name, kind, read):
+    folder, outside = tmp_path / "run", tmp_path / "outside"
+    shutil.copytree(whole, folder)
+    outside.mkdir()
+    (outside / "precious").write_text("precious")
+    (record,) = read_journal(folder)
+    kind(folder / name, outside)
+
+    read(folder, record.run_id)
+
+    assert [path.name for path in outside.iterdir()] == ["precious"]
+    assert (outside / "precious").read_text() == "precious"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_faults_of_any_kind_are_read_or_refused_by_every_command(
+    whole, tmp_path, kind, read_by_every_command
+):
+    tried(whole, tmp_path, FAULTS, kind, read_by_every_command)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
+    whole, tmp_path, kind, read_by_every_command
+):
+    names = kinds_of_files(whole)
+    assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
+        "journal", "vectors", "cases", "references", "report", "environments",
+        "environment", "suite", "faults", "validation", "discretisation", "",
+    }  # fmt: skip
+    for i, name in enumerate(names):
+        tried(whole, tmp_path / str(i), name, kind, read_by_every_command)
+
+
+@pytest.fixture
+def copied(whole, tmp_path):
+    """A copy that is removed by rm: pytest's own way of doing so recurses."""
+    folder = tmp_path / "run"
+    shutil.copytree(whole, folder)
+    yield folder
+    subprocess.run(["rm", "-rf", folder], check=True)
+
+
+@pytest.mark.parametrize("part", ["vectors", "report", "cases", "journal", ".scratch"])
+def test_folders_nested_without_end_are_refused_in_one_line(copied, part, capsys):
+    folder = copied
+    (folder / part).mkdir(exist_ok=True)
+    here = os.open(folder / part, os.O_RDONLY)
+    for _ in range(3000):
+        os.mkdir("d", dir_fd=here)
+        inner = os.open("d", os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here = inner
+    os.close(here)
+
+    for command in ("report", "validate"):
+        assert main(Registries(), [command, str(folder)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert (
+            f"{folder / part}: folders nested deeper than 30 levels; expected" in said
+        )
+    with pytest.raises(InputError, match="nested deeper"):
+        mb.load(folder)
