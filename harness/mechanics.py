@@ -26,7 +26,6 @@ Extended = NDArray[np.longdouble]
 #: up to which part of its terms what a rigid motion does to the gaps, or a load along
 #: it, is taken for the rounding of coordinates, normals and tractions
 UNFELT = 1e-10
-_CHUNK = 500  #: rows of B whose compliance is formed at once
 
 
 class Inverse(Protocol):
@@ -72,6 +71,9 @@ class Substructures(Protocol):
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP to v (N,), in its precision."""
+
+    def squared_product(self, v: Vector) -> Vector:
+        """Apply K∘K, the squares of the entries of K, to v (N,)."""
 
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P to forces (N,)."""
@@ -209,9 +211,7 @@ class RigidMotions(NamedTuple):
     free: Any  #: (n, q) sparse; no gap changes but for rounding
     G: Extended  #: (m, p)  B·felt
     largest: Any  #: (n, p) sparse: where felt is not zero, its largest entry
-    KR: Extended  #: (n, p)  K·felt
-    curvature: NDArray[np.float64]  #: (p, p)  feltᵀK·felt
-    strain: NDArray[np.float64]  #: (p, p)  (K·felt)ᵀK⁺(K·felt)
+    KR: Extended  #: (n, p)  K·felt on the components that no support holds
 
 
 class Grid(NamedTuple):
@@ -343,36 +343,13 @@ class Mechanics:
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
         felt = turned[:, :p]
         KR = np.zeros(felt.shape, dtype=Real)
-        if self.tear is None:  # KR is exactly zero of subdomains
-            K = csr_array(self.primal.P)
-            KR = _cancelling(K, np.asarray(felt.toarray()))
+        if p:
+            KR = _cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
             KR[exact.held] = 0
-        bent = [self.relaxed(k) if k.any() else k for k in KR.T]
-        strain = np.array([[float(k @ b) for b in bent] for k in KR.T])
         return RigidMotions(
             felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
             largest=_largest(felt), KR=KR,
-            curvature=np.asarray(felt.T @ KR, dtype=np.float64),
-            strain=strain.reshape(p, p),
         )  # fmt: skip
-
-    @cached_property
-    def compliance(self) -> Vector:
-        """√(B_i P K⁺P B_iᵀ) of each row (m,), with P = I − RRᵀ.
-
-        A displacement v without rigid motion changes the gap of row i by no more than
-        this times ‖v‖_K.
-        """
-        B, R = self.rows, self.inverse.kernel
-        squares = np.zeros(B.shape[0])
-        moved = np.stack([self.inverse(r) for r in R.T], axis=1) if R.size else R
-        G, G_moved, RKR = B @ R, B @ moved, R.T @ moved
-        for i in range(0, B.shape[0], _CHUNK):
-            rows = slice(i, i + _CHUNK)
-            F = np.diag(self.inverse.congruence(B[rows]))
-            rigid = (G[rows] * (G[rows] @ RKR - 2 * G_moved[rows])).sum(axis=1)
-            squares[rows] = np.maximum(F + rigid, 0) + 1e-12 * F
-        return np.sqrt(squares)
 
     def still(self, v: Extended) -> Extended:
         """Take the rigid motions out of `v` (n,):  v − R Rᵀv."""

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import prod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array, issparse
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
+
+from harness.errors import InputError, shown
 
 Vector = NDArray[np.float64]
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
+SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
+_MOST_FACTORED = 2000  #: rows of a P whose eigenvalues are bounded: a quarter second
+_NEGATIVE = 1e-6  #: curvature relative to the diagonal; texts may have six digits
+_FLAT = 1e-4  #: of the largest entry: below, rounding may have made most of Pᵢᵢ
+_STRIP = 256  #: rows of a dense matrix that are compared at once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,6 +86,72 @@ class QP:
         for name in expected:
             _freeze(getattr(self, name))
 
+    @classmethod
+    def from_arrays(
+        cls,
+        P: ArrayLike | Matrix,
+        q: ArrayLike,
+        G: ArrayLike | Matrix | None = None,
+        h: ArrayLike | None = None,
+        A: ArrayLike | Matrix | None = None,
+        b: ArrayLike | None = None,
+        lb: ArrayLike | None = None,
+        ub: ArrayLike | None = None,
+        sets: tuple[Any, ...] = (),
+    ) -> QP:
+        """Check and copy the arrays of a QP; the arguments stay as they are.
+
+        Matrices are dense or sparse; sparse ones are stored by columns. A vector with
+        one row or column, a single row of G or A as a vector with a scalar beside it,
+        and a scalar for equal bounds are accepted. None stands for an absent part.
+
+        Parameters
+        ----------
+        P : (n, n) symmetric, whole; not a triangle
+        q : (n,)
+        G, h : (p, n) and (p,) of G x ≤ h
+        A, b : (m, n) and (m,) of A x = b
+        lb, ub : (n,) bounds, -inf and inf where there are none
+        sets : reserved for constraints on blocks of variables; empty
+
+        Raises
+        ------
+        InputError
+            When a part is missing, is not numeric, has the wrong shape or holds NaN,
+            bounds cross, or P is not symmetric or not convex (see `check_convex`).
+
+        """
+        if not isinstance(sets, tuple | list) or sets:
+            raise InputError(
+                f"sets = {shown(sets)}; discs and cones are not supported yet; "
+                "expected sets=()"
+            )
+        for M, rhs, name, side in ((G, h, "G", "h"), (A, b, "A", "b")):
+            if (M is None) != (rhs is None):
+                here, absent = (name, side) if rhs is None else (side, name)
+                raise InputError(f"{absent} is missing beside {here}")
+        vector = numeric_vector("q", q)
+        if not (n := vector.size):
+            raise InputError("q is empty; expected at least one variable")
+        try:
+            found = cls(
+                P=_matrix("P", P, n, n),
+                q=vector,
+                **_rows("A", A, "b", b, n),
+                **_rows("G", G, "h", h, n),
+                lb=_bound("lb", lb, -np.inf, n),
+                ub=_bound("ub", ub, np.inf, n),
+            )
+            check_symmetric(found.P)
+        except ValueError as e:
+            raise InputError(str(e)) from None
+        check_convex(found.P)
+        return found
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{count} {name}" for name, count in self.sizes.items())
+        return f"<QP: {sizes}>"
+
     @property
     def is_explicit(self) -> bool:
         """Whether P is a matrix (dense or sparse), not an operator."""
@@ -102,6 +177,15 @@ class QP:
             "bounds": int(bounds),
         }
 
+    def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
+        """Convert the sparse matrices among P, A and G; dense ones and operators stay.
+
+        convert : maps a sparse matrix to an equal one of another type
+        """
+        matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
+        sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}
+        return replace(self, **sparse)
+
     def objective(self, x: Vector) -> float:
         """Evaluate ½ xᵀP x + qᵀx."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x)
@@ -119,6 +203,191 @@ def needs_matrices(qp: QP) -> str | None:
     run that hears this reason multiplies a small P out, on the clock, and asks again.
     """
     return None if qp.is_explicit else NEEDS_MATRICES
+
+
+def check_symmetric(P: Matrix) -> None:
+    """Refuse a P that is not symmetric up to rounding: solvers would read another one.
+
+    Raises
+    ------
+    ValueError
+        With the entries that differ most, and a hint where P is a triangle.
+
+    """
+    where, worst = _asymmetry(P)
+    largest = abs(P).max() if prod(P.shape) else 0.0
+    if worst > SYMMETRIC * largest:
+        i, j = where
+        raise ValueError(
+            f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
+            f"{_triangle(P)}"
+        )
+
+
+def check_convex(P: Matrix) -> None:
+    """Refuse a P with negative curvature: a KKT point of it may be a maximum.
+
+    With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to be above −1e-6:
+    D⁻½PD⁻½ + 1e-6 needs a Cholesky factor. What is closer to semidefinite may be so but
+    for rounding. Of more than 2000 rows only Pᵢᵢ is looked at.
+
+    Raises
+    ------
+    InputError
+        Where curvature is negative.
+
+    """
+    largest = float(abs(P).max()) if P.shape[0] else 0.0
+    if not largest:
+        return
+    diagonal = P.diagonal() / largest
+    i = int(diagonal.argmin())
+    if diagonal[i] < -_NEGATIVE * _FLAT:
+        raise InputError(
+            f"P is not positive semidefinite: P[{i}, {i}] = {P.diagonal()[i]:.3g}; "
+            "expected a convex QP"
+        )
+    if P.shape[0] > _MOST_FACTORED:
+        return
+    root = np.sqrt(np.maximum(diagonal, _FLAT))
+    scaled = (P.toarray() if issparse(P) else P) / largest / root / root[:, None]
+    try:
+        np.linalg.cholesky(scaled + _NEGATIVE * np.eye(len(root)))
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "P is not positive semidefinite: it has a negative eigenvalue; expected a "
+            "convex QP"
+        ) from None
+
+
+def _triangle(P: Matrix) -> str:
+    """Return a hint where one strict triangle of an asymmetric P is empty."""
+    lower, upper = (tril, triu) if issparse(P) else (np.tril, np.triu)
+    for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
+        if not abs(other).max():
+            return (
+                f"; P is {name} triangular, but is stored whole here: expected both "
+                "triangles, P + P.T - diag(diag(P))"
+            )
+    return ""
+
+
+def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
+    """Find the largest entry of |P − Pᵀ|; of a dense one in strips."""
+    if issparse(P):
+        difference = coo_array(abs(P - P.T))
+        if not difference.nnz:
+            return (0, 0), 0.0
+        at = int(difference.data.argmax())
+        i, j = (int(k[at]) for k in difference.coords)
+        return (i, j), float(difference.data[at])
+    found = (0, 0), 0.0
+    for begin in range(0, len(P), _STRIP):
+        strip = slice(begin, begin + _STRIP)
+        difference = abs(P[strip] - P[:, strip].T)
+        i, j = np.unravel_index(difference.argmax(), difference.shape)
+        if difference[i, j] > found[1]:
+            found = (begin + int(i), int(j)), float(difference[i, j])
+    return found
+
+
+def canonical(M: Matrix) -> Matrix:
+    """Sort the entries of a sparse matrix and add up those of one place.
+
+    Somebody else's need not be so, and what is frozen cannot be made so later.
+    """
+    if M.has_canonical_format:
+        return M
+    M = M.copy()
+    M.sum_duplicates()
+    return M
+
+
+def _numbers(name: str, value: Any) -> NDArray[np.float64]:
+    """Copy an array of finite or infinite numbers, a sparse one as dense."""
+    expected = "expected an array of numbers"
+    if value is None:
+        raise InputError(f"{name} is missing; {expected}")
+    try:
+        array = np.asarray(value.toarray() if issparse(value) else value)
+    except ValueError:  # rows of different lengths
+        raise InputError(f"{name} is ragged; {expected}") from None
+    if array.dtype.kind not in "biuf":
+        kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
+        raise InputError(f"{name} is of type {kind}; {expected}")
+    with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
+        return np.array(array, dtype=float)
+
+
+def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
+    """Copy a vector; a matrix of one row or column is one.
+
+    name : of the vector in messages
+    n : expected number of entries; None: any
+
+    Raises
+    ------
+    InputError
+        When it is not numeric or has another shape; NaN and inf are not looked for.
+
+    """
+    array = _numbers(name, value)
+    vector = array.ravel() if array.ndim == 2 and 1 in array.shape else array
+    if vector.ndim != 1 or (n is not None and vector.size != n):
+        expected = "one dimension" if n is None else f"({n},)"
+        raise InputError(f"{name} has shape {array.shape}; expected {expected}")
+    return vector
+
+
+def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
+    """Return a bound (n,); a scalar holds for every variable."""
+    value = absent if value is None else value
+    if np.ndim(value) == 0 and not issparse(value):
+        return np.full(n, _numbers(name, value))
+    return numeric_vector(name, value, n)
+
+
+def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
+    """Copy a matrix with n columns and, unless None, that number of rows."""
+    if issparse(value):
+        if value.dtype.kind not in "biuf":
+            raise InputError(
+                f"{name} is of type {value.dtype}; expected an array of numbers"
+            )
+        value = csc_array(value) if value.ndim == 2 else value.toarray()
+    if issparse(value):
+        M = canonical(csc_array(value, dtype=float, copy=True))
+        entries = M.data
+    else:
+        if not isinstance(value, np.ndarray) and hasattr(value, "matvec"):
+            raise InputError(
+                f"{name} is an operator; expected a matrix: {name} @ np.eye({n})"
+            )
+        M = entries = _numbers(name, value)
+        M = np.atleast_2d(M) if rows is None else M
+    if not np.isfinite(entries).all():
+        raise InputError(f"{name} holds NaN or inf; expected finite numbers")
+    if M.ndim != 2 or M.shape != (M.shape[0] if rows is None else rows, n):
+        expected = f"({'rows' if rows is None else rows}, {n})"
+        raise InputError(f"{name} has shape {M.shape}; expected {expected}")
+    return M
+
+
+def _rows(
+    name: str, M: Any, side: str, rhs: ArrayLike | None, n: int
+) -> dict[str, Matrix]:
+    """Return a matrix of constraint rows and its right-hand side; no rows for None."""
+    if M is None:
+        return {name: no_rows(n), side: np.zeros(0)}
+    matrix = _matrix(name, M, None, n)
+    p = matrix.shape[0]
+    scalar = rhs is not None and np.ndim(rhs) == 0 and not issparse(rhs)
+    vector = numeric_vector(side, [rhs] if scalar else rhs)
+    if vector.size != p:
+        raise InputError(
+            f"{side} has {vector.size} entries; expected {p}, one per row of {name}"
+        )
+    return {name: matrix, side: vector}
 
 
 def _freeze(M: Matrix) -> None:

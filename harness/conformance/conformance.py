@@ -37,6 +37,7 @@ from harness.plugin import Solver
 from harness.qp import QP, Vector
 from harness.record import VERIFIED_FACTOR
 from harness.solution import Solution, Status
+from harness.verify.infeasibility import infeasibility_margin
 from harness.verify.kkt import kkt_residuals
 from harness.verify.measure import measure
 
@@ -48,6 +49,7 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
+LOST = 8 * float(np.finfo(float).eps)  #: of a gradient's terms: rounding
 ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
 
 
@@ -132,14 +134,24 @@ def _multipliers_have_our_signs(solver: Solver) -> None:
         _near(name, getattr(s, name), value, 1e-6)
 
 
-def _absent_bounds_have_no_multipliers(solver: Solver) -> None:
+def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
+    """Forgive multipliers of the size of rounding: the dual residual has room for them.
+
+    That is 8·2⁻⁵² of the largest term of the gradient, as dual residuals forgive.
+    """
     qp, _ = manufactured("some bounds")
-    z_box = _solve(solver, qp, 1e-3).z_box
+    s = _solve(solver, qp, 1e-3)
     worst = max(
-        (-z_box[np.isinf(qp.lb)]).max(initial=0), z_box[np.isinf(qp.ub)].max(initial=0)
+        (-s.z_box[np.isinf(qp.lb)]).max(initial=0),
+        s.z_box[np.isinf(qp.ub)].max(initial=0),
     )
-    if not worst <= 0:
-        raise BrokenError(f"a multiplier of {worst:.1e} on an absent bound; expected 0")
+    if worst <= 0:
+        return Result(Grade.PASS)
+    size = max(np.abs(v).max(initial=0) for v in (qp.P @ s.x, qp.q, s.z_box))
+    what = f"a multiplier of {worst:.1e} on an absent bound"
+    if not worst <= LOST * size:
+        raise BrokenError(f"{what}; expected 0")
+    return Result(Grade.PASS, f"{what}: rounding; 0 would be right")
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
@@ -172,12 +184,16 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
     raise BrokenError("takes any option; expected TypeError for no_such_option")
 
 
-def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> None:
-    s = _solve(solver, problem(), 1e-9)
+def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
+    qp = problem()
+    s = _solve(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
         raise BrokenError("claims to have solved what has no solution")
     if not s.message:
         raise BrokenError(f"ended as {s.status} without a message; expected a reason")
+    if s.status is Status.INFEASIBLE and infeasibility_margin(qp, s) is not None:
+        return Result(Grade.PASS, "verified infeasible")
+    return Result(Grade.PASS, f"ended as {s.status}: {s.message}")
 
 
 def _an_operator_is_taken_or_declined(solver: Solver) -> None:

@@ -32,6 +32,7 @@ from math import log2, sqrt
 from pathlib import Path
 from time import perf_counter
 
+from harness.crossval.comparison import brief
 from harness.crossval.mesh_refinement import prolongation
 from harness.errors import InputError
 from harness.files.durable import full_disk_told, replace_file
@@ -80,6 +81,14 @@ class Discretisation:
     note: str = ""  #: why there is no more than that
     levels: tuple[Level, ...] = ()  #: coarsest first, that is the case itself
     params: Mapping[str, object] = field(default_factory=dict)  #: of the case, all
+
+    def __str__(self) -> str:
+        """Put the error in words, or the reason why it is not known."""
+        if self.error is None:
+            return f"unknown: {self.note}"
+        before = {"limit": "about ", "rounding": "less than "}.get(self.kind, "")
+        after = f" to the next finer mesh only: {self.note}" * (self.kind == "change")
+        return f"{before}{brief(self.error)}{after}"
 
 
 def estimated(
@@ -215,7 +224,7 @@ class _Halving:
             return
         while len(sizes) < LEVELS:
             if params is None:
-                self.why = "its family does not say which mesh is the next finer one"
+                self.why = f"the family {self._family.name} offers no refined mesh"
                 return
             growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else GROWTH
             if sizes and self._refused(growth * sizes[-1]):
@@ -227,6 +236,9 @@ class _Halving:
                 return
             start = perf_counter()
             level = self._level(params, form, first=not sizes)
+            if level is None and not sizes and form != case.form:
+                form, self.why = case.form, ""  # subdomains have a dual only
+                level = self._level(params, form, first=True)
             if level is None:
                 return
             yield level

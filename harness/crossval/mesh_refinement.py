@@ -23,7 +23,9 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     """Interpolate from the nodes of `coarse` (N) to those of `fine` (M), (M, N).
 
     Linear on the edges and bilinear in the cells of `coarse`, which are segments or
-    quadrilaterals; of these, two neighbouring corners may be one.
+    quadrilaterals; of these, the last two corners may be one. Such a triangle is cut
+    into four triangles, or like a quadrilateral, about the middle between the one
+    corner and the side across.
 
     Raises
     ------
@@ -43,8 +45,11 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     ]
     places = [to, *middles]
     if len(corners) == 4:
-        places.append(_between(near, middles[0], middles[2]))
-        rows.append((rows[0] + rows[2]) / 2)
+        # in four triangles the middles of the sides next to the one corner are joined
+        joined = np.asarray(near[middles[1], middles[3]]).ravel() > 0
+        cut = ~(joined & (corners[2] == corners[3]))
+        places.append(_between(near, middles[0][cut], middles[2][cut]))
+        rows.append(csr_array(rows[0] + rows[2])[cut] / 2)
     found, first = np.unique(np.concatenate(places), return_index=True)
     if found.size != len(fine.points):
         raise _unfit()

@@ -63,6 +63,7 @@ def as_data(found: Validation, folder: str, ours: str) -> dict[str, Any]:
         "remarks": len(outliers),
         "unanswered": len(found.unanswered),
         "declined": found.declined,
+        "proven_infeasible": found.proven,
         "not_validated": len(found.not_validated),
     }
     without = [
@@ -166,6 +167,8 @@ def _headline(
         _many(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case", "pair")
     )
     what = f"{answers} of {solvers} to {cases}, {pairs} compared"
+    if proven := counts["proven_infeasible"]:
+        what += f", {_many(proven, 'claim')} of infeasibility proven"
     if agreed:
         return f"No disagreement: {what}; every claim of success stands."
     parts = []

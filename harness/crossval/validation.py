@@ -19,11 +19,12 @@ from harness.errors import InputError
 from harness.files.qpfile import qp_digest
 from harness.files.store import digest_of, is_stored, load_solution, point_arrays
 from harness.plugin import Case, Family, Reference
-from harness.qp import Vector
+from harness.qp import QP, Vector
 from harness.record import Record, Verdict
 from harness.results.journal import read_journal
 from harness.results.rebuild import rebuild
-from harness.solution import Status
+from harness.solution import Solution, Status
+from harness.verify.infeasibility import infeasibility_margin
 from harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
@@ -51,6 +52,7 @@ class Validation:
     unanswered: tuple[Listed, ...]  #: no claim, no point: died, gave up, ran out
     not_validated: tuple[Listed, ...]  #: stored points that could not be judged
     declined: int
+    proven: int = 0  #: claims of infeasibility that a certificate proves
 
     @property
     def agreed(self) -> bool:
@@ -83,6 +85,7 @@ class _Part(NamedTuple):
     false: list[Listed]  #: claims without a point that are not so
     suspects: dict[str, Vector]  #: see `harness.crossval.misattribution`
     truths: dict[str, Vector]
+    proven: int  #: claims of infeasibility
 
 
 def validated(
@@ -103,7 +106,9 @@ def validated(
 
     """
     records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
-    if not any(r.vectors and is_stored(path, r.vectors) for r in records):
+    if not any(
+        (r.vectors and is_stored(path, r.vectors)) or _is_proven(r) for r in records
+    ):
         raise InputError(f"{path}: {_pointless(records)}")
     twins: dict[tuple[str, str], set[str]] = {}
     for r in records:
@@ -130,6 +135,7 @@ def validated(
         ),
         not_validated=tuple(x for part in parts for x in part.lost),
         declined=sum(r.verdict is Verdict.DECLINED for r in records),
+        proven=sum(part.proven for part in parts),
     )
 
 
@@ -147,6 +153,13 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     cases, lost = _built(folder, records)
     given, damaged = _given(folder, [r for r in records if r.case in cases], cases)
     lost += damaged
+    called = [r for r in records if _is_proven(r) and r.case in cases]
+    contradictory = {r.run_id for r in called if _is_infeasible(cases[r.case].qp)}
+    lost += [
+        _listed(r, "no certificate of infeasibility was found again")
+        for r in called
+        if r.run_id not in contradictory
+    ]
     by_numbers: dict[str, list[Given]] = {}
     for g in given:
         by_numbers.setdefault(_numbers(g), []).append(g)
@@ -166,16 +179,17 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     false = [
         _listed(r, text)
         for r in records
-        if (text := _falsehood(r, solvable.get(r.case, elastic)))
+        if r.run_id not in contradictory
+        and (text := _falsehood(r, solvable.get(r.case, elastic)))
     ]
-    return _Part(problems, lost, false, forces, truths)
+    return _Part(problems, lost, false, forces, truths, len(contradictory))
 
 
 def _pointless(records: Sequence[Record]) -> str:
     """Say why a folder has nothing to judge."""
     if any(r.vectors for r in records):
         return "its stored points are gone; expected vectors/*.npz, which a run writes"
-    statuses = Counter(r.verdict.value.replace("_", " ") for r in records)
+    statuses = Counter(r.verdict.words for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
     return f"no solver returned a point ({ends}); expected one that solves a case"
 
@@ -186,14 +200,14 @@ def _built(
     """Build the forms of a case that have answers; list what cannot be built."""
     cases: dict[str, Case] = {}
     lost: list[Listed] = []
-    for first in {r.case: r for r in records if r.vectors}.values():
+    answered = [r for r in records if r.vectors or _is_proven(r)]
+    for first in {r.case: r for r in answered}.values():
         try:
             cases[first.case] = rebuild(
                 first, folder.path, folder.families, folder.reference
             )
         except InputError as e:
-            answered = [r for r in records if r.case == first.case and r.vectors]
-            lost += [_listed(r, str(e)) for r in answered]
+            lost += [_listed(r, str(e)) for r in answered if r.case == first.case]
     return cases, lost
 
 
@@ -237,11 +251,21 @@ def _stands(r: Record) -> bool:
     return r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
 
 
+def _is_proven(r: Record) -> bool:
+    """Return whether a claim of infeasibility was proven when it was measured."""
+    return r.verdict is Verdict.VERIFIED_INFEASIBLE
+
+
+def _is_infeasible(qp: QP) -> bool:
+    """Return whether a certificate is found; that of the solver is not stored."""
+    claim = Solution.without_point(qp, Status.INFEASIBLE)
+    return infeasibility_margin(qp, claim) is not None
+
+
 def _silent(r: Record) -> bool:
     """Whether a record neither claims success nor is verified."""
-    return r.claimed != Status.SOLVED and r.verdict not in (
-        Verdict.VERIFIED,
-        Verdict.DECLINED,
+    return r.claimed != Status.SOLVED and not (
+        r.verdict.is_verified or r.verdict is Verdict.DECLINED
     )
 
 
@@ -261,8 +285,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _ending(r: Record) -> str:
-    words = r.verdict.value.replace("_", " ")
-    return f"{words}: {r.message}" if r.message else words
+    return f"{r.verdict.words}: {r.message}" if r.message else r.verdict.words
 
 
 def _numbers(g: Given) -> str:

@@ -31,17 +31,19 @@ like one. That differs from ‖û‖ only for answers that are as far off as the
 
 Where contact alone holds a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
 its rigid motions R, or D(λ̂) = −∞; ‖·‖ is a seminorm then, that of v − RRᵀv, and of the
-rigid motion itself nothing is said. KR is zero but for the rounding of K only, which
-counts where bodies move far, as a stiff one on a soft one. u* is the solution for the
-stored K; û and u_λ get the same rigid part, and γ = Rᵀ(û − u*). With what is left of
-balance,  ρ = Rᵀ(f − Bᵀλ̂ − K u_λ),  (1) becomes
+rigid motion itself nothing is said. Motions that contact does not feel (BR = 0 up to
+rounding) or that λ̂ does not press on are left aside, with what rounding makes of K and
+f along them.
 
-    ‖û − u*‖² + ‖u_λ − u*‖² + 2λ̂ᵀ(c − Bu*) + 2λ*ᵀ(c − Bû)
-        = 2g − 2γᵀρ − 2γᵀ(KR)ᵀ(û − u* + u_λ − u*) − 2γᵀ(RᵀKR)γ                   (4)
+All of this is evaluated for the stored K = TᵀK_T T + E, with subdomains or as one, see
+`harness.verify.substructured`. With e = û − u* = e' + Rγ, ρ = Kû − f + Bᵀλ̂, any d, and
+u_λ = Tû − d, (1) becomes, (R2) of docs/certificates.md,
 
-where γ is bounded by what contact allows, and the products by |ρ|, RᵀKR and ‖KRγ‖ in
-the norm of K⁺. Motions that contact does not feel (BR = 0 up to rounding) or that λ̂
-does not press on are left aside, with what rounding makes of K and f along them.
+    ‖Te‖² + ‖Te − d‖² + 2λ̂ᵀ(c − Bu*) + 2λ*ᵀ(c − Bû)
+        = ‖d‖² + 2λ̂ᵀ(c − Bû) + 2eᵀ(ρ − TᵀK_T d) − 2eᵀEe                          (4)
+
+where the last two terms are rounding: (R3) bounds them by ‖e'‖ and γ, and (R4) bounds γ
+by what contact allows.
 """
 
 from __future__ import annotations
@@ -59,7 +61,6 @@ from harness.solution import Solution
 from harness.verify.active_set_refinement import (
     CLOSED,
     at_bounds,
-    equilibrium,
     exchanged,
     suggested,
     unconstrained_guess,
@@ -71,7 +72,15 @@ from harness.verify.admissible import (
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import Alone, moved_together, neighbour, residual
+from harness.verify.substructured import (
+    Rounding,
+    Split,
+    Torn,
+    Undivided,
+    length,
+    neighbour,
+    still,
+)
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
@@ -91,12 +100,13 @@ class Certificate:
 
     u: Extended  #: û (n,)
     multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    off: Vector | Extended  #: û − u_λ (n,); of substructures torn, Tû − u_λ (N,)
+    off: Extended  #: û − u_λ (n,); of substructures torn, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
     sliding: float  #: the second term alone
     rounding: float  #: charged for KR ≠ 0 and an imperfect balance, in (4)
+    stretch: float  #: at least ‖·‖_K over the norm of the torn K, ‖T·‖
     claimed: float  #: bound (3) of the answer itself
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, from the answer to the admissible point
@@ -128,7 +138,7 @@ class Certificate:
     @property
     def error(self) -> float:
         """Largest error of û, of u_λ and of the answer itself."""
-        return max(self.pair, self.claimed)
+        return max(self.pair * self.stretch, self.claimed)
 
     @property
     def parts(self) -> dict[str, float]:
@@ -168,27 +178,42 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    tried = list(_certificates(mechanics, s))
-    found = [c for c in tried if isinstance(c, Certificate)]
-    if not found:
-        raise UncertifiableError(f"no admissible pair near the answer: {tried[0]}")
-    best = min(found, key=lambda c: c.error)
+    split = Undivided(mechanics) if mechanics.tear is None else Torn(mechanics)
+    best = sharpest(_certificates(split, s))
     if best.least >= best.error or mechanics.tear is not None:
         return best
-    return replace(best, least=max(best.least, _least_norm(mechanics)))
+    return replace(best, least=max(best.least, _least_norm(split)))
 
 
-def _least_norm(mechanics: Mechanics) -> float:
+def sharpest(tried: Iterator[Certificate | str]) -> Certificate:
+    """Return the certificate with the smallest bound.
+
+    Raises
+    ------
+    UncertifiableError
+        When there is none, with the first reason.
+
+    """
+    proven = list(tried)
+    found = [c for c in proven if isinstance(c, Certificate)]
+    if not found:
+        raise UncertifiableError(f"no admissible pair near the answer: {proven[0]}")
+    return min(found, key=lambda c: c.error)
+
+
+def _least_norm(split: Undivided | Torn) -> float:
     """Bound ‖u*‖ from below by a pair that owes nothing to an answer."""
+    mechanics = split.mechanics
     u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
-        return proof(mechanics, u, u, lam, states == CLOSED).least
+        return proof(split, u, u, lam, states == CLOSED).least
     except UncertifiableError:
         return 0.0
 
 
-def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | str]:
+def _certificates(split: Undivided | Torn, s: Solution) -> Iterator[Certificate | str]:
     """Yield what the answer's own pair proves and, if that is mostly work, others."""
+    mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.held] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
@@ -200,7 +225,7 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
         pairs.reverse()  # of large problems what mostly is enough comes first
     proven = np.inf
     for pair in pairs:
-        found = _proved(mechanics, s.x, u, *pair)
+        found = _proved(split, s.x, u, *pair)
         yield found
         if is_sharp(found):
             return
@@ -208,14 +233,13 @@ def _certificates(mechanics: Mechanics, s: Solution) -> Iterator[Certificate | s
     exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
     if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
-        yield _proved(mechanics, s.x, v, mu, states == CLOSED)
+        yield _proved(split, s.x, v, mu, states == CLOSED)
 
 
-def _proved(mechanics: Mechanics, *pair: Any) -> Certificate | str:
+def _proved(split: Undivided | Torn, *pair: Any) -> Certificate | str:
     """Evaluate the proof, or say why there is none."""
-    prove = proof if mechanics.tear is None else _substructured_proof
     try:
-        return prove(mechanics, *pair)
+        return proof(split, *pair)
     except UncertifiableError as e:
         return str(e)
 
@@ -228,7 +252,7 @@ def is_sharp(found: Certificate | str) -> bool:
 
 
 def proof(
-    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
+    split: Undivided | Torn, claimed: Vector | Extended, u: Extended,
     multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (4) and (3) for the pair that mending u and λ yields.
@@ -239,49 +263,28 @@ def proof(
         When they cannot be mended.
 
     """
-    exact, motions = mechanics.exact, mechanics.motions
+    mechanics = split.mechanics
     feasible = admissible(mechanics, u, closed)
     if feasible is None:
         raise UncertifiableError("the answer penetrates beyond repair")
-    gaps = -exact.motion(feasible)
     lam = balanced(mechanics, multipliers, feasible)
-    alpha = motions.felt.T @ feasible
-    force = exact.f - exact.B.T @ lam - motions.KR @ alpha
-    deformed, left = equilibrium(mechanics, force)
-    at_rest = deformed + motions.felt @ alpha
-    apart = mechanics.norm(feasible - at_rest)
-    works = exact.friction_work(feasible) + lam * gaps
-    total = apart + left
-    square = total * total + 2 * float(works.sum())
-    unbalanced = motions.felt.T @ force - motions.KR.T @ deformed
-    held, _ = held_and_loose(motions.G, relative(exact.interior(lam)))
-    rounding = _rounding(
-        mechanics, _reach(mechanics, held, lam, gaps, square), unbalanced, left, square
-    )
-    middle = (feasible + at_rest) * Real(0.5)
-    return _certificate(
-        exact, mechanics.kernel.shape[1] > 0,
-        u=feasible, multipliers=lam, off=feasible - at_rest,
-        norms=[mechanics.norm(v) for v in (feasible, at_rest, middle)],
-        apart=apart, left=left, works=works, rounding=rounding,
-        from_middle=_length(mechanics, claimed - middle, held),
-        moved=mechanics.norm(claimed - feasible),
+    return proven(
+        split, mechanics.exact, mechanics.motions.G, claimed=claimed, u=feasible,
+        at_rows=feasible, multipliers=lam,
     )  # fmt: skip
 
 
-def _certificate(
-    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended,
-    off: Vector | Extended, norms: list[float], apart: float, left: float,
-    works: Extended, rounding: float, from_middle: float, moved: float,
+def proven(
+    split: Split, exact: Exact, G: Extended, *, claimed: Vector | Extended,
+    u: Extended, at_rows: Extended, multipliers: Extended,
 ) -> Certificate:  # fmt: skip
-    """Put the terms of (2) and (3) together.
+    """Evaluate (4) and (3) for an admissible pair, wherever its parts are.
 
     Parameters
     ----------
-    norms : of û, of u_λ and of M
-    apart, left : ‖û − u_λ‖ as computed, and what the solve for u_λ left undone
-    works : (m,) that make up `work`
-    from_middle : from the answer to M
+    exact : the rows, on the components of `at_rows`
+    G : (m, p) what the motions do to the rows that contact feels
+    u, at_rows : û (n,), and at the components (w,) of the rows
 
     Raises
     ------
@@ -289,118 +292,75 @@ def _certificate(
         When the answer is too large for arithmetic.
 
     """
-    total, nearest = apart + left, apart - left
+    lam, motion = multipliers, exact.motion(at_rows)
+    works = exact.friction_work(at_rows) - lam * motion
     work = float(works.sum())
-    gap = 0.5 * (total * total + 2 * work + rounding)
-    around = np.sqrt(max(gap - 0.25 * max(nearest, 0.0) * nearest, 0.0)) + left / 2
-    pair = np.sqrt(2 * gap)
+    at_u = split.residual(u)
+    near = neighbour(split, at_u.rho + split.pulled(lam))
+    drift = still(split, claimed - u)
+    moved = split.spread(drift)
+    K_moved = split.product(moved)
+    u_u, u_d, d_d, moved_moved, moved_d = split.total(*(
+        float(a @ b) for a, b in (
+            (at_u.v, at_u.Kv), (at_u.v, near.Kd), (near.d, near.Kd),
+            (moved, K_moved), (moved, near.Kd),
+        )
+    ))  # fmt: skip
+    held, _ = held_and_loose(G, relative(exact.interior(lam)))
+    p, noise = G.shape[1], split.noise(u)
+    apart, left = _root(d_d), near.left + length(split, noise)
+    total, nearest = apart + left, max(apart - left, 0.0)
+    square = total * total + 2 * work
+    known = split.rounding(held)
+    reach = _reach(split, exact, G, held, lam, -motion, square)
+    unbalanced = np.abs(held.T @ near.unbalanced[:p])
+    scattered = np.abs(held.T) @ split.scattered(noise)[:p]
+    pull = (unbalanced + scattered).astype(np.float64)
+    rounding = _charge(reach, known, pull, at_u.theta, square)
+    if np.isinf(rounding) and np.isfinite(square):
+        raise UncertifiableError(
+            "the answer is too far off: along rigid motions that large, rounding of "
+            "the stiffness outweighs all that contact holds"
+        )
+    gap = 0.5 * (square + rounding)
+    around = _root(gap - 0.25 * nearest * nearest) + left / 2
+    pair = _root(2 * gap)
+    from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
+    further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
+    in_K = known.stored(
+        from_middle + around, reach.within(2 * gap) + further, at_u.theta
+    )
+    stretch = _root(1 + at_u.theta)
+    norms = _root(u_u), _root(u_u - 2 * u_d + d_d), _root(u_u - u_d + 0.25 * d_d)
+    least = max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)
     found = Certificate(
-        u=u, multipliers=multipliers, off=off, norm=norms[0],
-        distance=total, work=work, sliding=float(works[~exact.contact].sum()),
-        rounding=rounding, claimed=from_middle + float(around),
-        least=float(max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)),
-        moved=moved, seminorm=seminorm,
+        u=u, multipliers=lam, off=near.d, norm=norms[0], distance=total, work=work,
+        sliding=float(works[~exact.contact].sum()), rounding=rounding, claimed=in_K,
+        stretch=stretch, least=least / stretch, moved=_root(moved_moved),
+        seminorm=near.unbalanced.size > 0,
     )  # fmt: skip
     if not np.isfinite(found.error):
         raise UncertifiableError("the answer is too large for arithmetic")
     return found
 
 
-def _substructured_proof(
-    mechanics: Mechanics, claimed: Vector | Extended, u: Extended,
-    multipliers: Extended, closed: Any,
-) -> Certificate:  # fmt: skip
-    """Evaluate (1) and (3) with the u_λ of `harness.verify.substructured`.
-
-    Raises
-    ------
-    UncertifiableError
-        When u or λ cannot be mended.
-
-    """
-    exact = mechanics.exact
-    feasible = admissible(mechanics, u, closed)
-    if feasible is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
-    lam = balanced(mechanics, multipliers, feasible)
-    rho, square = residual(mechanics, feasible, lam)
-    near = neighbour(
-        mechanics.substructures, exact.held, rho.astype(np.float64),
-        moved_together(mechanics), Alone(),
-    )  # fmt: skip
-    force = mechanics.substructures.spread.T @ near.Kd
-    moved = mechanics.still(claimed - feasible).astype(np.float64)
-    return torn_certificate(
-        exact, mechanics.kernel.shape[1] > 0, u=feasible, multipliers=lam, off=near.d,
-        works=exact.friction_work(feasible) - lam * exact.motion(feasible),
-        energies=Energies(
-            square, float(mechanics.still(feasible) @ force), float(near.d @ near.Kd),
-            float(moved @ (mechanics.primal.P @ moved)), float(moved @ force),
-            near.left,
-        ),
-    )  # fmt: skip
+def _root(square: float) -> float:
+    return float(np.sqrt(max(square, 0.0)))
 
 
-class Energies(NamedTuple):
-    """Products in K_T of û, of d = Tû − u_λ, and of u − û from û to the answer."""
+def _charge(
+    reach: _Reach, known: Rounding, pull: Vector, theta: float, square: float
+) -> float:
+    """Charge the rounding terms (R3) of (4): q at its smallest fixed point.
 
-    u_u: float
-    u_d: float
-    d_d: float
-    moved_moved: float
-    moved_d: float
-    left: float  #: of what is left of d, with itself
-
-
-def torn_certificate(
-    exact: Exact, seminorm: bool, *, u: Extended, multipliers: Extended, off: Vector,
-    works: Extended, energies: Energies,
-) -> Certificate:  # fmt: skip
-    """Put the terms of (1) and (3) together, of u_λ = Tû − d."""
-    e = energies
-
-    def length(square: float) -> float:
-        return float(np.sqrt(max(square, 0.0)))
-
-    return _certificate(
-        exact, seminorm, u=u, multipliers=multipliers, off=off, works=works,
-        norms=[
-            length(e.u_u), length(e.u_u - 2 * e.u_d + e.d_d),
-            length(e.u_u - e.u_d + 0.25 * e.d_d),
-        ],
-        apart=length(e.d_d), left=length(e.left), rounding=0.0,
-        from_middle=length(e.moved_moved + e.moved_d + 0.25 * e.d_d),
-        moved=length(e.moved_moved),
-    )  # fmt: skip
-
-
-def _length(mechanics: Mechanics, v: Extended, held: NDArray[np.float64]) -> float:
-    """Return ‖v‖, or √(vᵀKv) with the motions that are held where it is larger."""
-    R = mechanics.motions.felt @ held
-    deformed = mechanics.still(v)
-    whole = deformed + R @ (R.T @ v)
-    squares = [x @ (mechanics.stiffness @ x) for x in (deformed, whole)]
-    return float(np.sqrt(max(*squares, Real(0))))
-
-
-def _rounding(
-    mechanics: Mechanics, reach: _Reach, unbalanced: Extended, left: float,
-    square: float,
-) -> float:  # fmt: skip
-    """Charge what rounding left of KR = 0 and of the balance: what (4) adds to 2g.
-
-    unbalanced : (p,)  Rᵀ(f − Bᵀλ̂ − Ku_λ)
+    pull : (h,) sizes of Rᵀ(ρ − TᵀK_T d) along the motions that are held
     square : 2g without it
     """
-    motions, turn = mechanics.motions, reach.held
-    strain = np.sqrt(np.maximum(np.diag(turn.T @ motions.strain @ turn), 0))
-    curvature = np.abs(turn.T @ motions.curvature @ turn)
-    force = np.abs(turn.T @ unbalanced).astype(np.float64) + strain * left
 
     def charged(square: float) -> float:
         gamma = reach.within(square)
-        bent = np.sqrt(8 * square) * (gamma @ strain)
-        return float(2 * (gamma @ force) + bent + 2 * (gamma @ curvature @ gamma))
+        bent = known.work(_root(square), gamma, theta)
+        return float(2 * (gamma @ pull) + 2 * bent)
 
     charge = 0.0
     for _ in range(200):
@@ -413,7 +373,6 @@ def _rounding(
 class _Reach(NamedTuple):
     """How far the rigid motions of û and u* can be apart, by the errors of the pair."""
 
-    held: NDArray[np.float64]  #: (p, h) of the motions that λ̂ holds
     gaps: Vector  #: (h,) without errors
     error: Vector  #: (h,) per ‖û − u*‖
     square: Vector  #: (h,) per sum of the squares of both errors
@@ -426,43 +385,45 @@ class _Reach(NamedTuple):
 
 
 def _reach(
-    mechanics: Mechanics, held: NDArray[np.float64], lam: Extended, gaps: Extended,
-    square: float,
+    split: Split, exact: Exact, G: Extended, held: NDArray[np.float64], lam: Extended,
+    gaps: Extended, square: float,
 ) -> _Reach:  # fmt: skip
     """Bound the rigid part γ of û − u* by what contact allows.
 
-    Rows of u* are not violated, −Gγ ≤ c − Bû + φ‖û − u*‖, and those that λ̂ presses are
-    nearly closed,  Gγ ≤ φ‖û − u*‖ + square/2λ̂,  since λ̂ᵀ(c − Bu*) ≤ square/2. Rows of
-    friction are bounded likewise on both sides, by square/2 over what λ̂ lacks to either
-    bound: (g − λ̂) v* ≤ square/2 where v* > 0, and (g + λ̂)(−v*) where not. Nonnegative
-    combinations of these inequalities that yield ±γₖ bound it; any will do, and what
-    seems cheap at `square` is preferred. Motions that λ̂ does not hold are left aside as
-    those that contact does not feel: what rounding makes of K along them is not part of
-    the problem.
+    Any nonnegative combination y of the inequalities (R4) that yields ±γₖ bounds it.
+    One that seems cheap at `square` is taken, where Bᵢdiag(K)⁻¹Bᵢᵀ stands for the
+    compliance of a row; then ‖Σ±yᵢBᵢ‖ is measured in the dual norm. Motions that λ̂ does
+    not hold are left aside as those that contact does not feel: what rounding makes of
+    K along them is not part of the problem.
     """
     if not held.shape[1]:
-        return _Reach(held, *np.zeros((3, 0)))
-    exact, tiny = mechanics.exact, np.finfo(float).tiny
-    G, phi = mechanics.motions.G.astype(np.float64), mechanics.compliance
+        return _Reach(*np.zeros((3, 0)))
+    tiny = np.finfo(float).tiny
+    phi, motions = np.sqrt(exact.loose.astype(np.float64)), G.astype(np.float64)
     down, up = lam > exact.lower, lam < exact.upper
     below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
     above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
     open_by = np.maximum(np.where(exact.contact, 0, -gaps)[down], 0)
-    parts = np.stack([
-        np.append(np.maximum(gaps, 0)[up], open_by).astype(np.float64),
-        np.append(phi[up], phi[down]),
-        np.append(0.5 / above, 0.5 / below),
-    ])  # fmt: skip
-    cost = np.array([1.0, np.sqrt(square), square]) @ parts + np.finfo(float).tiny
-    columns = (np.vstack([-G[up], G[down]]) / cost[:, None]).T
+    opened = np.append(np.maximum(gaps, 0)[up], open_by).astype(np.float64)
+    soft, pressed = np.append(phi[up], phi[down]), 0.5 / np.append(above, below)
+    cost = opened + np.sqrt(square) * soft + square * pressed + tiny
+    columns = (np.vstack([-motions[up], motions[down]]) / cost[:, None]).T
     size = np.abs(columns).max()
     found = np.zeros((3, held.shape[1]))
     for k, motion in enumerate(held.T):
         for target in (motion, -motion):
-            y = _combination(columns / size, target)
-            found[:, k] = np.maximum(found[:, k], parts @ (y / size / cost))
+            y = _combination(columns / size, target) / size / cost
+            forces = np.zeros_like(lam)
+            forces[up] = y[: up.sum()]
+            forces[down] -= y[up.sum() :]
+            bound = (
+                opened @ y,
+                length(split, split.pulled(forces)),
+                (pressed * y).max(initial=0.0),
+            )
+            found[:, k] = np.maximum(found[:, k], bound)
     # what the combinations miss of ±γₖ is at most MISSED of the largest
-    return _Reach(held, *(v + 2 * MISSED * v.sum() for v in found))
+    return _Reach(*(v + 2 * MISSED * v.sum() for v in found))
 
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:

@@ -4,7 +4,7 @@ Every residual is scale-free: multiplying the objective, a constraint row or the
 a variable by a constant changes none of them, so that one threshold means the same for
 every problem. All four are zero exactly at a KKT point, which is a solution if P is
 positive semidefinite; that is taken on trust. What small residuals prove of the
-objective, and what they cannot, is in docs/mathematics.md; where they cannot,
+objective, and what they cannot, is in docs/verdicts.md; where they cannot,
 `harness.verify.optimum` compares with a proven optimum.
 """
 
@@ -418,6 +418,7 @@ def verdict(
     factor: float = VERIFIED_FACTOR,
     *,
     error: float | None = None,
+    infeasible: bool = False,
 ) -> Verdict:
     """Judge a point by its residuals; the claim decides only how a failure is called.
 
@@ -426,11 +427,16 @@ def verdict(
     success is `inaccurate` while at least half of the digits asked for are there (worst
     residual ≤ √(factor·tol)), and `wrong` beyond. A residual above 0.1 verifies
     nothing, whatever the tolerance.
+
+    infeasible : whether the QP is proven to have no feasible point; a claim of that is
+        verified, whatever point comes with it
     """
     most = allowed(tol, factor)
     worst = residuals.worst if error is None else error
     if claimed is Status.DECLINED:
         return Verdict.DECLINED
+    if claimed is Status.INFEASIBLE and infeasible:
+        return Verdict.VERIFIED_INFEASIBLE
     if worst <= most:
         return Verdict.VERIFIED
     match claimed:
@@ -448,8 +454,8 @@ def rejudged(record: Record, factor: float) -> Verdict:
 
     Claim and residuals decide, or the error against a proven optimum where it did
     (`Record.decided_by`). Where they do not explain the stored status (a limit, a
-    crash, a sequence that had ended before), it was decided by something else, and
-    stands.
+    crash, a sequence that had ended before, a proof of infeasibility, which knows no
+    tolerance), it was decided by something else, and stands.
     """
     if record.claimed is None:
         return record.verdict

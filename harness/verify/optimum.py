@@ -41,6 +41,7 @@ from harness.verify.kkt import (
     violation,
     widths,
 )
+from harness.verify.rational import rational, solutions
 
 LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
 CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optimum
@@ -184,14 +185,14 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
     lower, upper = (s.z_box < 0) & below, (s.z_box > 0) & above
     n, pressed, held = qp.q.size, s.z > 0, lower | upper
     box = np.eye(n)[held]
-    G, lb, ub = _rational(_dense(qp.G)), _rational(qp.lb[below]), qp.ub[above]
+    G, lb, ub = rational(_dense(qp.G)), rational(qp.lb[below]), qp.ub[above]
     B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], box])
     if n + len(B) > RATIONAL:
         return None
     c = np.concatenate([qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[held]])
-    P, q = _rational(_dense(qp.P)), _rational(qp.q)
+    P, q = rational(_dense(qp.P)), rational(qp.q)
     equations = np.block([[_dense(qp.P), B.T], [B, np.zeros((len(B), len(B)))]])
-    solve = _solutions(_rational(equations), _rational(np.concatenate([-qp.q, c])))
+    solve = solutions(rational(equations), rational(np.concatenate([-qp.q, c])))
     if solve is None:
         return None
     signs = np.where(upper, 1, -1)[held]
@@ -203,12 +204,12 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
             guess[n:] = np.concatenate([
                 multipliers.y, multipliers.z[pressed], multipliers.z_box[held]
             ])  # fmt: skip
-        found = solve(_rational(guess))
+        found = solve(rational(guess))
         x, y, z, z_box = np.split(found, np.cumsum([n, qp.b.size, int(pressed.sum())]))
         if (
-            (G @ x <= _rational(qp.h)).all()
+            (G @ x <= rational(qp.h)).all()
             and (x[below] >= lb).all()
-            and (x[above] <= _rational(ub)).all()
+            and (x[above] <= rational(ub)).all()
             and (z >= 0).all()
             and (z_box * signs >= 0).all()
         ):
@@ -219,48 +220,6 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
             rounded.z[pressed], rounded.z_box[held] = z, z_box
             return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
     return None
-
-
-def _solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
-    """Solve Mx = b by Gauss-Jordan elimination; None where there is no solution.
-
-    M, b : arrays of fractions
-
-    Returns
-    -------
-    the map from a guess to the solution in which unknowns without a pivot are as there
-
-    """
-    rows, pivots = np.column_stack([M, b]), list[int]()
-    for column in range(M.shape[1]):
-        at = len(pivots)
-        below = np.flatnonzero(rows[at:, column] != 0)
-        if not below.size:
-            continue
-        rows[[at, at + below[0]]] = rows[[at + below[0], at]]
-        rows[at] = rows[at] / rows[at, column]
-        for i in np.flatnonzero(rows[:, column] != 0):
-            if i != at:
-                rows[i] = rows[i] - rows[i, column] * rows[at]
-        pivots.append(column)
-    if (rows[len(pivots) :, -1] != 0).any():
-        return None
-    free = np.setdiff1d(np.arange(M.shape[1]), pivots)
-    solved = rows[: len(pivots)]
-
-    def solution(guess: Any) -> Any:
-        x = guess.copy()
-        x[pivots] = solved[:, -1] - solved[:, free] @ guess[free]
-        return x
-
-    return solution
-
-
-def _rational(v: Any) -> Any:
-    """Give an array of doubles as one of fractions."""
-    exact = np.empty(v.shape, dtype=object)
-    exact.ravel()[:] = [Fraction(float(value)) for value in v.ravel()]
-    return exact
 
 
 def _dense(M: Any) -> Any:

@@ -17,6 +17,7 @@ makes of it is no part of the problem.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -36,14 +37,18 @@ from harness.verify.admissible import (
     inside_at_rows,
     is_driven,
 )
-from harness.verify.certificate import (
-    Certificate,
-    Energies,
-    is_sharp,
-    torn_certificate,
-)
+from harness.verify.certificate import Certificate, is_sharp, proven, sharpest
 from harness.verify.products import times_columns, times_rows
-from harness.verify.substructured import neighbour, scaled_rows
+from harness.verify.substructured import (
+    SAFETY,
+    Residual,
+    Rounding,
+    Sharing,
+    length,
+    sample,
+    scaled_rows,
+    still,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -212,24 +217,54 @@ def certify_over_ranks(
     rigid = _rigid_motions(own, exact, at)
     u = rigid.without_free(own, u)
     trace = own.among.traced(u, at)
+    split = _OnRanks(own, exact, rigid, at)
     raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
     states = suggested(exact, trace, raw)
     tidied = at_bounds(exact, states, raw), states == CLOSED
-    found, why = list[Certificate](), list[str]()
-    for lam, closed in (tidied, (raw, np.zeros(raw.size, dtype=bool))):
-        try:
-            found.append(
-                _proof(
-                    own, exact, rigid, (at, softness, trace), u, lam, closed, claimed
+
+    def certificates() -> Iterator[Certificate | str]:
+        for lam, closed in (tidied, (raw, np.zeros(raw.size, dtype=bool))):
+            found: Certificate | str
+            try:
+                mended, feasible, forces = _mended(
+                    own, exact, rigid, (at, softness, trace), u, lam, closed
                 )
-            )
-        except UncertifiableError as e:
-            why.append(str(e))
-        if found and is_sharp(found[-1]):
-            break
-    if not found:
-        raise UncertifiableError(f"no admissible pair near the answer: {why[0]}")
-    return min(found, key=lambda c: c.error)
+                found = proven(
+                    split, exact, rigid.balance.G, claimed=claimed, u=feasible,
+                    at_rows=mended, multipliers=forces,
+                )  # fmt: skip
+            except UncertifiableError as e:
+                found = str(e)
+            yield found
+            if is_sharp(found):
+                return
+
+    return sharpest(certificates())
+
+
+def _mended(
+    own: OwnBodies, exact: Exact, rigid: _RigidMotions,
+    trace: tuple[NDArray[np.int64], Vector, Extended],
+    u: Extended, lam: Extended, closed: NDArray[np.bool_],
+) -> tuple[Extended, Extended, Extended]:  # fmt: skip
+    """Find û at the components of the rows (w,) and at own ones (n,), and λ̂.
+
+    Raises
+    ------
+    UncertifiableError
+        When they cannot be mended.
+
+    """
+    at, softness, start = trace
+    found = inside_at_rows(exact, rigid.at_rows, softness, start, closed)
+    if found is None:
+        raise UncertifiableError("the answer penetrates beyond repair")
+    if rigid.driven:
+        raise UncertifiableError(rigid.driven)
+    places, here = own.among.places(at)
+    feasible = rigid.moved(u * found.theta, found.u[at.size :])
+    feasible[places[here]] = found.u[: at.size][here]
+    return found.u[: at.size], feasible, rigid.balance.near(lam)
 
 
 def _at_rows(own: OwnBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
@@ -271,12 +306,6 @@ class _RigidMotions:
     together: NDArray[np.float64]  #: (motions, r) coefficients of R of all subdomains
     balance: Balance  #: of the load along felt ones
     driven: str = ""  #: which load along free ones nothing can balance, if there is one
-
-    def still(self, own: OwnBodies, v: NDArray[Any]) -> NDArray[Any]:
-        """Take the rigid motions out of v (n,), a displacement of own components."""
-        if not self.all.shape[1]:  # sparse matrices take long over nothing
-            return v
-        return np.asarray(v - self.all @ own.among.along(self.all, v))
 
     def without_free(self, own: OwnBodies, v: Extended) -> Extended:
         """Take the free motions out of v (n,)."""
@@ -356,43 +385,80 @@ def _largest(own: OwnBodies, R: Any) -> Extended:
     return np.asarray(np.max(own.ranks.comm.allgather(sizes), axis=0))
 
 
-def _proof(
-    own: OwnBodies, exact: Exact, rigid: _RigidMotions,
-    trace: tuple[NDArray[np.int64], Vector, Extended],
-    u: Extended, lam: Extended, closed: NDArray[np.bool_], claimed: Vector,
-) -> Certificate:  # fmt: skip
-    """Evaluate (1) and (3) of `harness.verify.certificate` for the pair mended."""
-    at, softness, start = trace
-    found = inside_at_rows(exact, rigid.at_rows, softness, start, closed)
-    if found is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
-    if rigid.driven:
-        raise UncertifiableError(rigid.driven)
-    lam = rigid.balance.near(lam)
-    places, here = own.among.places(at)
-    feasible = rigid.moved(u * found.theta, found.u[at.size :])
-    feasible[places[here]] = found.u[: at.size][here]
-    parts, among, T = own.parts, own.among, own.parts.spread
-    still = rigid.still(own, feasible)
-    torn = times_rows(T.data, T.indices, T.indptr, still)
-    pull = parts.product(torn)
-    square = torn @ pull
-    pull -= own.f
-    rho = among.completed(
-        times_columns(T.data, T.indices, T.indptr, pull, feasible.size)  # Tᵀ by columns
-    )
-    rho[places[here]] += (exact.B.T @ lam)[here]
-    rho[own.held] = 0
-    near = neighbour(parts, own.held, rho.astype(np.float64), rigid.together, among)
-    moved = rigid.still(own, claimed - feasible).astype(np.float64)
-    moved = parts.spread @ moved
-    energies = among.total(
-        float(square), float(torn @ near.Kd), float(near.d @ near.Kd),
-        float(moved @ parts.product(moved)), float(moved @ near.Kd), near.left,
-    )  # fmt: skip
-    motion = exact.motion(found.u[: at.size])
-    return torn_certificate(
-        exact, rigid.all.shape[1] > 0, u=feasible, multipliers=lam, off=near.d,
-        works=exact.friction_work(found.u[: at.size]) - lam * motion,
-        energies=Energies(*energies),
-    )  # fmt: skip
+class _OnRanks:
+    """The bodies of all ranks; see `harness.verify.substructured.Split`.
+
+    No rank has the assembled K. The residual is that of TᵀK_T T, where subdomains have
+    exact kernels, and E is estimated by samples of the rounding of doubles.
+    """
+
+    def __init__(self, own: OwnBodies, exact: Exact, rigid: _RigidMotions, at: Any):
+        """Prepare what several pairs need; `at` (w,) are the components of the rows."""
+        self._own, self._exact, self._rigid = own, exact, rigid
+        self._places, self._here = own.among.places(at)
+        self._sharing = Sharing(own.parts, own.held, rigid.together, own.among)
+
+    def along(self, v: Extended) -> Extended:
+        return self._own.among.along(self._rigid.all, v)
+
+    def motion(self, alpha: Extended) -> Extended:
+        return np.asarray(self._rigid.all @ alpha)
+
+    def residual(self, u: Extended) -> Residual:
+        deformed = still(self, u)
+        v = self.spread(deformed)
+        Kv = self.product(v)
+        rho = self.joined(Kv - self._own.f)
+        square = self.total(float(v @ Kv))[0]
+        off = self._own.among.along(
+            csr_array(deformed[:, None] ** 2), self.noise(deformed) ** 2
+        )[0]
+        theta = SAFETY * float(np.sqrt(off)) / square if square > 0 else 0.0
+        return Residual(rho, v, Kv, theta)
+
+    def pulled(self, multipliers: Extended) -> Extended:
+        found = np.zeros(self._own.components.size, dtype=Real)
+        forces = self._exact.B.T @ multipliers
+        found[self._places[self._here]] = forces[self._here]
+        found[self._own.held] = 0
+        return found
+
+    def spread(self, u: Extended) -> Extended:
+        T = self._own.parts.spread
+        return times_rows(T.data, T.indices, T.indptr, u)
+
+    def joined(self, b: Extended) -> Extended:
+        T, size = self._own.parts.spread, self._own.components.size
+        found = times_columns(T.data, T.indices, T.indptr, b, size)
+        found = self._own.among.completed(found)
+        found[self._own.held] = 0
+        return np.asarray(found)
+
+    def product(self, v: Extended) -> Extended:
+        return self._own.parts.product(v)
+
+    def solve(self, rho: Extended) -> Vector:
+        return self._own.parts.solve(self._sharing(rho.astype(np.float64)))
+
+    def total(self, *numbers: float) -> list[float]:
+        return self._own.among.total(*numbers)
+
+    def scattered(self, v: Extended) -> Extended:
+        R = csr_array(self._rigid.all)
+        return np.asarray(np.sqrt(self._own.among.along(R.multiply(R), v**2)))
+
+    def noise(self, u: Extended) -> Extended:
+        variances = self._sharing.variances(self.spread(u))
+        found = sample(variances, u, self._own.components, np.float64)
+        found[self._own.held] = 0
+        return found
+
+    def rounding(self, held: NDArray[np.float64]) -> Rounding:
+        h, p = held.shape[1], held.shape[0]
+        strain, curvature = np.zeros(h), np.zeros((h, h))
+        rest = np.zeros(self._rigid.all.shape[1] - p)
+        for k, motion in enumerate(held.T):
+            off = self.noise(self.motion(np.append(motion, rest)))
+            strain[k] = length(self, off)
+            curvature[k] = np.abs(held.T) @ self.scattered(off)[:p]
+        return Rounding(strain, curvature)

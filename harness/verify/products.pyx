@@ -62,7 +62,6 @@ def projected_products(
 
     P = I − RRᵀ; M (n, n) by columns (CSC) and orthonormal R (n, r), r ≤ 6, are doubles.
     The parts begin at `starts`; where one is zero, `found` stays as it is.
-    Coefficients of R are found to the digits of doubles.
     """
     cdef Py_ssize_t n = indptr.shape[0] - 1, s, first, i, j, k
     part = np.empty(n, dtype=np.double if real is double else np.longdouble)
@@ -90,18 +89,18 @@ def projected_products(
 
 cdef void project(const double[:, ::1] R, real *v) noexcept nogil:
     """Apply P = I − RRᵀ to v (n,)."""
-    cdef double[MODES] along
+    cdef real[MODES] along
     cdef Py_ssize_t i, l, r = R.shape[1]
-    cdef double v_i
+    cdef real v_i
     cdef real left
     for l in range(r):
         along[l] = 0
     for i in range(R.shape[0]):
-        v_i = <double> v[i]
+        v_i = v[i]
         for l in range(r):
             along[l] += R[i, l] * v_i
     for i in range(R.shape[0]):
         left = v[i]
         for l in range(r):
-            left -= <real> R[i, l] * along[l]
+            left -= R[i, l] * along[l]
         v[i] = left

@@ -32,6 +32,7 @@ from harness.verify.active_set_refinement import (
 )
 from harness.verify.admissible import DENSE
 from harness.verify.certificate import UncertifiableError, proof
+from harness.verify.substructured import Undivided
 
 TRUSTED = 1e-7  #: bound up to which a solution from stored rows is one
 
@@ -102,7 +103,7 @@ def _solved(mechanics: Mechanics, guess: States) -> ReferencePoint:
     guess = np.where(exact.contact & (guess == UPPER), CLOSED, guess).astype(np.int8)
     u, lam, states = exchanged(mechanics, guess)
     try:
-        found = proof(mechanics, u, u, lam, states == CLOSED)
+        found = proof(Undivided(mechanics), u, u, lam, states == CLOSED)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"

@@ -22,6 +22,7 @@ from harness.record import Record, Verdict
 from harness.registry import COPIES, SolverSpec
 from harness.solution import Solution, Status
 from harness.verify.certificate import Certificate, UncertifiableError, certify
+from harness.verify.infeasibility import infeasibility_margin
 from harness.verify.kkt import Residuals, kkt_residuals, verdict
 from harness.verify.optimum import Proves, decided
 from harness.verify.over_ranks import certify_over_ranks
@@ -110,13 +111,25 @@ def judged(
         with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
             residuals = kkt_residuals(qp, s)
             objective = qp.objective(s.x)
-    tol, error = record.judged_at, None
-    if prove is not None:
+    tol, error, margin = record.judged_at, None, None
+    if s.status is Status.INFEASIBLE and found is None:
+        margin = infeasibility_margin(qp, s)
+        record = noted(
+            record,
+            "no certificate of infeasibility was found" if margin is None
+            else f"no feasible point: Farkas certificate with a margin of {margin:.1e}",
+        )  # fmt: skip
+    elif s.status is Status.INFEASIBLE:
+        record = noted(record, "claims of infeasibility are not examined by ranks")
+    if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
+    decided_by = "residuals" if error is None else "reference"
     return record.but(
-        verdict=verdict(s.status, residuals, tol, error=error),
+        verdict=verdict(
+            s.status, residuals, tol, error=error, infeasible=margin is not None
+        ),
         objective=objective,
-        decided_by="residuals" if error is None else "reference",
+        decided_by=decided_by if margin is None else "certificate",
         optimum_error=error,
         **residuals._asdict(),
     )

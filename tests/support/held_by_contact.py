@@ -26,10 +26,12 @@ from problems.contact.bodies import (
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
+from problems.duality.dualisation import Transformed
 from problems.duality.stepping import primal_qp
+from problems.duality.torn_dual import torn_dual
 from problems.fem.elasticity import Material
 from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.feti.elastic import in_parts, linearised_by
+from problems.feti.elastic import in_parts, linearised_by, subdivide, torn
 from problems.feti.emission import ProblemInParts
 from problems.feti.partition import graph_partition
 from problems.feti.subdivision import mesh_in_parts
@@ -72,13 +74,17 @@ def disc_in_parts(
     n: int = 4,
     *,
     parts: int = 6,
+    contact: str = "nts",
+    basis: str = "dual",
+    disc_is_slave: bool = True,
     rollers: bool = False,
+    turn: float = 0.3,
     tilt: float = 0.0,
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
 ) -> ProblemInParts:
     """Describe the dual of `disc_between_plates`, cut into so many parts by METIS."""
-    bodies = _disc_and_plates(n, True, rollers, 0.3, tilt, push, E)
+    bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     mesh, fixed = bodies.mesh, bodies.B_D.indices
     label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
     named = np.concatenate([fixed, bodies.interface]) // 2
@@ -87,8 +93,24 @@ def disc_in_parts(
         mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
         plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
         fixed=fixed, load=(loaded, bodies.f[loaded] * bodies.force),
-        pairs=bodies.pairs, linearise=linearised_by("nts", "dual"), glue="orthonormal",
+        pairs=bodies.pairs, linearise=linearised_by(contact, basis), glue="orthonormal",
     )  # fmt: skip
+
+
+def torn_disc_between_plates(
+    n: int = 4,
+    *,
+    parts: int = 6,
+    contact: str = "nts",
+    basis: str = "dual",
+    turn: float = 0.0,
+) -> Transformed:
+    """Build the dual of a disc between plates on one process, torn by METIS."""
+    bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
+    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    label = graph_partition(bodies.mesh.points, bodies.mesh.cells, bodies.body, parts)
+    return torn_dual(torn(subdivide(bodies, label), primal), primal)
 
 
 def _disc_and_plates(

@@ -208,10 +208,16 @@ class FlipsSigns(Sound):
         return replace(s, y=-s.y)
 
 
-class LeavesRoundOff(Sound):
+class HoldsAbsentBounds(Sound):
+    by = 1e-13
+
     def act(self, qp, tol):
         s = self.honest(qp, tol)
-        return replace(s, z_box=s.z_box - 1e-16)
+        return replace(s, z_box=s.z_box - self.by)
+
+
+class LeavesRoundOff(HoldsAbsentBounds):
+    by = 3.5e-18
 
 
 class Remembers(Sound):
@@ -350,7 +356,7 @@ def test_a_sound_solver_fails_no_check(check):
         (StopsEarly, "finds the planted solution: everything, sparse"),
         (StopsEarly, "reaches the tolerance 1e-06: box"),
         (FlipsSigns, "gives multipliers our signs"),
-        (LeavesRoundOff, "puts none on absent bounds"),
+        (HoldsAbsentBounds, "puts none on absent bounds"),
         (Remembers, "starts every repeat cold, same answer"),
         (Wanders, "starts every repeat cold, same answer"),
         (Scales, "leaves the problem alone: sparse"),
@@ -367,6 +373,20 @@ def test_a_sound_solver_fails_no_check(check):
 def test_a_check_catches_its_fault(kind, check):
     MEMORY.clear()
     assert run_check(check, kind()).grade is Grade.FAIL
+
+
+def test_rounding_on_absent_bounds_passes_with_a_remark():
+    grade, message, _ = run_check("puts none on absent bounds", LeavesRoundOff())
+    assert grade is Grade.PASS
+    assert "3.5e-18" in message
+    assert run_check("puts none on absent bounds", Sound()).message == ""
+
+
+def test_a_right_claim_of_infeasibility_is_told_from_giving_up():
+    message = run_check("claims no success: infeasible", Sound()).message
+    assert message == "verified infeasible"
+    message = run_check("claims no success: unbounded", Sound()).message
+    assert message != "verified infeasible"
 
 
 def test_who_fails_on_an_operator_is_told_the_line_to_write():

@@ -5,6 +5,7 @@ its elements. The patch test's solution is in every finite element space.
 """
 
 import json
+from itertools import pairwise
 from time import sleep
 from types import SimpleNamespace
 
@@ -28,6 +29,7 @@ from problems import PROBLEMS
 from problems.models.hertz import halved
 from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
 from solvers.reference.solve import reference_solution
+from tests.support import ROOT
 
 
 def levels(*distances, bound=1e-9):
@@ -251,7 +253,7 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
 
     assert {d.kind for d in (*found, *large, *late)} == {"unknown"}
     assert "it is Monday" in found[0].note
-    assert "does not say" in found[1].note
+    assert "bare offers no refined mesh" in found[1].note
     assert f"{MOST_UNKNOWNS:,}" in large[0].note
     assert "time" in late[0].note
     assert late[0].levels == large[0].levels == ()
@@ -360,3 +362,52 @@ def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path)
     assert "on curved sides" in curved.note
     assert "expected friction=tresca" in coulomb.note
     assert curved.kind == coulomb.kind == "unknown"
+
+
+PUNCH = "bodies:suites/crossval/punch.toml"
+
+
+def test_the_error_of_a_mesh_from_gmsh_is_its_distance_to_a_far_finer_one(
+    tmp_path, monkeypatch
+):
+    """Four halvings stand for the limit: their own error is a tenth of the coarse."""
+    monkeypatch.chdir(ROOT)
+    (found,) = meshes(tmp_path, f"{PUNCH}/dual")
+    grids, points = [], []
+    for k in range(5):
+        case = parse(f"{PUNCH}/halvings={k}/primal", PROBLEMS).build(reference_solution)
+        mechanics = case.mechanics
+        grids.append(mechanics.grid)
+        points.append(reference_point(mechanics, reference_solution).u)
+    u = points[0] + grids[0].lift
+    for coarse, fine in pairwise(grids):
+        u = (prolongation(coarse, fine) @ u.reshape(-1, 2)).ravel()
+    distance = mechanics.norm(points[-1] + grids[-1].lift - u)
+
+    assert found.kind == "limit"
+    whole = found.error * found.levels[0].norm / np.sqrt(abs(mechanics.scale))
+    assert whole == pytest.approx(float(distance), rel=0.1)
+
+
+def test_parts_of_bodies_have_the_error_of_the_whole(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    whole, torn = meshes(tmp_path, f"{PUNCH}/primal", f"{PUNCH}/parts=4/dual")
+
+    assert torn.error == pytest.approx(whole.error, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("key", "reason"),
+    [
+        ("kinematics=finite", "expected kinematics=linear"),
+        ("friction=coulomb/mu=0.3", "expected friction=tresca"),
+    ],
+)
+def test_bodies_without_an_error_of_the_mesh_have_a_reason(
+    tmp_path, monkeypatch, key, reason
+):
+    monkeypatch.chdir(ROOT)
+    (found,) = meshes(tmp_path, f"{PUNCH}/{key}/dual")
+
+    assert found.kind == "unknown"
+    assert reason in found.note

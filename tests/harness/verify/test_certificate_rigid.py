@@ -13,9 +13,10 @@ from harness import Case, Solution, Status, UncertifiableError, certify
 from harness.mechanics import Extended, Mechanics, Real, _cancelling
 from harness.names import parse
 from harness.verify.admissible import _newton, admissible, balanced
-from harness.verify.certificate import Certificate, _Reach, _rounding
+from harness.verify.certificate import Certificate, _charge, _Reach
 from harness.verify.kkt import kkt_residuals
 from harness.verify.references import reference_point
+from harness.verify.substructured import Rounding, Undivided, length
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
@@ -236,31 +237,29 @@ def test_what_rigid_motions_do_to_a_stored_matrix_is_known_to_its_last_digits():
 def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
     """|B_i v| ≤ φ_i‖v‖ for every v without rigid motion, and one v attains it."""
     mechanics = disc_between_plates().mechanics
+    split = Undivided(mechanics)
     for i in (0, 3):
         row = mechanics.exact.B[[i]].toarray()[0]
         v = mechanics.relaxed(row)
         attained = float(row @ v) / mechanics.norm(v)
-        assert attained == pytest.approx(mechanics.compliance[i], rel=1e-9)
+        pressed = np.zeros_like(mechanics.exact.c)
+        pressed[i] = 1
+        compliance = length(split, split.pulled(pressed))
+        assert attained == pytest.approx(compliance, rel=1e-9)
 
 
 def test_the_charge_of_rounding_solves_its_inequality():
-    """One held motion: γ ≤ 2√s, s = 1 + charge, charge ≥ 2γρ + √(8s)γσ + 2γ²κ."""
-    mechanics = disc_between_plates().mechanics
-    motions = mechanics.motions
-    one = np.zeros((motions.felt.shape[1], 1))
-    one[0] = 1
-    reach = _Reach(one, np.zeros(1), np.full(1, 2.0), np.zeros(1))
+    """One held motion: γ ≤ 2√s, s = 1 + charge, charge ≥ 2γρ + 4√s γσ + 2γ²κ."""
+    reach = _Reach(np.zeros(1), np.full(1, 2.0), np.zeros(1))
 
     def charge(rho: float, sigma: float, kappa: float) -> float:
-        mechanics.__dict__["motions"] = motions._replace(
-            strain=sigma**2 * np.eye(len(one)), curvature=-kappa * np.eye(len(one))
-        )
-        return _rounding(mechanics, reach, rho * one[:, 0], 0.0, 1.0)
+        known = Rounding(np.full(1, sigma), np.full((1, 1), kappa))
+        return _charge(reach, known, np.full(1, rho), 0.0, 1.0)
 
     for rho, sigma, kappa in ((1e-3, 0, 0), (0, 1e-3, 0), (0, 0, 1e-3)):
         s = 1 + charge(rho, sigma, kappa)
         gamma = 2 * np.sqrt(s)
-        needed = 2 * gamma * rho + np.sqrt(8 * s) * gamma * sigma + 2 * gamma**2 * kappa
+        needed = 2 * gamma * rho + 4 * np.sqrt(s) * gamma * sigma + 2 * gamma**2 * kappa
         assert needed <= s - 1 <= 1.05 * needed
     assert charge(0, 0, 1.0) == np.inf  # it is stronger than all that holds the motion
 

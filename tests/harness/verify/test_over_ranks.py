@@ -73,7 +73,10 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        assert bounds["energy_bound"] == pytest.approx(one["bound"], rel=ROUNDING)
+        # ranks allow for what rounding makes of any assembled K, one knows its own
+        assert bounds["energy_bound"] == pytest.approx(
+            one["bound"], rel=ROUNDING, abs=1e-10
+        )
         assert bounds["certificate"] == pytest.approx(
             one["parts"], rel=ROUNDING, abs=1e-10
         )

@@ -604,7 +604,7 @@ def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted()
 
 @pytest.mark.slow
 def test_a_search_of_a_hundred_thousand_points_finds_none_either():
-    """Of 7500 right points one is refuted, as docs/mathematics.md says: big-M."""
+    """Of 7500 right points one is refuted, as docs/verdicts.md says: big-M."""
     wrong, refuted, verified = search(314159, 100_000)
 
     assert wrong == []

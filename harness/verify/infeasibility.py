@@ -1,0 +1,325 @@
+"""Certificates of infeasibility, by Farkas' lemma, without rounding.
+
+Multipliers y, z ≥ 0 of the rows Ax = b, Gx ≤ h with c = Aᵀy + Gᵀz prove that no x has
+lb ≤ x ≤ ub and satisfies them if
+
+    V = bᵀy + hᵀz − Σ min(cⱼlbⱼ, cⱼubⱼ) < 0,
+
+since cᵀx ≤ bᵀy + hᵀz at every feasible x. In the convention of `harness.qp` the second
+sum is that of z_box = −c, and a multiplier on an absent bound, cⱼ > 0 without lbⱼ or
+cⱼ < 0 without ubⱼ, makes V infinite, however small it is: x may be as large as it likes
+along j. So an approximate ray proves nothing. It is mended first, so that cⱼ = 0 holds
+exactly where it has to: either in rational arithmetic, or by an enclosure of a solution
+that is proven to exist. V is then evaluated in rational arithmetic, from the doubles of
+the QP as they are.
+
+A right-hand side is itself a rounded number. So V counts only where it exceeds
+`ROUNDING` of the sum of its absolute terms. That ratio, the margin, is the same in all
+units of rows and variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array, eye_array, hstack, vstack
+
+from harness.qp import QP, Vector
+from harness.solution import Solution
+from harness.verify.rational import (
+    nonnegative_solution,
+    rational,
+    rational_product,
+    solutions,
+)
+
+#: least margin: redundant rows whose right-hand sides were rounded, each after a sum of
+#: thousands of terms, contradict one another by less
+ROUNDING = 1e-12
+#: multipliers below this part of the largest, in scaled rows, are left out; solvers
+#: that iterate leave such in rows that have no part in the contradiction
+CUTS = (0.0, 1e-9, 1e-6, 1e-3)
+CANCELLED = 1e-3  #: of its terms: a smaller cⱼ may be meant to vanish
+MOST_ENTRIES = 10**6  #: of A and G, beyond which nothing is proven
+MOST_ELIMINATED = 40  #: pivots of an elimination in rational arithmetic: a second
+MOST_TABLEAU = 1500  #: entries of a linear program in rational arithmetic: seconds
+MOST_DENSE = 1500  #: rows and columns of an enclosure
+FAR = 1e6  #: sizes of right-hand sides; bounds beyond are left out of the first search
+LP_SECONDS = 20.0  #: for the search of a ray
+EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
+
+
+class Ray(NamedTuple):
+    """Multipliers of the rows [A; G] that may prove infeasibility."""
+
+    rows: NDArray[np.int64]  #: (k,) that carry one
+    centre: Any  #: (k,) fractions
+    radius: Any  #: (k,) fractions: the ray is within these of the centre
+    vanish: NDArray[np.bool_]  #: (n,) where c is known to be exactly zero
+
+
+#: margins of the rays that `_searched` found
+_MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
+
+
+@np.errstate(all="ignore")  # entries of 1e±300 overflow in units of their rows
+def infeasibility_margin(qp: QP, s: Solution) -> float | None:
+    """Return the margin of a proof that `qp` has no feasible point; None without one.
+
+    The multipliers of `s`, which claims infeasibility, are tried first. Where these
+    prove nothing, others are searched for, once for each QP.
+
+    Returns
+    -------
+    −V over the sum of the absolute terms of V, above `ROUNDING`
+
+    """
+    told = np.concatenate([s.y, s.z])
+    if not qp.b.size + qp.h.size:
+        return None
+    M = csr_array(vstack([csr_array(qp.A), csr_array(qp.G)]), dtype=float)
+    if M.nnz > MOST_ENTRIES or not np.isfinite(M.data).all():
+        return None
+    M.eliminate_zeros()
+    row, column = _equilibrated(M)
+    margin = None
+    if np.isfinite(told).all() and told.any():
+        margin = _margin_near(qp, M, column, told)
+    if margin is None:
+        if qp not in _MARGINS:
+            _MARGINS[qp] = _searched(qp, M, row, column)
+        margin = _MARGINS[qp]
+    return margin
+
+
+def _searched(qp: QP, M: csr_array, row: Vector, column: Vector) -> float | None:
+    """Search for a ray that proves infeasibility; return its margin, or None."""
+    for w in _rays(qp, M, row, column):
+        margin = _margin_near(qp, M, column, w)
+        if margin is not None:
+            return margin
+    ray = _exact_ray(qp, M)
+    return None if ray is None else _margin(qp, M, ray)
+
+
+def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | None:
+    """Prove infeasibility by a ray near w; return the margin, or None."""
+    w = w.copy()
+    w[qp.b.size :] = np.maximum(w[qp.b.size :], 0)
+    sizes = abs(M) @ diags_array(column)
+    largest = np.asarray(sizes.max(axis=1).toarray()).ravel()
+    size = np.abs(w) * np.where(largest > 0, largest, 1.0)  # 0·x ≤ −1 has no entries
+    if not 0 < size.max() < np.inf:
+        return None
+    w = w * 2.0 ** -np.floor(np.log2(size.max()))
+    tried = set[int]()
+    for cut in CUTS:
+        rows = np.flatnonzero(size > cut * size.max())
+        if rows.size in tried:
+            continue
+        tried.add(rows.size)
+        for ray in _mended(qp, M[rows], rows, w[rows]):
+            margin = _margin(qp, M[rows], ray)
+            if margin is not None:
+                return margin
+    return None
+
+
+def _mended(qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector) -> Iterator[Ray]:
+    """Generate rays near w whose c vanishes exactly where it has to.
+
+    That is on variables without bounds, and on those where c is small and has the wrong
+    sign for the only bound. First the ray as it is, then with c = 0 wherever it is
+    small, then only where the sign is wrong.
+
+    M, w : of the rows that carry a multiplier
+    """
+    exact = rational(w)
+    zero = 0 * exact
+    c = rational_product(M, exact)
+    terms = abs(M).T @ np.abs(w)
+    known = np.array([not value for value in c])
+    yield Ray(rows, exact, zero, known)
+    rounded = np.array([float(value) for value in c])
+    free = np.isinf(qp.lb) & np.isinf(qp.ub)
+    small = np.abs(rounded) <= CANCELLED * terms
+    wrong = ((rounded > 0) & np.isinf(qp.lb)) | ((rounded < 0) & np.isinf(qp.ub))
+    for vanish in (small | free, small & (wrong | known) | free):
+        vanish = vanish & (terms > 0)
+        if not vanish.any():
+            continue
+        part = csr_array(M[:, vanish])
+        radius = _enclosure(part, w, rounded[vanish], terms[vanish])
+        if radius is not None:
+            yield Ray(rows, exact, rational(radius), vanish)
+        if min(part.shape) <= MOST_ELIMINATED and max(part.shape) <= MOST_DENSE:
+            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
+            solve = solutions(
+                rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
+            )
+            assert solve is not None  # zero is one
+            mended = exact.copy()
+            mended[order] = solve(exact[order])
+            yield Ray(rows, mended, zero, vanish)
+
+
+def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | None:
+    """Bound the change of w (k,) that makes Mᵀw = c vanish exactly; None without one.
+
+    With columns scaled by their terms and rows by w, let X be an approximate right
+    inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ with its rounding. Then MᵀX is
+    regular, and δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, |δ| ≤ |X|·1·‖c‖∞/(1 − α).
+
+    M : (k, n) of the variables where c has to vanish
+    """
+    k, n = M.shape
+    if n > k or k > MOST_DENSE:
+        return None
+    # powers of two, so that scaling is no rounding
+    unit, weight = (2.0 ** np.floor(np.log2(v)) for v in (terms, np.abs(w)))
+    ratio = weight / unit[:, None]
+    B = M.toarray().T * ratio
+    if not ((ratio > 0).all() and np.isfinite(B).all()):
+        return None
+    X = np.linalg.pinv(B)
+    rounding = 2 * (k + 2) * EPS * (np.abs(B) @ np.abs(X) + 1)
+    alpha = float((np.abs(np.eye(n) - B @ X) + rounding).sum(axis=1).max())
+    if not alpha < 0.5:
+        return None
+    largest = float((np.maximum(np.abs(c), TINY) / unit).max()) / (1 - alpha)
+    radius: Vector = 1.001 * np.abs(X).sum(axis=1) * largest * weight
+    return radius + TINY
+
+
+def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
+    """Return the least margin of the rays of an enclosure; None below `ROUNDING`."""
+    m = qp.b.size
+    if (ray.centre < ray.radius)[ray.rows >= m].any():
+        return None
+    rhs = rational(np.concatenate([qp.b, qp.h])[ray.rows])
+    value = ray.centre @ rhs + ray.radius @ abs(rhs)
+    terms = (abs(ray.centre) + ray.radius) @ abs(rhs)
+    left = np.flatnonzero(~ray.vanish)
+    part = M[:, left]
+    c, spread = (
+        rational_product(part, ray.centre),
+        rational_product(abs(part), ray.radius),
+    )
+    for lb, ub, c_j, by in zip(qp.lb[left], qp.ub[left], c, spread, strict=True):
+        products = []
+        for end in (c_j - by, c_j + by):
+            bound = float(lb if end > 0 else ub) if end else 0.0
+            if np.isinf(bound):
+                return None
+            products.append(-end * Fraction(bound))
+        value += max(products)  # a convex function of c, so that it is at an end
+        terms += max(map(abs, products))
+    return float(-value / terms) if -value > Fraction(ROUNDING) * terms else None
+
+
+def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]:
+    """Generate multipliers w of the rows of M with the largest margin.
+
+    A linear program minimises V where the sum of its absolute terms is at most one.
+    Bounds far beyond all right-hand sides are left out at first, since costs of such
+    different sizes hide one another.
+
+    row, column : factors, see `_equilibrated`
+    """
+    rhs = row * np.concatenate([qp.b, qp.h])
+    lb, ub = qp.lb / column, qp.ub / column
+    bounds = np.abs(np.concatenate([lb, ub]))
+    bounds = bounds[np.isfinite(bounds) & (bounds > 0)]
+    size = np.abs(rhs).max() or bounds.min(initial=np.inf)
+    rhs, lb, ub, bounds = (v / size for v in (rhs, lb, ub, bounds))
+    scaled = csr_array(diags_array(row) @ M @ diags_array(column))
+    reaches = {FAR, bounds.max()} if (bounds > FAR).any() else {FAR}
+    for reach in sorted(reaches):
+        w = _solved(scaled, qp.b.size, rhs, lb, ub, reach)
+        if w is not None:
+            yield w * row
+
+
+def _solved(
+    M: csr_array, m: int, rhs: Vector, lb: Vector, ub: Vector, reach: float
+) -> Vector | None:
+    """Solve the linear program of `_rays`; None where its minimum is not negative.
+
+    M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
+    reach : of bounds that take part
+    """
+    from scipy.optimize import linprog  # here: it takes long to load
+
+    n, k = M.shape[1], M.shape[0]
+    lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))
+    eye = csr_array(eye_array(n))
+    cost = np.concatenate([rhs, -rhs[:m], ub[upper], -lb[lower]])
+    # unknowns are terms of V, or nearly: units in which the program is well scaled
+    unit = np.maximum(np.abs(cost), 1 / FAR)
+    balance = hstack([M.T, -M[:m].T, eye[:, upper], -eye[:, lower]])
+    balance = csr_array(balance @ diags_array(1 / unit))
+    largest = np.asarray(abs(balance).max(axis=1).toarray()).ravel()
+    balance = csr_array(diags_array(1 / np.where(largest > 0, largest, 1.0)) @ balance)
+    cost = cost / unit
+    if not (np.isfinite(balance.data).all() and np.isfinite(cost).all()):
+        return None
+    solution = linprog(
+        cost, A_ub=csr_array(np.abs(cost)[None]), b_ub=[1.0],
+        A_eq=balance, b_eq=np.zeros(n),
+        options=dict(
+            time_limit=LP_SECONDS, primal_feasibility_tolerance=1e-10,
+            dual_feasibility_tolerance=1e-10,
+        ),
+    )  # fmt: skip
+    if solution.x is None or not solution.fun < 0:
+        return None
+    terms = solution.x / unit
+    w: Vector = terms[:k]
+    w[:m] -= terms[k : k + m]
+    return w
+
+
+def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
+    """Find a ray whose margin exceeds `ROUNDING`, in rational arithmetic.
+
+    Where a small QP has one, this finds it: by Farkas' lemma one exists exactly if no
+    feasible point is left when right-hand sides and bounds give way by `ROUNDING` of
+    themselves.
+    """
+    m, k, n = qp.b.size, M.shape[0], M.shape[1]
+    lower, upper = (np.flatnonzero(np.isfinite(v)) for v in (qp.lb, qp.ub))
+    unknowns = k + m + lower.size + upper.size
+    if (n + 1) * unknowns > MOST_TABLEAU:
+        return None
+    rows, eye = M.toarray(), np.eye(n)
+    columns = np.hstack([rows.T, -rows[:m].T, eye[:, upper], -eye[:, lower]])
+    rhs = rational(np.concatenate([qp.b, qp.h, -qp.b, qp.ub[upper], -qp.lb[lower]]))
+    rhs = rhs + Fraction(ROUNDING) * abs(rhs)
+    w = nonnegative_solution(
+        np.vstack([rational(columns), rhs]), rational(np.append(np.zeros(n), -1.0))
+    )
+    if w is None:
+        return None
+    ray = w[:k].copy()
+    ray[:m] -= w[k : k + m]
+    return Ray(np.arange(k), ray, 0 * ray, np.zeros(n, dtype=bool))
+
+
+def _equilibrated(M: csr_array) -> tuple[Vector, Vector]:
+    """Return factors of rows and columns, powers of two, that make entries about one.
+
+    Ruiz (2001): both are divided by the root of their largest entry, again and again.
+    """
+    row, column = np.ones(M.shape[0]), np.ones(M.shape[1])
+    size = abs(M)
+    for _ in range(20):
+        scaled = diags_array(row) @ size @ diags_array(column)
+        for factor, axis in ((row, 1), (column, 0)):
+            largest = np.asarray(scaled.max(axis=axis).toarray()).ravel()
+            factor /= np.sqrt(np.where(largest > 0, largest, 1.0))
+    return np.exp2(np.round(np.log2(row))), np.exp2(np.round(np.log2(column)))

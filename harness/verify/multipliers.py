@@ -1,0 +1,194 @@
+"""Multipliers of a point that comes without them.
+
+At x, with g = Px + q, the multipliers minimise
+
+    Σᵢ wᵢ²(g + Aᵀy + Gᵀz + z_box)ᵢ²  +  Σⱼ (zⱼsⱼ/E)²    over y, z ≥ 0 and z_box,
+
+where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
+and 1/wᵢ that of the stationarity residual; z_box has the sign of its bound. The second
+sum is what complementarity measures. It takes the place of a threshold between active
+and inactive rows: a row that is nearly active may bear as much as its slack permits.
+
+Existence is what counts. Multipliers with small residuals prove the point, however they
+were found, so the best of several weightings is returned, judged by `kkt_residuals`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr, solve_triangular
+from scipy.sparse import csr_array
+
+from harness.errors import InputError
+from harness.qp import QP, Matrix, Vector
+from harness.solution import Solution, Status
+from harness.verify.kkt import energy_at, kkt_residuals
+
+#: A row is left out if its multiplier, by as much as moves the stationarity residual by
+#: tol, moves complementarity by more than this many tol: it cannot help.
+FARTHEST = 100.0
+RANK = 1e-12  #: of the largest column: what is left of a column that depends on others
+MAX_ENTRIES = 2**25  #: of the dense least-squares matrix: 256 MiB
+
+
+class _Scales(NamedTuple):
+    """Weights of the two sums."""
+
+    w: Vector  #: (n,) of stationarity, 1 over its scale; 0 at fixed variables
+    E: float  #: of complementarity, divides
+
+
+@np.errstate(all="ignore")  # a point may hold 1e300
+def with_multipliers(
+    qp: QP,
+    x: Vector,
+    y: Vector | None = None,
+    z: Vector | None = None,
+    z_box: Vector | None = None,
+) -> Solution:
+    """Complete a point by the best multipliers where they are None; others stay.
+
+    Raises
+    ------
+    InputError
+        When the least-squares problem would have more than `MAX_ENTRIES` entries.
+
+    """
+    given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
+    unknown = {name for name, (v, like) in given.items() if v is None and like.size}
+    s = Solution(
+        status=Status.SOLVED,
+        x=x,
+        y=np.zeros(qp.b.size) if y is None else y,
+        z=np.zeros(qp.h.size) if z is None else z,
+        z_box=np.zeros(qp.q.size) if z_box is None else z_box,
+    )
+    if not unknown or not all(np.isfinite(v).all() for v in (x, s.y, s.z, s.z_box)):
+        return s
+    Px = qp.P @ x
+    g = Px + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box
+    scale = max(float(np.abs(v).max()) for v in (Px, qp.q, g))
+    E, size = energy_at(qp, s), np.full(x.size, scale if scale > 0 else 1.0)
+    found = [s]
+    for _ in range(2):  # relative to the largest force, then to those of each component
+        found.append(_fitted(qp, s, g, _Scales(1 / size, E), unknown))
+        forces = qp.A.T @ found[-1].y + qp.G.T @ found[-1].z + found[-1].z_box
+        own = np.maximum.reduce([np.abs(Px), np.abs(qp.q), np.abs(forces)])
+        size = np.where(own > 0, own, size)
+    return min(found, key=lambda one: _worst(qp, one))
+
+
+def _worst(qp: QP, s: Solution) -> float:
+    worst = kkt_residuals(qp, s).worst
+    return np.inf if np.isnan(worst) else worst
+
+
+def _fitted(
+    qp: QP, s: Solution, g: Vector, scales: _Scales, unknown: set[str]
+) -> Solution:
+    """Minimise the two sums over the unknown multipliers; `s` has the others.
+
+    g : (n,) Px + q and the forces of the multipliers of `s`
+    """
+    lower, upper = s.x - qp.lb, qp.ub - s.x
+    is_fixed = (qp.lb == qp.ub) & ("z_box" in unknown)
+    scales = scales._replace(w=np.where(is_fixed, 0.0, scales.w))
+    y, z = s.y, s.z
+    if unknown & {"y", "z"}:
+        rows = _near(np.abs(qp.h - qp.G @ s.x), _norms(qp.G, scales.w), scales.E)
+        rows = rows if "z" in unknown else rows[:0]
+        below, above = (
+            _near(np.abs(slack), scales.w, scales.E) if "z_box" in unknown else rows[:0]
+            for slack in (lower, upper)
+        )
+        n, k, m = s.x.size, rows.size + below.size + above.size, qp.b.size
+        if (n + k) * (k + m) > MAX_ENTRIES:
+            raise InputError(
+                f"multipliers of {k} nearly active rows and bounds and {m} equality "
+                "rows are too many to compute; expected y, z and z_box beside x"
+            )
+        columns = np.zeros((n, k))
+        columns[:, : rows.size] = _dense(qp.G[rows].T)
+        columns[below, rows.size + np.arange(below.size)] = -1
+        columns[above, rows.size + below.size + np.arange(above.size)] = 1
+        slack = np.concatenate([(qp.h - qp.G @ s.x)[rows], lower[below], upper[above]])
+        free = _dense(qp.A.T) if "y" in unknown else np.zeros((n, 0))
+        found, pull = _least_squares(free, columns, slack, g, scales)
+        if "y" in unknown:
+            y = found
+        if "z" in unknown:
+            z = np.zeros(qp.h.size)
+            z[rows] = pull[: rows.size]
+    r = g + qp.A.T @ (y - s.y) + qp.G.T @ (z - s.z)
+    z_box = s.z_box
+    if "z_box" in unknown:  # each component by itself
+        borne = _share(np.maximum(r, 0), lower, scales)
+        z_box = _share(np.maximum(-r, 0), upper, scales) - borne
+        z_box[is_fixed] = -r[is_fixed]
+    return Solution(status=s.status, x=s.x, y=y, z=z, z_box=z_box)
+
+
+def _least_squares(
+    free: Any, columns: Any, slack: Vector, g: Vector, scales: _Scales
+) -> tuple[Vector, Vector]:
+    """Minimise ‖w(g + free·y + columns·ζ)‖² + ‖slack·ζ/E‖² over y and ζ ≥ 0.
+
+    y is eliminated by an orthonormal basis of the range of w·free, which may have
+    dependent columns; these get no multiplier.
+    """
+    from scipy.optimize import nnls  # late: it takes long, and workers need none
+
+    w = scales.w[:, None]
+    Q, R, pivots = qr(w * free, mode="economic", pivoting=True)
+    size = np.abs(np.diag(R))
+    rank = int((size > RANK * size[:1].sum()).sum())
+    Q, R = Q[:, :rank], R[:rank, :rank]
+    norms = np.linalg.norm(w * columns, axis=0)
+    C, target = w * columns / norms, -scales.w * g
+    price = np.divide(
+        np.abs(slack), scales.E * norms, out=np.zeros(slack.size), where=slack != 0
+    )
+    zeta = np.zeros(slack.size)
+    if slack.size:  # without columns, scipy's nnls (1.17.1) would crash Python
+        reduced = C - Q @ (Q.T @ C)
+        reduced -= Q @ (Q.T @ reduced)  # once more, or rounding of Q remains
+        stacked = np.vstack([reduced, np.diag(price)])
+        rhs = np.concatenate([target - Q @ (Q.T @ target), np.zeros(slack.size)])
+        try:
+            zeta, _ = nnls(stacked, rhs, maxiter=100 * slack.size + 100)
+        except RuntimeError:
+            raise InputError(
+                "multipliers: the least-squares iteration did not end; expected y, z "
+                "and z_box beside x"
+            ) from None
+    y = np.zeros(free.shape[1])
+    y[pivots[:rank]] = solve_triangular(R, Q.T @ (target - C @ zeta))
+    return y, zeta / norms
+
+
+def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
+    """List rows or bounds whose multiplier could help, see `FARTHEST`.
+
+    norms : ‖w·aⱼ‖
+    """
+    return np.flatnonzero((norms > 0) & (slack <= FARTHEST * E * norms))
+
+
+def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:
+    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ, component by component."""
+    price = np.divide(
+        slack, scales.E * scales.w, out=np.zeros(slack.size), where=slack != 0
+    )
+    return np.where(np.isfinite(slack), force / (1 + price**2), 0.0)
+
+
+def _norms(M: Matrix, w: Vector) -> Vector:
+    """Return ‖w·aⱼ‖ of each row aⱼ of M."""
+    return np.asarray(np.sqrt(csr_array(M).power(2) @ w**2))
+
+
+def _dense(M: Matrix) -> Any:
+    return M.toarray() if hasattr(M, "toarray") else M

@@ -1,0 +1,125 @@
+"""A QP from arrays: what is accepted, and what every refusal says."""
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array, csc_matrix, csr_array, eye_array
+from scipy.sparse.linalg import aslinearoperator
+
+from harness import QP, InputError
+
+I2, ZERO = np.eye(2), np.zeros(2)
+UPPER = np.array([[2.0, 1.0], [0.0, 2.0]])
+
+
+@pytest.mark.parametrize("kind", [np.asarray, csc_matrix, csr_array, coo_array, list])
+def test_matrices_of_every_kind_make_the_same_qp(kind):
+    P, G = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 1.0], [0.0, 2.0]])
+    as_kind = (lambda M: M.tolist()) if kind is list else kind
+    qp = QP.from_arrays(as_kind(P), [1, 2], as_kind(G), [3, 4], as_kind(G[:1]), [5])
+    x = np.array([0.5, -1.0])
+
+    assert qp.objective(x) == 0.5 * x @ P @ x + np.array([1, 2]) @ x
+    assert (qp.P @ x).tolist() == (P @ x).tolist()
+    assert (qp.G @ x).tolist() == (G @ x).tolist()
+    assert (qp.A @ x).tolist() == (G[:1] @ x).tolist()
+    assert (qp.h.tolist(), qp.b.tolist()) == ([3, 4], [5])
+
+
+def test_absent_parts_are_no_rows_and_infinite_bounds():
+    qp = QP.from_arrays(I2, ZERO)
+
+    assert (qp.A.shape, qp.G.shape, qp.b.size, qp.h.size) == ((0, 2), (0, 2), 0, 0)
+    assert (qp.lb == -np.inf).all()
+    assert (qp.ub == np.inf).all()
+
+
+def test_a_scalar_bounds_every_variable_and_a_vector_is_one_row():
+    qp = QP.from_arrays(I2, ZERO, G=[1, 2], h=3, lb=0, ub=[1, np.inf])
+
+    assert (qp.lb.tolist(), qp.ub.tolist()) == ([0, 0], [1, np.inf])
+    assert (qp.G.tolist(), qp.h.tolist()) == ([[1, 2]], [3])
+
+
+def test_columns_and_rows_are_vectors():
+    qp = QP.from_arrays(I2, [[1.0], [2.0]], lb=np.zeros((1, 2)))
+
+    assert (qp.q.tolist(), qp.lb.tolist()) == ([1, 2], [0, 0])
+
+
+@pytest.mark.parametrize("kind", [np.array, csc_matrix])
+def test_the_arrays_that_were_given_stay_writable_and_apart(kind):
+    P, q = kind(I2), np.ones(2)
+    qp = QP.from_arrays(P, q)
+    P[0, 0], q[0] = 7, 7
+
+    assert qp.P.diagonal().tolist() == [1, 1]
+    assert qp.q.tolist() == [1, 1]
+
+
+def test_entries_of_one_place_are_added_up():
+    twice = coo_array(([1.0, 1.0, 1.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
+
+    assert QP.from_arrays(twice, ZERO).P.toarray().tolist() == [[2, 0], [0, 1]]
+
+
+def test_a_qp_shows_its_sizes():
+    qp = QP.from_arrays(I2, ZERO, A=[1, 1], b=1, lb=0)
+
+    assert repr(qp) == "<QP: 2 variables, 1 equalities, 0 inequalities, 2 bounds>"
+
+
+WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)\)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"P": UPPER}, f"P is not symmetric.*P is upper triangular, but is {WHOLE}"),
+        ({"P": csc_matrix(UPPER)}, f"P is upper triangular, but is {WHOLE}"),
+        ({"P": UPPER.T}, f"P is lower triangular, but is {WHOLE}"),
+        ({"P": [[1, 2], [3, 4]]}, r"P\[0, 1\] and P\[1, 0\] differ by 1$"),
+        ({"P": -I2}, r"P is not positive semidefinite: P\[0, 0\] = -1; expected a con"),
+        ({"P": [[1, 2], [2, 1]]}, "it has a negative eigenvalue; expected a convex QP"),
+        ({"P": None}, "P is missing; expected an array of numbers"),
+        ({"P": np.eye(3)}, r"P has shape \(3, 3\); expected \(2, 2\)"),
+        ({"P": np.nan * I2}, "P holds NaN or inf; expected finite numbers"),
+        ({"P": csc_matrix(np.inf * np.ones((2, 2)))}, "P holds NaN or inf"),
+        ({"P": 1j * I2}, "P is of type complex128; expected an array of numbers"),
+        ({"P": csc_matrix(1j * I2)}, "P is of type complex128; expected an array"),
+        ({"P": [[1, 2], [3]]}, "P is ragged; expected an array of numbers"),
+        ({"P": "P"}, "P is of type <U1; expected an array of numbers"),
+        ({"P": aslinearoperator(I2)}, r"expected a matrix: P @ np.eye\(2\)"),
+        ({"q": None}, "q is missing"),
+        ({"q": []}, "q is empty; expected at least one variable"),
+        ({"q": 1.0}, r"q has shape \(\); expected one dimension"),
+        ({"q": [1, np.nan]}, "q holds NaN or inf"),
+        ({"q": {1: 2}}, "q is of type dict"),
+        ({"G": I2}, "h is missing beside G"),
+        ({"h": ZERO}, "G is missing beside h"),
+        ({"A": I2}, "b is missing beside A"),
+        ({"b": ZERO}, "A is missing beside b"),
+        (
+            {"G": np.ones((2, 3)), "h": ZERO},
+            r"G has shape \(2, 3\); expected \(rows, 2",
+        ),
+        ({"A": [1, 1], "b": ZERO}, "b has 2 entries; expected 1, one per row of A"),
+        ({"G": [1, 1], "h": np.inf}, "h holds NaN or inf"),
+        ({"lb": [0, 0, 0]}, r"lb has shape \(3,\); expected \(2,\)"),
+        ({"lb": np.nan}, "bounds hold NaN"),
+        ({"lb": 1, "ub": 0}, "bounds cross: lb > ub"),
+        ({"lb": "low"}, "lb is of type <U3"),
+        ({"sets": (1,)}, r"discs and cones are not supported yet; expected sets=\(\)"),
+    ],
+)
+def test_what_is_no_qp_is_refused_in_one_line(changes, message):
+    with pytest.raises(InputError, match=message) as e:
+        QP.from_arrays(**{"P": I2, "q": ZERO, **changes})
+    assert "\n" not in str(e.value)
+
+
+def test_a_semidefinite_matrix_is_convex_up_to_rounding():
+    rng = np.random.default_rng(5)
+    B = rng.standard_normal((40, 3))
+
+    assert QP.from_arrays(B @ B.T, np.zeros(40)).q.size == 40
+    assert QP.from_arrays(eye_array(600) * 0, np.zeros(600)).q.size == 600

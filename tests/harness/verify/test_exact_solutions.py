@@ -1,0 +1,219 @@
+"""Certificates beside exact solutions of the stored problem: no error above its bound.
+
+Errors are those from the solution of the stored K, f, B and c in integers, in the
+energy norm of the stored K, and evaluated in integers, too.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from harness import Case, UncertifiableError, certify
+from harness.distributed import mpi
+from harness.names import parse
+from harness.verify.references import reference_point
+from problems import PROBLEMS
+from solvers import SOLVERS
+from solvers.reference.solve import reference_solution
+from tests.support import ROOT, SUPPORT
+from tests.support.disturbed import disturbed
+from tests.support.exact_solutions import ExactSolution, exact_solution
+
+SMALL = "contact-patch/lower=3/upper=2"
+STIFF_AND_SOFT = tuple(
+    f"{SMALL}/ratio=1e{e}{torn}"
+    for e in (-12, -10, -8, -6, -3, 6, 9, 12)
+    for torn in ("", "/feti=2")
+)
+RUBBING = (
+    f"{SMALL}/ratio=1e-12/friction=tresca/bound=1e5",
+    f"{SMALL}/ratio=1e-12/friction=tresca/bound=1e5/feti=2",
+    f"{SMALL}/ratio=1e-10/friction=coulomb/mu=0.2",
+    f"{SMALL}/ratio=1e-10/friction=coulomb/mu=0.2/feti=2",
+    f"{SMALL}/ratio=1e-6/friction=coulomb/mu=0.2/feti=1",
+    f"{SMALL}/ratio=1e9/friction=coulomb/mu=0.1/feti=2",
+    f"{SMALL}/ratio=1e12/friction=tresca/bound=1e5/feti=1",
+    "hertz-cylinder/n=2/m=2/ratio=1e12/load=1000/friction=tresca/bound=1e6/feti=2",
+    "beam-ring/Nr=2/Nh=2/steps=1/friction=coulomb/mu=0.3/feti=3",
+    "beam-ring/Nr=2/Nh=2/steps=1/friction=tresca/bound=5e7",
+    "greco/n=6/feti=3", "greco/n=6",
+)  # fmt: skip
+OTHERS = (
+    "contact-patch/ratio=1e-10/feti=2",
+    f"{SMALL}/ratio=1e-6/slave=lower/contact=nts/feti=2",
+    "hertz-cylinder/n=3/m=2/ratio=1e-8/feti=4",
+    "hertz-cylinder/n=3/m=2/ratio=1e-9",
+    "hertz-cylinder/n=2/m=2/ratio=1e8/load=1000/feti=2",
+    "hertz-plane/n=1/load=1000", "hertz-plane/n=1/load=1000/feti=2",
+    "obstacle/n=8", "obstacle/n=8/feti=4", "membranes/S=2/n=3",
+    "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
+)  # fmt: skip
+#: linear ones, whose other solvers take very long; all but the first are soft in
+#: bending, or nearly move rigidly inside
+PLATES = (
+    "plate/Sx=12/Sy=1/n=2", "plate/Sx=40/Sy=1/n=1",
+    "plate/Sx=20/Sy=1/n=1/width=20/height=0.05",
+    "plate/Sx=3/Sy=3/n=2/pattern=checkerboard/jump=1e8",
+)  # fmt: skip
+MOVED_FAR = (
+    "contact-patch/ratio=1e-10/feti=2", "contact-patch/ratio=1e-12/feti=2",
+    "contact-patch/ratio=1e-10/friction=coulomb/mu=0.2/feti=2",
+    "hertz-cylinder/n=3/m=2/ratio=1e-8/feti=4",
+)  # fmt: skip
+CASES = STIFF_AND_SOFT + RUBBING + OTHERS + PLATES
+ON_RANKS = (
+    f"{SMALL}/ratio=1e-12/feti=1", f"{SMALL}/ratio=1e-10/feti=2",
+    f"{SMALL}/ratio=1e-6/feti=1", f"{SMALL}/ratio=1e12/feti=1",
+    f"{SMALL}/ratio=1e-10/friction=coulomb/mu=0.2/feti=2",
+    f"{SMALL}/ratio=1e9/friction=tresca/bound=1e5/feti=1",
+    "hertz-cylinder/n=3/m=2/ratio=1e-8/feti=4", "membranes/S=2/n=3",
+    "plate/Sx=12/Sy=1/n=2", "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
+)  # fmt: skip
+DISTURBED = 10_000
+#: what arithmetic of doubles may take off a bound, which is a sum and a root of doubles
+ROUNDED = 1 + 1e-9
+#: errors between which effectivities are measured: below, bounds are those of rounding
+SHARP = (1e-7, 0.1)
+
+
+class Found(NamedTuple):
+    """Certificates of answers to one problem."""
+
+    faults: list[str]  #: errors that exceed their bounds
+    sharp: list[float]  #: bound over error
+    bounds: list[float]
+
+
+@cache
+def known(name: str) -> tuple[Case, ExactSolution]:
+    case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
+    assert case.mechanics is not None
+    return case, exact_solution(case.mechanics)
+
+
+def certified(name: str, answers) -> Found:
+    """Certify answers, each with a label."""
+    case, exact = known(name)
+    found = Found([], [], [])
+    for label, s in answers:
+        try:
+            c = certify(case.mechanics, s)
+        except UncertifiableError:
+            continue
+        error, ratio = exact.exceeded(c, s, c.u)
+        if ratio > ROUNDED:
+            found.faults.append(f"{label}: error {error:.6e}, bound {c.bound:.6e}")
+        if SHARP[0] < error < SHARP[1]:
+            found.sharp.append(1 / ratio)
+        found.bounds.append(c.bound)
+    return found
+
+
+def disturbances(name: str, count: int):
+    case, exact = known(name)
+    rng, answer = np.random.default_rng(sum(map(ord, name))), exact.answer()
+    for i in range(count):
+        yield f"disturbance {i}", disturbed(answer, i, rng, case.mechanics)
+
+
+def solved(name: str, labels=tuple(SOLVERS)):
+    """Yield the answers of all these solvers that accept the problem."""
+    case, _ = known(name)
+    for label in labels:
+        solver = SOLVERS[label]
+        if (name in PLATES and label != "feti") or solver.declines(case.qp):
+            continue
+        for tol in (1e-4, 1e-8):
+            try:
+                s = solver.prepare(case.qp, tol)()
+            except (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError):
+                continue  # a crash is no answer, and for other tests
+            yield f"{label} to {tol}", case.mechanics.back(s)
+
+
+@pytest.mark.parametrize("name", [STIFF_AND_SOFT[3], RUBBING[3], PLATES[0]])
+def test_no_error_exceeds_its_bound(name):
+    found = certified(name, disturbances(name, 24))
+
+    assert found.faults == []
+    assert len(found.sharp) > 3
+    assert np.median(found.sharp) <= 2
+
+
+@pytest.mark.parametrize("name", MOVED_FAR)
+def test_an_answer_that_moves_far_on_a_soft_body_is_not_better_than_it_is(name):
+    """Rounding of K, which a torn body has too, counts as much as it moves."""
+    found = certified(name, solved(name, ("smalbe",)))
+
+    assert found.faults == []
+    assert max(found.bounds) > 1e-7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_no_error_of_any_solver_exceeds_its_bound(name):
+    found = certified(name, solved(name))
+
+    assert found.faults == []
+    assert len(found.bounds) > (0 if name in PLATES else 3)
+
+
+@pytest.mark.slow
+def test_no_error_of_ten_thousand_exceeds_its_bound_and_bounds_are_sharp():
+    sharp = []
+    for name in CASES:
+        found = certified(name, disturbances(name, DISTURBED // len(CASES) + 1))
+        assert found.faults == [], name
+        sharp += found.sharp
+
+    assert len(sharp) > DISTURBED / 4
+    assert np.median(sharp) <= 2
+
+
+@pytest.mark.parametrize(
+    ("count", "names"),
+    [
+        (8, (ON_RANKS[1], ON_RANKS[3])),
+        pytest.param(100, ON_RANKS, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.together
+def test_no_error_exceeds_the_bound_of_two_ranks(count, names):
+    done = subprocess.run(
+        [
+            mpi.mpiexec(), "-n", "2", sys.executable, "-m", "mpi4py",
+            str(SUPPORT / "exact_on_ranks.py"), str(count), *names,
+        ],
+        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+
+    assert [faults for faults, _ in found.values()] == [[]] * len(names)
+    assert np.median([e for _, sharp in found.values() for e in sharp]) <= 2
+
+
+@pytest.mark.parametrize("name", ["contact-patch", "hertz-cylinder/n=3/m=2"])
+def test_the_solution_for_the_stored_matrix_is_the_reference(name):
+    """Though one body is softer by 1e-9, and moves as much further than it deforms."""
+    case, exact = known(f"{name}/ratio=1e-9")
+    point = reference_point(case.mechanics, reference_solution)
+
+    assert exact.error(point.u) <= point.bound * exact.norm < 1e-7 * exact.norm
+
+
+def test_a_displacement_is_measured_without_its_rigid_motion():
+    _, exact = known(SMALL)
+    rigid = exact.mechanics.kernel.toarray()[:, 0].astype(float)
+    v = np.zeros(rigid.size)
+    v[-3:] = 1, 2, 3
+
+    assert exact.error(v + 1e3 * rigid) == pytest.approx(exact.error(v), rel=1e-12)

@@ -1,0 +1,164 @@
+"""Multipliers of points that come without: planted KKT points, and points beside."""
+
+import numpy as np
+import pytest
+
+from harness import QP, InputError, kkt_residuals
+from harness.verify import multipliers
+from harness.verify.multipliers import with_multipliers
+
+TOL = 1e-8
+
+
+def solved_qp(seed, *, definite=True):
+    """Make a QP with redundant and degenerate rows, and its exact solution x.
+
+    Every kind of constraint: equality rows of which some are combinations of others,
+    active inequality rows with and without a multiplier, some written twice, bounds on
+    either side, fixed variables and free ones.
+    """
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 30))
+    L = rng.standard_normal((n, int(rng.integers(1, n + 1))))
+    P = L @ L.T + definite * np.eye(n)
+    x = rng.standard_normal(n)
+    A = rng.standard_normal((int(rng.integers(0, n // 2 + 1)), n))
+    if len(A):
+        A = np.vstack([A, 3 * A[:1], A.sum(axis=0)])
+    G = rng.standard_normal((int(rng.integers(0, 2 * n)), n))
+    if len(G):
+        G = np.vstack([G, 2 * G[:1]])
+    is_active, bears = rng.random(len(G)) < 0.5, rng.random(len(G)) < 0.7
+    z = np.where(is_active & bears, rng.exponential(size=len(G)), 0)
+    slack = np.where(is_active, 0, rng.exponential(size=len(G)))
+    lb, ub, z_box = np.full(n, -np.inf), np.full(n, np.inf), np.zeros(n)
+    at = rng.integers(0, 6, n)
+    force = rng.exponential(size=n) * (rng.random(n) < 0.7)
+    lb[at == 0], z_box[at == 0] = x[at == 0], -force[at == 0]
+    ub[at == 1], z_box[at == 1] = x[at == 1], force[at == 1]
+    lb[at == 2], ub[at == 2] = x[at == 2] - 1, x[at == 2] + 1
+    fixed = (at == 3) & (rng.random(n) < 0.3)
+    lb[fixed] = ub[fixed] = x[fixed]
+    z_box[fixed] = force[fixed] - 0.5
+    y = rng.standard_normal(len(A))
+    q = -(P @ x + A.T @ y + G.T @ z + z_box)
+    return QP.from_arrays(P, q, G, G @ x + slack, A, A @ x, lb, ub), x
+
+
+@pytest.mark.parametrize("definite", [True, False])
+def test_a_solution_without_multipliers_is_proven(definite):
+    worst = [
+        kkt_residuals(qp, with_multipliers(qp, x)).worst
+        for qp, x in (solved_qp(seed, definite=definite) for seed in range(200))
+    ]
+
+    assert max(worst) <= 1e-13
+
+
+def test_signs_of_computed_multipliers_are_those_of_their_bounds():
+    for seed in range(100):
+        qp, x = solved_qp(seed)
+        s = with_multipliers(qp, x)
+        at_lb, at_ub = x == qp.lb, x == qp.ub
+
+        assert (s.z >= 0).all()
+        assert np.abs(s.z_box[~at_lb & ~at_ub]).max(initial=0) <= 1e-12
+        assert (s.z_box[at_lb & ~at_ub] <= 0).all()
+        assert (s.z_box[at_ub & ~at_lb] >= 0).all()
+
+
+def test_a_point_beside_the_solution_has_no_multipliers():
+    """100·tol off in every component, on strictly convex QPs: more than 10·tol is left.
+
+    No multipliers would do, so none are found.
+    """
+    left = []
+    for seed in range(200):
+        qp, x = solved_qp(seed)
+        off = np.random.default_rng(seed).choice([-1.0, 1.0], x.size)
+        beside = x + 100 * TOL * np.abs(x).max() * off
+        left.append(kkt_residuals(qp, with_multipliers(qp, beside)).worst)
+
+    assert min(left) > 10 * TOL
+
+
+def test_a_nearly_active_row_bears_what_its_slack_permits():
+    """min ½x² − x with x ≤ ½, at x = ½ − δ: the multiplier ½ costs ½δ."""
+    delta = 1e-9
+    qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
+    s = with_multipliers(qp, np.array([0.5 - delta]))
+
+    assert s.z[0] == pytest.approx(0.5, rel=1e-6)
+    assert 1e-10 < kkt_residuals(qp, s).worst < 1e-8
+
+
+def test_an_inactive_row_bears_nothing():
+    """The minimum of ½x² − x is 1; x = 0 is none, whatever the row x ≤ ½ could bear."""
+    qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
+    s = with_multipliers(qp, np.array([0.0]))
+
+    assert kkt_residuals(qp, s).worst > 0.1
+
+
+def test_a_row_that_pulls_the_wrong_way_bears_nothing():
+    qp = QP.from_arrays([[1.0]], [-1.0], lb=[0.0], G=[[-1.0]], h=[0.0])
+    s = with_multipliers(qp, np.array([0.0]))
+
+    assert (s.z.tolist(), s.z_box.tolist()) == ([0], [0])
+    assert kkt_residuals(qp, s).worst > 0.1
+
+
+def test_a_vertex_of_a_linear_program_with_more_rows_than_it_needs_is_proven():
+    """min −x₁ − x₂ over x ≤ 1, x₁ + x₂ ≤ 2, 2x₁ + x₂ ≤ 3: four rows meet at (1, 1)."""
+    G = np.array([[1, 0], [0, 1], [1, 1], [2, 1]])
+    qp = QP.from_arrays(np.zeros((2, 2)), [-1, -1], G, [1, 1, 2, 3], ub=1)
+    x = np.ones(2)
+
+    assert kkt_residuals(qp, with_multipliers(qp, x)).worst <= 1e-15
+    assert kkt_residuals(qp, with_multipliers(qp, x - [0.1, 0])).worst > 1e-3
+
+
+@pytest.mark.parametrize("power", [-6, 6])
+def test_units_of_rows_and_variables_change_nothing(power):
+    """Rows, variables and objective multiplied by powers of ten."""
+    for seed in range(50):
+        qp, x = solved_qp(seed)
+        rng = np.random.default_rng(seed)
+        D = 10.0 ** rng.integers(min(power, 0), max(power, 0) + 1, x.size)
+        rows = 10.0 ** rng.integers(min(power, 0), max(power, 0) + 1, qp.h.size)
+        scaled = QP.from_arrays(
+            10.0**power * qp.P * D * D[:, None], 10.0**power * qp.q * D,
+            (qp.G * D) * rows[:, None] if qp.h.size else None,
+            qp.h * rows if qp.h.size else None,
+            qp.A * D if qp.b.size else None, qp.b if qp.b.size else None,
+            qp.lb / D, qp.ub / D,
+        )  # fmt: skip
+
+        assert kkt_residuals(scaled, with_multipliers(scaled, x / D)).worst <= 1e-11
+
+
+def test_multipliers_that_are_given_stay():
+    """Of two equal rows one bears a part; the other takes the rest."""
+    qp = QP.from_arrays([[1.0]], [-3.0], G=[[1.0]], h=[1.0], ub=[1.0])
+    one = np.array([1.0])
+    s = with_multipliers(qp, one, z=np.array([0.5]))
+
+    assert (s.z.tolist(), s.z_box.tolist()) == ([0.5], [1.5])
+    assert kkt_residuals(qp, s).worst == 0
+
+
+def test_a_point_that_holds_nan_gets_no_multipliers():
+    qp, x = solved_qp(3)
+    x = np.where(np.arange(x.size) == 0, np.nan, x)
+    s = with_multipliers(qp, x)
+
+    assert np.isnan(kkt_residuals(qp, s).worst)
+
+
+def test_too_many_multipliers_are_refused(monkeypatch):
+    monkeypatch.setattr(multipliers, "MAX_ENTRIES", 10)
+    qp = QP.from_arrays(np.eye(4), -np.ones(4), np.eye(4), np.zeros(4))
+    with pytest.raises(
+        InputError, match=r"too many to compute; expected y, z and z_box"
+    ):
+        with_multipliers(qp, np.zeros(4))

@@ -1,0 +1,251 @@
+"""Solutions of stored contact problems in integers, and errors in their energy norm.
+
+A number is an integer times 2^−BITS, so that data, sums and products are exact. The KKT
+equations for guessed closed rows are solved by elimination in extended precision, and
+refined with exact residuals until nothing changes above 2^−FINE; then the signs of all
+multipliers, gaps and slips are checked. The guess of which rows are closed is the only
+part that the code under test has in it, and a wrong one is found out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+from math import isqrt, ldexp
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from harness import Mechanics, Solution, Status
+from harness.mechanics import Real
+from harness.verify.active_set_refinement import CLOSED, LOWER, UPPER, States
+from harness.verify.certificate import Certificate
+from harness.verify.references import reference_point
+from solvers.reference.solve import reference_solution
+from tests.support.held_by_contact import _eliminated, _loose, _substituted
+
+BITS = 500  #: after the binary point
+FINE = 330  #: bits, relative to the largest unknown, that refinement settles
+Integers = NDArray[np.object_]
+
+
+def integers(v: Any) -> Integers:
+    """Return v, doubles or extended, times 2^BITS; digits beyond are cut off."""
+    v = np.asarray(v)
+    high = v.astype(np.float64)
+    low = (v - high).astype(np.float64)
+    found = np.empty(v.shape, dtype=object)
+    flat = found.reshape(-1)
+    for k, (a, b) in enumerate(zip(high.ravel(), low.ravel(), strict=True)):
+        flat[k] = _integer(a) + _integer(b)
+    return found
+
+
+def _integer(a: float) -> int:
+    top, bottom = float(a).as_integer_ratio()
+    return (top << BITS) // bottom
+
+
+def _float(x: int, bits: int = BITS) -> float:
+    """Return x·2^−bits, rounded."""
+    drop = max(x.bit_length() - 64, 0)
+    return ldexp(float(x >> drop), drop - bits)
+
+
+class Rows:
+    """A sparse matrix of doubles, for exact products with integers."""
+
+    def __init__(self, M: Any) -> None:
+        M = M.tocsr().copy()
+        M.eliminate_zeros()
+        self._start, self._at = M.indptr, M.indices
+        self._entries = integers(M.data)
+
+    def __matmul__(self, x: Integers) -> Integers:
+        """Return M x, rounded to 2^−BITS down."""
+        terms = self._entries * x[self._at]
+        sums = np.zeros(len(self._start) - 1, dtype=object)
+        for i, (a, b) in enumerate(zip(self._start[:-1], self._start[1:], strict=True)):
+            sums[i] = sum(terms[a:b]) >> BITS
+        return sums
+
+
+class UnsettledError(Exception):
+    """Why the stored problem has no exact solution here."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExactSolution:
+    """The solution of the stored K, f, B, c of a problem in one piece."""
+
+    mechanics: Mechanics
+    u: Integers  #: (n,)
+    multipliers: Integers  #: (m,)
+
+    @cached_property
+    def _K(self) -> Rows:
+        return Rows(self.mechanics.primal.P)
+
+    @cached_property
+    def _R(self) -> tuple[Integers, list[list[Fraction]]]:
+        """Rigid motions (n, r), and the inverse of RᵀR."""
+        R = integers(np.asarray(self.mechanics.kernel.toarray()))
+        gram = [[Fraction(sum(a * b)) for b in R.T] for a in R.T]
+        return R, _inverse(gram)
+
+    def without_motion(self, v: Integers) -> Integers:
+        """Take the rigid motions out of v (n,)."""
+        R, inverse = self._R
+        along = [Fraction(sum(r * v)) for r in R.T]
+        for r, row in zip(R.T, inverse, strict=True):
+            alpha = sum(a * b for a, b in zip(row, along, strict=True))
+            v = v - ((r * round(alpha * 2**BITS)) >> BITS)
+        return v
+
+    def length(self, v: Integers) -> float:
+        """Return the energy norm √(vᵀKv) of v (n,) without its rigid motion."""
+        v = self.without_motion(v)
+        square = int(sum(v * (self._K @ v)))  # at scale 2^−2BITS
+        return _float(isqrt(max(square, 0)))
+
+    def error(self, u: Any) -> float:
+        """Return ‖u − u*‖ for u (n,), doubles or extended."""
+        return self.length(integers(u) - self.u)
+
+    @cached_property
+    def norm(self) -> float:
+        """‖u*‖."""
+        return self.length(self.u)
+
+    def answer(self) -> Solution:
+        """Return u and λ in doubles, as `Mechanics.back` would give them."""
+        m = self.mechanics
+        u, lam = (np.array([_float(x) for x in v]) for v in (self.u, self.multipliers))
+        contact = m.primal.h.size
+        z = np.zeros(contact + m.friction.bound.size)
+        z[:contact], z[contact:][m.friction.bound > 0] = lam[:contact], lam[contact:]
+        none = np.zeros(0)
+        return Solution(status=Status.SOLVED, x=u, y=none, z=z, z_box=0 * u)
+
+    def exceeded(self, found: Certificate, s: Solution, u: Any) -> tuple[float, float]:
+        """Return the relative error of û (n,) and the answer, and over the bound."""
+        error = max(self.error(s.x), self.error(u)) / self.norm
+        return error, error / found.bound if error else 0.0
+
+
+def exact_solution(mechanics: Mechanics) -> ExactSolution:
+    """Solve the stored problem; motions that closed rows do not feel are pinned.
+
+    Raises
+    ------
+    UnsettledError
+        When no set of closed rows satisfies all conditions within some exchanges.
+
+    """
+    mechanics = mechanics.whole
+    near = reference_point(mechanics, reference_solution)
+    states, pinned = near.states, near.u
+    for _ in range(12):
+        u, lam = _given(mechanics, states, pinned)
+        wrong = _exchanged(mechanics, states, u, lam)
+        if (wrong == states).all():
+            return ExactSolution(mechanics, u, lam)
+        states = wrong
+    raise UnsettledError("closed rows do not settle")
+
+
+def _given(
+    mechanics: Mechanics, states: States, pinned: Any
+) -> tuple[Integers, Integers]:
+    """Solve with equality on the closed rows."""
+    exact, primal = mechanics.exact, mechanics.primal
+    K, B = primal.P.toarray(), mechanics.rows.toarray()
+    free, closed = np.setdiff1d(np.arange(len(K)), exact.held), states == CLOSED
+    lam = np.where(
+        states == LOWER, exact.lower, np.where(states == UPPER, exact.upper, 0)
+    )
+    rows = B[closed][:, free]
+    kernel = mechanics.kernel.toarray().astype(np.float64)[free]
+    loose = _loose(rows, kernel)
+    rows = np.vstack([rows, loose.T])
+    A = np.block(
+        [[K[np.ix_(free, free)], rows.T], [rows, np.zeros(2 * rows.shape[:1])]]
+    )
+    slip = integers(lam)
+    force = integers(-primal.q) - Rows(mechanics.rows.T) @ slip
+    at = integers(loose.T @ pinned[free].astype(np.float64))
+    right = np.concatenate([force[free], integers(exact.c[closed]), at])
+    x = _solve(A, right)
+    u = np.zeros(len(K), dtype=object)
+    u[free] = x[: free.size]
+    slip[closed] = x[free.size :][: closed.sum()]
+    return u, slip
+
+
+def _exchanged(
+    mechanics: Mechanics, states: States, u: Integers, lam: Integers
+) -> States:
+    """Return the states with rows exchanged that violate a condition.
+
+    Zeros are known to 2^−FINE of the largest number only.
+    """
+    exact = mechanics.exact
+    v = Rows(mechanics.rows) @ u - integers(exact.c)
+    zero_v = max(abs(x) for x in u) >> (FINE - 60) if u.size else 0
+    zero = max((abs(x) for x in lam), default=0) >> (FINE - 60)
+    lower, upper = integers(exact.lower), np.zeros(lam.size, dtype=object)
+    bounded = ~exact.contact
+    upper[bounded] = integers(exact.upper[bounded])
+    found = states.copy()
+    for i, state in enumerate(states):
+        if state == CLOSED:
+            if lam[i] < lower[i] - zero:
+                found[i] = LOWER
+            elif bounded[i] and lam[i] > upper[i] + zero:
+                found[i] = UPPER
+        elif (state == LOWER and v[i] > zero_v) or (state == UPPER and v[i] < -zero_v):
+            found[i] = CLOSED
+    return found
+
+
+def _solve(A: NDArray[np.float64], b: Integers) -> Integers:
+    """Solve Ax = b (n,) to FINE bits."""
+    scale, scaled = np.ones(len(b)), A.copy()
+    for _ in range(20):
+        by = 2.0 ** np.round(0.5 * np.log2(np.abs(scaled).max(axis=1)))
+        scale, scaled = scale / by, scaled / by[:, None] / by
+    factor, order = _eliminated(scaled.astype(Real))
+    exact, x = Rows(csr_array(A)), np.zeros(len(b), dtype=object)
+    for _ in range(120):
+        r = b - exact @ x
+        largest = max(abs(v) for v in r)
+        if not largest:
+            break
+        unit = largest.bit_length()
+        left = np.array([_float(v, unit) for v in r]).astype(Real) * scale
+        step = _substituted(factor, left[order]) * scale
+        whole = np.array([
+            _integer(float(s)) >> (BITS - unit) if unit < BITS
+            else _integer(float(s)) << (unit - BITS) for s in step
+        ], dtype=object)  # fmt: skip
+        x = x + whole
+        if max(abs(v) for v in whole) <= max(abs(v) for v in x) >> FINE:
+            return x
+    raise UnsettledError("refinement does not converge")
+
+
+def _inverse(M: list[list[Fraction]]) -> list[list[Fraction]]:
+    """Invert a small matrix (r, r)."""
+    r = len(M)
+    rows = [row + [Fraction(int(i == j)) for j in range(r)] for i, row in enumerate(M)]
+    for k in range(r):
+        rows[k] = [x / rows[k][k] for x in rows[k]]
+        for i in range(r):
+            if i != k:
+                rows[i] = [
+                    a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)
+                ]
+    return [row[r:] for row in rows]
