@@ -205,6 +205,28 @@ def without_friction(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
+def one_state(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError at finite strain, whose QPs are linearised at their own states.
+
+    The QP of the next finer mesh belongs to another state, so that the distance of the
+    two solutions is not the error of either mesh.
+    """
+    if params["kinematics"] == "finite":
+        raise InputError(
+            f"{family}: the error of the mesh with kinematics=finite is not built; "
+            "expected kinematics=linear"
+        )
+
+
+def minimised(family: str, laws: Iterable[str]) -> None:
+    """Raise InputError where a law is Coulomb's, whose solutions minimise nothing."""
+    if "coulomb" in laws:
+        raise InputError(
+            f"{family}: friction=coulomb minimises no energy on any mesh; "
+            "expected friction=tresca"
+        )
+
+
 def tangential(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak: parts of μP, no sliding."""
     Q, peak = float(params["Q"]), float(params["peak"])

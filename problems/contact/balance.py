@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import InputError, Matrix
+from harness import Friction, InputError, Matrix
 from problems.contact.bodies import UnassembledBodies
 
 #: part of the load that may be left: rounding of coordinates, normals and tractions
@@ -76,6 +76,48 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         if np.abs(part).max() > _SLIGHT * np.abs(parts).max()
     ]
     raise InputError(_named(moving, size))
+
+
+def check_friction(
+    bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
+) -> None:
+    """Refuse a load that friction with its bounds cannot hold.
+
+    With forces λ_n ≥ 0 of the contact rows B and |λ_t| ≤ g of the rows T of friction,
+    Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0 has to have a solution. A linear program minimises the sum
+    of what is left.
+
+    step, share : number of the load step, and its part of the load
+
+    Raises
+    ------
+    InputError
+        With the part of the load that nothing holds.
+
+    """
+    R, _, _ = _motions(bodies)
+    allowed = _kernel(bodies.B_D @ R)
+    if not allowed.shape[1] or not friction.bound.size:
+        return
+    from scipy.optimize import linprog  # late, as above
+
+    motions = R @ allowed
+    forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
+    eye, load = np.eye(allowed.shape[1]), motions.T @ bodies.f * share
+    rows = B.shape[0]
+    limits = [(0, None)] * rows + [(-g, g) for g in friction.bound]
+    size = np.abs(bodies.f).sum() * share
+    found = linprog(
+        np.append(np.zeros(forces.shape[1]), np.ones(2 * len(eye))),
+        A_eq=np.hstack([forces, eye, -eye]), b_eq=load,
+        bounds=limits + [(0, None)] * (2 * len(eye)), method="highs",
+    )  # fmt: skip
+    if found.x is not None and found.fun > UNBALANCED * size:
+        raise InputError(
+            f"load step {step}: friction cannot hold the load; within the bound of "
+            f"Tresca's law nothing balances {found.fun / size:.2%} of it; expected "
+            "supports that hold the bodies, or a larger bound"
+        )
 
 
 def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:

@@ -25,7 +25,7 @@ import numpy as np
 from harness import Friction, InputError, Vector
 from harness.errors import PastEndError
 from harness.mechanics import NO_FRICTION
-from problems.contact.bodies import Bodies, ContactSides
+from problems.contact.bodies import ContactSides, UnassembledBodies
 from problems.contact.node_to_segment import ContactRows
 from problems.fem.mesh import Nodes
 
@@ -61,7 +61,7 @@ def law_of(params: Mapping[str, Any]) -> FrictionLaw:
 
 
 def friction_of(
-    bodies: Bodies | ContactSides,
+    bodies: UnassembledBodies | ContactSides,
     rows: ContactRows,
     laws: Sequence[FrictionLaw],
     before: Vector,
@@ -120,8 +120,8 @@ def settled(
         except ArithmeticError as e:
             raise InputError(
                 f"load step {step}: no equilibrium was found with the "
-                f"{len(found) + 1}. bound of Coulomb's law; expected supports or "
-                f"friction that hold the bodies: {e}"
+                f"{len(found) + 1}. bound of Coulomb's law: friction cannot hold the "
+                f"load; expected supports or friction that hold the bodies: {e}"
             ) from None
         residuals.append(friction.residual(forces))
         if residuals[-1] <= SETTLED:

@@ -51,8 +51,9 @@ def results_of(
 ) -> dict[str, Any]:  # fmt: skip
     """Report counts, energy, contact forces and stresses.
 
-    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the first pair's master (of
-    its slave where the master is rigid), −ΣBᵀλ of contact and friction, N/m.
+    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the master (of the slave
+    where the master is rigid), −ΣBᵀλ of contact and friction, N/m; absent where several
+    pairs may touch, since a sum over them has no meaning: `contacts` has each force.
     max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
     `pair_results`. With friction those of `frictional`, too.
 
@@ -72,7 +73,7 @@ def results_of(
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
         "energy": inside.energy,
-        "contact_force": forces[_loaded(bodies)].sum(axis=0).tolist(),
+        **_contact_force(bodies, forces),
         "multiplier_sum": float(normal.sum() * bodies.force),
         "max_von_mises": {
             name: float(largest)
@@ -82,13 +83,17 @@ def results_of(
     } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
 
 
-def _loaded(bodies: Bodies | ContactSides) -> NDArray[np.bool_]:
-    """Mark the nodes (N,) of the body that `contact_force` acts on; none if nothing."""
-    owner = bodies.body_of_node
+def _contact_force(
+    bodies: Bodies | ContactSides, forces: NDArray[np.float64]
+) -> dict[str, list[float]]:
+    """Sum the forces of the only pair on one of its bodies; empty for several pairs."""
+    if len(bodies.pairs) > 1:
+        return {}
     if not bodies.pairs:
-        return np.zeros(owner.size, dtype=bool)
-    slave, master = bodies.pairs[0]
-    return np.asarray(owner == owner[(master if master.size else slave)[0]])
+        return {"contact_force": [0.0, 0.0]}
+    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
+    loaded = owner == owner[(master if master.size else slave)[0]]
+    return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
 
 def frictional(
@@ -97,14 +102,21 @@ def frictional(
     """Report what friction does.
 
     open, stick, slip: numbers of rows of pairs with friction, which are not active, or
-    active and below the bound, or at it. friction_residual: ‖g − mu·λ_n‖/‖g‖ of
+    active and below the bound, or at it. sliding_without_contact: rows that are not
+    active and yet carry shear, which Tresca's law allows, and which are not open;
+    shear_without_contact: their part of Σ|λ_t|. friction_residual: ‖g − mu·λ_n‖/‖g‖ of
     Coulomb's law, 0 of Tresca's. dissipation: Σ g|Tu − s|, the work of the friction in
     this step, J/m.
     """
     state = states(primal, s, friction)
+    shear = np.abs(s.z[primal.h.size :])
+    unpressed = (state == "open") & (shear > ACTIVE * np.abs(s.z).max(initial=0.0))
+    state = np.where(unpressed, "", state)
     slip = friction.T @ s.x - friction.start
     return {
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
+        "sliding_without_contact": int(unpressed.sum()),
+        "shear_without_contact": float(shear[unpressed].sum() / (shear.sum() or 1.0)),
         "friction_residual": friction.residual(s.z[: primal.h.size]),
         "dissipation": float(friction.bound @ np.abs(slip))
         * bodies.force * bodies.length,
@@ -147,8 +159,12 @@ def pair_results(
 def fields(
     bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
+    subdomains: NDArray[np.int64] | None = None,
 ) -> Fields:  # fmt: skip
-    """Collect the deformed state for pictures; stresses as of `quantities`."""
+    """Collect the deformed state for pictures; stresses as of `quantities`.
+
+    subdomains : (E,) of each cell, of bodies that are torn
+    """
     u = s.x * bodies.length
     sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
     slaves = np.concatenate(sides)
@@ -161,6 +177,7 @@ def fields(
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
         contacts=contact_sides(bodies, primal, s, friction),
+        subdomains=subdomains,
     )
 
 

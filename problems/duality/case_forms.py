@@ -59,7 +59,7 @@ def contact_case(
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, tear = None, None
+    seconds, tear, subdomains = None, None, None
     if torn is not None:
         if form != "dual":
             raise InputError(
@@ -69,6 +69,7 @@ def contact_case(
         pieces = torn()
         new, tear = torn_dual(pieces, primal, friction), partial(LocalProblems, pieces)
         seconds = perf_counter() - start
+        subdomains = pieces.label
         matrices = torn_matrices(pieces, new.qp)
         decomposition = torn_quantities(pieces, new.qp)
     elif form == "primal":
@@ -86,7 +87,9 @@ def contact_case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x * bodies.length,
         quantities=lambda s: {**quantities(new.recover(s)), **decomposition},
-        fields=lambda s: fields(bodies, primal, new.recover(s), friction),
+        fields=lambda s: fields(
+            bodies, primal, new.recover(s), friction, subdomains=subdomains
+        ),
         scale=new.sign * energy,
         constant=new.constant * energy,
         matrices=matrices,

@@ -210,14 +210,35 @@ class NewtonPath:
                 if size < least:
                     raise InputError(
                         f"load step {k} of {self.steps}: the last equilibrium is that "
-                        f"at the load factor {reached:.6g}; beyond it, {e}; expected a "
-                        "smaller load, or supports that hold the bodies better"
+                        f"at the load factor {reached:.6g}; beyond it, {e}; expected "
+                        f"{self._advice(target)}"
                     ) from None
                 continue
             parts += 1
             if load_factor == target:
                 return found, parts
             reached, (u, lam) = load_factor, self._end(found)
+
+    def _advice(self, load_factor: float) -> str:
+        """Name a problem with an equilibrium where a load has none that is found.
+
+        Entries of F = I + ∂u/∂X are known to the rounding of 1: of cells of size h that
+        leaves forces of about h|K|·1, whatever the load. Beside a tiny load they are
+        more than SETTLED.
+        """
+        h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
+        rounded = h * self._free_norm(
+            abs(self.bodies.K) @ np.ones(self.bodies.mesh.dofs)
+        )
+        share = (
+            ROUNDING * rounded / (load_factor * self._free_norm(self.bodies.f) or 1.0)
+        )
+        if share <= SETTLED:
+            return "a smaller load, or supports that hold the bodies better"
+        return (
+            f"a larger load, or kinematics=linear: of strains this small, rounding "
+            f"leaves {share:.0e} of the forces, and {SETTLED:g} is asked for"
+        )
 
     def _start(self, k: int) -> tuple[Vector, Vector]:
         if k == 1:

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
+from problems.contact.balance import check_friction
 from problems.contact.bodies import Bodies
 from problems.contact.friction import (
     FrictionLaw,
@@ -240,6 +241,12 @@ def single_load(
 
     factorise : K with its rigid modes; called where Coulomb's law needs solutions
     steps, iterate : as of `LoadPath`
+
+    Raises
+    ------
+    InputError
+        When friction cannot hold the load.
+
     """
     if any(law.mu for law in laws):
         path = LoadPath(
@@ -252,6 +259,7 @@ def single_load(
     rows = linearise(at_rest)
     pressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
     friction = friction_of(bodies, rows, laws, at_rest, pressed)
+    check_friction(bodies, rows.B, friction, 1, 1 / steps)
     return primal_qp(bodies, rows, 1 / steps), friction
 
 

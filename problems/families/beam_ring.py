@@ -25,6 +25,7 @@ from problems.ranges import (
     emitted_on_ranks,
     fits,
     one_of,
+    one_state,
     rough,
     torn_by,
     without_friction,
@@ -89,8 +90,7 @@ class BeamRing(InSubdomains):
         The arcs of the ring are other polygons. At finite strain there is none: the
         QP of another mesh is linearised at another state.
         """
-        if params["kinematics"] == "finite":
-            return None
+        one_state(self.name, params)
         without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
 

@@ -23,7 +23,9 @@ from problems.ranges import (
     at_least,
     at_most,
     deformed,
+    minimised,
     one_of,
+    one_state,
     rough,
     torn_by,
 )
@@ -46,7 +48,7 @@ class GmshBodies(InSubdomains):
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
             "path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0,
-            "parts": 0, "glue": DECOMPOSITION["glue"],
+            "parts": 0, "glue": DECOMPOSITION["glue"], "halvings": 0,
         }),
         hash=False,
     )  # fmt: skip
@@ -78,6 +80,8 @@ class GmshBodies(InSubdomains):
             raise InputError(f"{self.name}: path is missing; expected bodies:PATH.toml")
         at_least(1, self.name, params, ("steps", "step", "relin"))
         at_most(MOST_STEPS, self.name, params, ("steps", "relin"))
+        at_least(0, self.name, params, ("halvings",))
+        at_most(30, self.name, params, ("halvings",))
         if p["step"] > p["steps"]:
             raise InputError(
                 f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
@@ -93,6 +97,14 @@ class GmshBodies(InSubdomains):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
         check_digest(p["path"], p["sha256"], digest(path, mesh))
+
+    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
+        """Return the case with every edge of the mesh halved."""
+        from problems.models.gmsh_bodies import laws_of
+
+        one_state(self.name, params)
+        minimised(self.name, [law.kind for law in laws_of(params)])
+        return {**params, "halvings": int(params["halvings"]) + 1}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
         """Whether there are parts, and no Newton iterations."""

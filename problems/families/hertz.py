@@ -22,6 +22,7 @@ from problems.ranges import (
     emitted_on_ranks,
     fits,
     one_of,
+    one_state,
     positive,
     rough,
     tangential,
@@ -60,13 +61,8 @@ class HertzPlane(InSubdomains):
         deformed(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; the arcs are other polygons.
-
-        At finite strain there is none: the QP of another mesh is linearised at another
-        state.
-        """
-        if params["kinematics"] == "finite":
-            return None
+        """Return the case with every cell halved; the arcs are other polygons."""
+        one_state(self.name, params)
         return {**params, "halvings": int(params["halvings"]) + 1}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:

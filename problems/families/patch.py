@@ -21,7 +21,9 @@ from problems.ranges import (
     doubled,
     emitted_on_ranks,
     fits,
+    minimised,
     one_of,
+    one_state,
     positive,
     rough,
     torn_by,
@@ -82,13 +84,8 @@ class ContactPatch(InSubdomains):
         Coulomb's law is refused: its solutions minimise nothing. At finite strain there
         is none: the QP of another mesh is linearised at another state.
         """
-        if params["kinematics"] == "finite":
-            return None
-        if params["friction"] == "coulomb":
-            raise InputError(
-                f"{self.name}: friction=coulomb minimises no energy on any mesh; "
-                "expected friction=tresca"
-            )
+        one_state(self.name, params)
+        minimised(self.name, [str(params["friction"])])
         return {**params, **doubled(params, "lower", "upper")}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:

@@ -26,6 +26,7 @@ CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
 #: kinds of cells that start so are of higher order or solid, by the names of meshio
 _CURVED = ("line", "triangle", "quad")
 _SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
+_SPACE = "three dimensions are not supported yet"
 _FIRST_ORDER = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -2 -order 1"
 _NAMED = 'Physical Surface("NAME") in the .geo file'
 
@@ -56,13 +57,15 @@ def read_msh(path: Path) -> NamedMesh:
 
     """
     mesh = _read(path)
-    points = np.asarray(mesh.points, dtype=float)
-    extent = np.ptp(points, axis=0).max(initial=0.0)
-    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
-        raise InputError(f"{path}: not plane; expected all nodes at the same z")
     for block in mesh.cells:
         if block.type not in DIMENSION:
             raise InputError(f"{path}: cells of type {block.type}; {_remedy(block)}")
+    points = np.asarray(mesh.points, dtype=float)
+    extent = np.ptp(points, axis=0).max(initial=0.0)
+    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
+        raise InputError(
+            f"{path}: not plane; {_SPACE}: expected all nodes at the same z"
+        )
     parts = _named(path, mesh, 2)
     if not parts:
         raise InputError(f"{path}: no named surface with cells; expected {_NAMED}")
@@ -91,10 +94,59 @@ def read_msh(path: Path) -> NamedMesh:
     )  # fmt: skip
 
 
+def halved(mesh: NamedMesh) -> NamedMesh:
+    """Halve every edge: four triangles or quadrilaterals of each cell.
+
+    New nodes lie on the straight edges, so that all bodies keep their shape. A triangle
+    is cut into four that are similar to it, a quadrilateral about the mean of its
+    corners. Bodies stay numbered one after another.
+    """
+    cells, corners = mesh.cells, mesh.cells.T
+    is_quad = ~triangular(cells)
+    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1)  # (E, 4, 2)
+    ends, middle = np.unique(
+        np.sort(edges.reshape(-1, 2), axis=1), axis=0, return_inverse=True
+    )
+    n = len(mesh.points)
+    is_edge = ends[:, 0] != ends[:, 1]  # of a triangle's repeated corner, that corner
+    number = np.where(is_edge, n + np.cumsum(is_edge) - 1, ends[:, 0])
+    m = number[middle].reshape(-1, 4).T
+    centre = n + is_edge.sum() + np.cumsum(is_quad) - 1
+    points = np.concatenate([
+        mesh.points,
+        mesh.points[ends[is_edge]].mean(axis=1),
+        mesh.points[cells[is_quad]].mean(axis=1),
+    ])  # fmt: skip
+    children = np.stack([
+        np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
+        for k in range(4)
+    ], axis=-1)  # fmt: skip
+    # the third corner of a triangle stands twice: cut it off once, and take the middles
+    children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
+    children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
+    fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
+    of_edge = {(a, b): k for (a, b), k in zip(ends.tolist(), number, strict=True)}
+    used = _distinct([np.unique(fine[part]) for part in mesh.surfaces.values()])
+    renumbered = np.empty(len(points), dtype=np.int64)
+    renumbered[used] = np.arange(used.size)
+
+    def cut(curve: Nodes) -> Nodes:
+        a, b = curve.T
+        at = np.array([of_edge[min(e), max(e)] for e in curve.tolist()], dtype=np.int64)
+        return np.asarray(renumbered[np.stack([a, at, at, b], axis=-1).reshape(-1, 2)])
+
+    return NamedMesh(
+        points[used], renumbered[fine.reshape(-1, 4)],
+        {k: (4 * v[:, None] + np.arange(4)).ravel() for k, v in mesh.surfaces.items()},
+        {name: cut(curve) for name, curve in mesh.curves.items()},
+        {name: renumbered[spot] for name, spot in mesh.spots.items()},
+    )  # fmt: skip
+
+
 def _remedy(block: Any) -> str:
     """Say what gmsh should write instead of cells that we do not read."""
     if block.type.startswith(_SOLID):
-        return "expected plane bodies: gmsh -2"
+        return f"{_SPACE}: expected plane bodies, gmsh -2"
     if block.type.startswith(_CURVED):
         return f"expected cells of first order: {_FIRST_ORDER}"
     return f"expected triangles or quadrilaterals: {', '.join(DIMENSION)} of meshio"

@@ -107,7 +107,7 @@ def glue(
         kinds=kinds, kind=decomposition.kind, spread=T,
         B=csr_array(diags_array(scale) @ vstack([B_E @ turn, B_I])),
         c=scale * np.append(values, c), scale=scale, f=average @ load,
-        equalities=of_row.size,
+        equalities=of_row.size, label=decomposition.label,
     )  # fmt: skip
 
 

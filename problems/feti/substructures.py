@@ -71,6 +71,15 @@ class LocalProblems:
             )
         return found
 
+    def squared_product(self, v: Vector) -> Vector:
+        """Apply K∘K, the squares of the entries of K, to v (N,)."""
+        found = np.empty_like(v)
+        for kind, place in self._kinds():
+            K = kind.K.copy()
+            K.data = K.data**2
+            found[place] = K @ v[place]
+        return found
+
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P with one factor per kind; all subdomains of a kind at once."""
         found, domains = np.zeros_like(b), self.torn.domains

@@ -47,6 +47,7 @@ class Decomposition:
     kind: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
     #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
     rotation: NDArray[np.float64]
+    label: NDArray[np.int64]  #: (E,) subdomain of each cell of the whole mesh
 
     @property
     def subdomain(self) -> NDArray[np.int64]:
@@ -187,7 +188,7 @@ def decompose(
     first, kind, rotation = classify(map(key, range(S)), torn)
     return Decomposition(
         node=node, nodes=n, start=start, parts=tuple(map(part, first)),
-        kind=kind, rotation=rotation,
+        kind=kind, rotation=rotation, label=label,
     )  # fmt: skip
 
 

@@ -217,6 +217,8 @@ class Torn:
     scale: Vector  #: (m,) positive
     f: Vector  #: (N,) Tᵀf is the load of the whole
     equalities: int  #: rows of B that are equations, the first ones
+    #: (E,) subdomain of each cell of the whole mesh; None where ranks hold shares of it
+    label: NDArray[np.int64] | None = None
 
     @property
     def start(self) -> NDArray[np.int64]:

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import eye_array, issparse
+from scipy.sparse import eye_array
 
-from harness import QP, InputError, Matrix
+from harness import QP, InputError
 from harness.checked import is_number, located
 from harness.files.datafile import content
 from harness.files.matfile import matrix, read_mat, to_qp, vector
 from harness.files.parquetfile import load_parquet
 from harness.files.qpfile import load_qp
+from harness.qp import check_convex
 from problems.files.file_digest import format_of
 from problems.files.qps import parse_qps
 from problems.files.two_sided import TwoSidedQP, one_sided
@@ -25,9 +26,6 @@ from problems.files.two_sided import TwoSidedQP, one_sided
 Loaded = tuple[QP, float, float]
 
 _COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
-_MOST_FACTORED = 2000  #: rows of a P whose eigenvalues are bounded: a quarter second
-_NEGATIVE = 1e-6  #: curvature relative to the diagonal; texts may have six digits
-_FLAT = 1e-4  #: of the largest entry: below, rounding may have made most of Pᵢᵢ
 
 
 def read(path: Path) -> Loaded:
@@ -43,44 +41,8 @@ def read(path: Path) -> Loaded:
     """
     qp, scale, constant = _READERS[format_of(path)](path)
     with located(str(path)):
-        _check_convex(qp.P)
+        check_convex(qp.P)
     return qp, scale, constant
-
-
-def _check_convex(P: Matrix) -> None:
-    """Refuse a P with negative curvature: a KKT point of it may be a maximum.
-
-    With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to be above −1e-6:
-    D⁻½PD⁻½ + 1e-6 needs a Cholesky factor. What is closer to semidefinite may be so but
-    for rounding. Of more than 2000 rows only Pᵢᵢ is looked at.
-
-    Raises
-    ------
-    InputError
-        Where curvature is negative.
-
-    """
-    largest = float(abs(P).max()) if P.shape[0] else 0.0
-    if not largest:
-        return
-    diagonal = P.diagonal() / largest
-    i = int(diagonal.argmin())
-    if diagonal[i] < -_NEGATIVE * _FLAT:
-        raise InputError(
-            f"P is not positive semidefinite: P[{i}, {i}] = {P.diagonal()[i]:.3g}; "
-            "expected a convex QP"
-        )
-    if P.shape[0] > _MOST_FACTORED:
-        return
-    root = np.sqrt(np.maximum(diagonal, _FLAT))
-    scaled = (P.toarray() if issparse(P) else P) / largest / root / root[:, None]
-    try:
-        np.linalg.cholesky(scaled + _NEGATIVE * np.eye(len(root)))
-    except np.linalg.LinAlgError:
-        raise InputError(
-            "P is not positive semidefinite: it has a negative eigenvalue; expected a "
-            "convex QP"
-        ) from None
 
 
 def _npz(path: Path) -> Loaded:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, vstack
 
 from harness import QP, InputError, Vector
-from harness.files.qpfile import check_symmetric
+from harness.qp import check_symmetric
 
 INFINITE = 1e20  #: bounds of at least this size mean that there is none
 

@@ -61,7 +61,7 @@ from harness.files.reading import read_toml
 from problems.contact.bodies import ContactPair, UnassembledBodies, unassembled
 from problems.contact.friction import FrictionLaw, law_of
 from problems.fem.elasticity import Material
-from problems.fem.gmsh_mesh import NamedMesh, read_msh
+from problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
 from problems.fem.mesh import Mesh, Nodes
 from problems.ranges import (
     FINITE,
@@ -72,6 +72,7 @@ from problems.ranges import (
     NEEDED,
     PLANES,
     SETTINGS,
+    fits,
     physical,
 )
 
@@ -125,8 +126,10 @@ def read_description(path: Path) -> dict[str, Any]:
     return table
 
 
-def described_bodies(path: Path, plane: Any) -> UnassembledBodies:
+def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     """Read what the TOML file describes.
+
+    halvings : times that every edge of the mesh is halved, on straight edges
 
     Raises
     ------
@@ -136,6 +139,9 @@ def described_bodies(path: Path, plane: Any) -> UnassembledBodies:
     """
     table = read_description(path)
     named = read_msh(path.parent / table["mesh"])
+    fits(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
+    for _ in range(halvings):
+        named = halved(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):

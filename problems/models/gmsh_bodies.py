@@ -17,7 +17,7 @@ from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
 from harness import QP, Case, Friction, InputError, Reference, Value
 from harness.checked import located
-from problems.contact.balance import check_balance
+from problems.contact.balance import check_balance, check_friction
 from problems.contact.bodies import (
     Bodies,
     assembled,
@@ -25,7 +25,7 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw
+from problems.contact.friction import FrictionLaw, friction_of
 from problems.contact.linearise import linearisation
 from problems.contact.results import quantities
 from problems.duality.case_forms import contact_case
@@ -74,7 +74,7 @@ def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> C
 
 def _load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     p: Any = params
-    source = (p["path"], p["sha256"], p["plane"])
+    source = (p["path"], p["sha256"], p["plane"], p["halvings"])
     bodies = model(*source)
     if p["kinematics"] == "finite":
         return _finite(form, source, p, reference)
@@ -86,7 +86,7 @@ def _load_step(form: str, params: Mapping[str, Value], reference: Reference) -> 
     pieces = None
     if p["parts"]:
         with located(source[0]):
-            parts = _subdivided(*source, p["parts"])
+            parts = _subdivided(source, p["parts"])
         pieces = partial(torn, parts, primal, friction, p["glue"])
     case = contact_case(
         bodies, primal, form, torn=pieces,
@@ -99,7 +99,7 @@ def _load_step(form: str, params: Mapping[str, Value], reference: Reference) -> 
 
 
 def _finite(
-    form: str, source: tuple[str, str, Any], p: Any, reference: Reference
+    form: str, source: tuple[str, str, Any, int], p: Any, reference: Reference
 ) -> Case:
     """Emit the QP of one Newton iteration of one load step."""
     laws = laws_of(p)
@@ -118,7 +118,7 @@ def _finite(
 
 
 def _posed(
-    source: tuple[str, str, Any], p: Any, reference: Reference
+    source: tuple[str, str, Any, int], p: Any, reference: Reference
 ) -> tuple[QP, Friction]:
     """Linearise the contact where the load path is; at first, that is u = 0."""
     laws = laws_of(p)
@@ -129,11 +129,11 @@ def _posed(
         rows = linearise(np.zeros(bodies.mesh.dofs))
         with located(source[0]):  # friction may hold either way
             check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
-        return single_load(
-            bodies, linearise, laws,
-            factorise=lambda: _floating(*source), reference=reference,
-            steps=p["steps"], iterate=p["iterate"],
-        )  # fmt: skip
+            return single_load(
+                bodies, linearise, laws,
+                factorise=lambda: _floating(*source), reference=reference,
+                steps=p["steps"], iterate=p["iterate"],
+            )  # fmt: skip
     quasi_static = p["loading"] == "quasi-static"
     path = _path(source, method, p["steps"], p["relin"], laws, quasi_static, reference)
     problem = path.problem(p["step"], p["iterate"])
@@ -146,12 +146,20 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     The mesh is read and cut as a whole.
     """
     p: Any = params
-    bodies, laws = described_bodies(Path(p["path"]), p["plane"]), laws_of(params)
+    bodies, laws = (
+        described_bodies(Path(p["path"]), p["plane"], p["halvings"]),
+        laws_of(params),
+    )
     mesh, method = bodies.mesh, (p["contact"], p["basis"])
     with located(p["path"]):
         if p["step"] == p["relin"] == 1:  # bodies that only contact holds have no path
-            rows = linearisation(bodies, *method, laws)(np.zeros(mesh.dofs))
+            at_rest = np.zeros(mesh.dofs)
+            rows = linearisation(bodies, *method, laws)(at_rest)
             check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
+            if not any(law.mu for law in laws):
+                unpressed = np.zeros(sum(pair.slave.size for pair in bodies.pairs))
+                friction = friction_of(bodies, rows, laws, at_rest, unpressed)
+                check_friction(bodies, rows.B, friction, 1, 1 / p["steps"])
         label = graph_partition(mesh.points, mesh.cells, bodies.body, p["parts"])
     fixed, loaded = bodies.B_D.indices, np.flatnonzero(bodies.f)
     named = np.concatenate([fixed, bodies.interface]) // 2
@@ -184,15 +192,15 @@ def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
 
 
 @lru_cache(maxsize=4)
-def model(path: str, sha256: str, plane: Any) -> Bodies:
+def model(path: str, sha256: str, plane: Any, halvings: int) -> Bodies:
     """Assemble the bodies of a description; the digest tells contents apart."""
     del sha256
-    return assembled(described_bodies(Path(path), plane))
+    return assembled(described_bodies(Path(path), plane, halvings))
 
 
 @lru_cache(maxsize=4)
-def _subdivided(path: str, sha256: str, plane: Any, parts: int) -> SubdividedBodies:
-    bodies = model(path, sha256, plane)
+def _subdivided(source: tuple[str, str, Any, int], parts: int) -> SubdividedBodies:
+    bodies = model(*source)
     label = graph_partition(bodies.mesh.points, bodies.mesh.cells, bodies.body, parts)
     return subdivide(bodies, label)
 
@@ -214,7 +222,7 @@ def _supported(*source: Any) -> GeneralisedInverse:
 
 @lru_cache(maxsize=4)
 def _path(
-    source: tuple[str, str, Any], method: tuple[str, str], steps: int, relin: int,
+    source: tuple[str, str, Any, int], method: tuple[str, str], steps: int, relin: int,
     laws: tuple[FrictionLaw, ...], quasi_static: bool, reference: Reference,
 ) -> LoadPath:  # fmt: skip
     bodies = model(*source)
@@ -237,8 +245,8 @@ def _unsupported(path: str) -> InputError:
 
 @lru_cache(maxsize=4)
 def _newton_path(
-    source: tuple[str, str, Any], method: tuple[str, str], steps: int, material: str,
-    contact_stiffness: str, reference: Reference,
+    source: tuple[str, str, Any, int], method: tuple[str, str], steps: int,
+    material: str, contact_stiffness: str, reference: Reference,
 ) -> NewtonPath:  # fmt: skip
     bodies = model(*source)
     keys = {

@@ -150,7 +150,8 @@ def half_on_plane(params: Mapping[str, Value]) -> Halves:
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
     )
-    disc = _lower_half(exact.a / p["n"], exact.a, p["halvings"])
+    a = min(exact.a, RADIUS)  # as of `two_halves`
+    disc = _lower_half(a / p["n"], a, p["halvings"])
     return Halves((disc,), (MATERIAL,), exact)
 
 
@@ -236,7 +237,9 @@ def cylinder_on_cylinder(
 def two_halves(params: Mapping[str, Value]) -> Halves:
     """Divide the cylinders, n cells per a on the upper one and m on the lower.
 
-    The upper one has R = 8 mm, E = 200 GPa, the lower one `radius` and `ratio` times
+    Where Hertz's a exceeds a radius, as with a body too soft for his theory, cells are
+    those of an a as long as the radius: evenly meshed arcs must not wind around it. The
+    upper one has R = 8 mm, E = 200 GPa, the lower one `radius` and `ratio` times
     that.
     """
     p: Any = params
@@ -246,7 +249,7 @@ def two_halves(params: Mapping[str, Value]) -> Halves:
     exact = LineContact(
         p["load"] * UNIT_LOAD, 1 / (1 / RADIUS + 1 / radius), 1 / compliance
     )
-    a, halvings = exact.a, p["halvings"]
+    a, halvings = min(exact.a, RADIUS, radius), p["halvings"]
     upper = _lower_half(a / p["n"], a, halvings).prefixed("upper_")
     lower = _upper_half(a / p["m"], a, radius, halvings).prefixed("lower_")
     return Halves((upper, lower), (MATERIAL, below), exact)
@@ -479,8 +482,13 @@ def _polar(
 
 
 def graded(h: float, uniform: float, total: float) -> Vector:
-    """Divide [0, total]: cells of size h up to `uniform`, then growing by GROWTH."""
+    """Divide [0, total]: cells of size h up to `uniform`, then growing by GROWTH.
+
+    Where cells of size h reach the end, all are as long, and at most h.
+    """
     even = h * np.arange(np.ceil(uniform / h) + 1)
+    if even[-1] >= total:
+        return np.linspace(0, total, int(np.ceil(total / h)) + 1)
     rest = total - even[-1]
     count = np.ceil(np.log1p(rest * (GROWTH - 1) / (GROWTH * h)) / np.log(GROWTH))
     sizes = GROWTH ** np.arange(1, count + 1)

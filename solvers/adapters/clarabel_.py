@@ -23,11 +23,12 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, in_sequence
 
+PRIMAL = "PrimalInfeasible"  #: it comes with a certificate
 CLAIMS = {
     "Solved": Status.SOLVED,
     "MaxIterations": Status.ITERATION_LIMIT,
     "MaxTime": Status.TIME_LIMIT,
-    "PrimalInfeasible": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "DualInfeasible": Status.INFEASIBLE,
 }  #: anything else (AlmostSolved, InsufficientProgress, …) is FAILED
 
@@ -93,7 +94,9 @@ class Clarabel:
             r = solver.solve()
             status = CLAIMS.get(str(r.status), Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, str(r.status))
+                is_primal = str(r.status) == PRIMAL
+                ray = from_one_sided(qp, np.array(r.z)) if is_primal else {}
+                return Solution.without_point(qp, status, str(r.status), **ray)
             return Solution(
                 status=status,
                 x=np.array(r.x), **from_one_sided(qp, np.array(r.z) / scale),

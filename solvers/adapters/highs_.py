@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import csc_matrix, tril, vstack
 
-from harness import QP, About, Solution, Status, needs_matrices
+from harness import QP, About, Solution, Status, Vector, needs_matrices
 from solvers.common.conversion import (
     csc,
     needs_dense,
@@ -23,11 +23,12 @@ from solvers.common.conversion import (
     positive,
 )
 
+PRIMAL = "kInfeasible"  #: it may come with a certificate
 CLAIMS = {
     "kOptimal": Status.SOLVED,
     "kIterationLimit": Status.ITERATION_LIMIT,
     "kTimeLimit": Status.TIME_LIMIT,
-    "kInfeasible": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "kUnbounded": Status.INFEASIBLE,
     "kUnboundedOrInfeasible": Status.INFEASIBLE,
 }  #: anything else is FAILED
@@ -106,14 +107,19 @@ class HiGHS:
             info, name = solver.getInfo(), solver.getModelStatus().name
             status = CLAIMS.get(name, Status.FAILED)
             found = solver.getSolution()
+            m, p = qp.b.size, qp.h.size
             if status is Status.INFEASIBLE or not found.value_valid:
-                return Solution.without_point(qp, status, name)
+                ray: dict[str, Vector] = {}
+                _, is_known, row = solver.getDualRay()
+                if name == PRIMAL and is_known and m + p:
+                    y, z = -row[:m], -row[m:]
+                    ray = dict(y=y, z=z, z_box=-(qp.A.T @ y + qp.G.T @ z))
+                return Solution.without_point(qp, status, name, **ray)
             row = -np.array(found.row_dual) / scale
             z_box = -np.array(found.col_dual) / scale
             steps = {
                 "qpasm": info.qp_iteration_count, "hipo": info.ipm_iteration_count
             }  # fmt: skip
-            m, p = qp.b.size, qp.h.size
             return Solution(
                 status=status, x=np.array(found.col_value),
                 y=row[:m], z=row[m : m + p], z_box=on_present_bounds(qp, z_box),

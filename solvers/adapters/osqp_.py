@@ -24,12 +24,13 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, tightening
 
+PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
     "OSQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,  # at the limit, 10·tol holds
     "OSQP_TIME_LIMIT_REACHED": Status.TIME_LIMIT,
-    "OSQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "OSQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
 }  #: anything else is FAILED
 
@@ -100,7 +101,8 @@ class OSQP:
             name = osqp.SolverStatus(r.info.status_val).name
             status = CLAIMS.get(name, Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, r.info.status)
+                ray = from_two_sided(qp, r.prim_inf_cert) if name == PRIMAL else {}
+                return Solution.without_point(qp, status, r.info.status, **ray)
             return Solution(
                 status=status, x=r.x, **from_two_sided(qp, r.y / scale),
                 iterations=r.info.iter, message=r.info.status,

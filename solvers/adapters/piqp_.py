@@ -25,10 +25,11 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, in_sequence
 
+PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {
     "PIQP_SOLVED": Status.SOLVED,
     "PIQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    "PIQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "PIQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
 }  #: anything else is FAILED
 
@@ -85,11 +86,15 @@ class PIQP:
         def solve() -> Solution:
             status = CLAIMS.get(solver.solve().name, Status.FAILED)
             r, info = solver.result, solver.result.info
+            multipliers = dict(
+                y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
+            )
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, info.status.name)
+                # its multipliers diverge along a certificate
+                ray = multipliers if info.status.name == PRIMAL else {}
+                return Solution.without_point(qp, status, info.status.name, **ray)
             return Solution(
-                status=status, x=r.x, y=r.y / scale, z=r.z_u / scale,
-                z_box=(r.z_bu - r.z_bl) / scale,
+                status=status, x=r.x, **multipliers,
                 iterations=info.iter, message=info.status.name,
                 counts={"factor_retries": info.factor_retires},
                 reported={

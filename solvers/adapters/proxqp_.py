@@ -28,10 +28,11 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, tightening
 
+PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    "PROXQP_PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "PROXQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
 }  #: anything else is FAILED
@@ -124,7 +125,10 @@ class ProxQP:
             r = solver.results
             status = CLAIMS.get(r.info.status.name, Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, r.info.status.name)
+                ray: dict[str, Vector] = {}
+                if r.info.status.name == PRIMAL:
+                    ray = dict(y=np.array(r.y), **form.multipliers(np.array(r.z)))
+                return Solution.without_point(qp, status, r.info.status.name, **ray)
             return Solution(
                 status=status,
                 x=np.array(r.x), y=np.array(r.y), **form.multipliers(np.array(r.z)),

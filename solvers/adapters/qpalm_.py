@@ -23,11 +23,12 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, in_sequence
 
+PRIMAL = "PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {
     "SOLVED": Status.SOLVED,
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
-    "PRIMAL_INFEASIBLE": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "DUAL_INFEASIBLE": Status.INFEASIBLE,
 }  #: anything else is FAILED
 INFINITE = 1e20  #: QPALM's own infinity
@@ -89,9 +90,13 @@ class QPALM:
                 solver.warm_start(*warm.pop())
             solver.solve(asynchronous=False)
             info = solver.info
-            status = CLAIMS.get(_name(qpalm, info.status_val), Status.FAILED)
+            name = _name(qpalm, info.status_val)
+            status = CLAIMS.get(name, Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, info.status)
+                ray: dict[str, Vector] = {}
+                if name == PRIMAL:
+                    ray = from_two_sided(qp, np.array(solver.prim_inf_certificate))
+                return Solution.without_point(qp, status, info.status, **ray)
             x, y = np.array(solver.solution.x), np.array(solver.solution.y)
             return Solution(
                 status=status, x=x, **from_two_sided(qp, y),

@@ -21,10 +21,11 @@ from solvers.common.conversion import (
     positive,
 )
 
+PRIMAL = "infeasible"  #: it comes with a certificate
 CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
-    "infeasible": Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
     "unbounded": Status.INFEASIBLE,
 }  #: anything else (almost_solved, …) is FAILED
 LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
@@ -86,7 +87,8 @@ class QTQP:
             words = r.status.value
             status = CLAIMS.get(words, Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, words)
+                ray = from_one_sided(qp, np.array(r.y)) if words == PRIMAL else {}
+                return Solution.without_point(qp, status, words, **ray)
             return Solution(
                 status=status,
                 x=np.array(r.x), **from_one_sided(qp, np.array(r.y) / scale),

@@ -25,11 +25,12 @@ from solvers.common.conversion import (
 )
 from solvers.common.sequence import Session, in_sequence
 
+PRIMAL = -2  #: it comes with a certificate
 CLAIMS = {
     1: Status.SOLVED,
     2: Status.ITERATION_LIMIT,  # inaccurate, as at the limit
     -1: Status.INFEASIBLE,  # unbounded
-    -2: Status.INFEASIBLE,
+    PRIMAL: Status.INFEASIBLE,
 }  #: anything else is FAILED
 CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
@@ -95,7 +96,9 @@ class SCS:
             info = r["info"]
             status = CLAIMS.get(info["status_val"], Status.FAILED)
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, info["status"])
+                is_primal = info["status_val"] == PRIMAL
+                ray = from_one_sided(qp, r["y"]) if is_primal else {}
+                return Solution.without_point(qp, status, info["status"], **ray)
             return Solution(
                 status=status, x=r["x"], **from_one_sided(qp, r["y"]),
                 iterations=info["iter"], message=info["status"],

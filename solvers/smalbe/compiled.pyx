@@ -484,6 +484,7 @@ def homogenised(Product F, C, x_tilde, q, lb, ub, double norm):
 
 # --- MPRGP and the outer loop -------------------------------------------------------
 
+cdef double NOISE = 1e-13  # part of the terms of a cost that is taken for rounding
 cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
 cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
 cdef double NO_SHIFT = 1e-13  # x̃ of this size relative to ν is rounding of e = 0
@@ -496,6 +497,7 @@ cdef enum:
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
     MOST_IDLE = 2
+    FIRST_LOOK = 500  # steps of a run after which its progress is looked at first
     STD = 0
     PROJCG = 1
     MIXED = 2
@@ -1125,6 +1127,16 @@ cdef class Solver:
             total += x[i] * (g[i] - self.rhs[i])
         return total
 
+    cdef void terms_of_cost(self):
+        """Tell twice the cost at x, and the sum of the absolute values of its terms."""
+        cdef double term, total = 0.0, size = 0.0
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            term = self.x[i] * (self.g[i] - self.rhs[i])
+            total += term
+            size += fabs(term)
+        self.told[0], self.told[1] = total, size
+
     cdef void to(self, double alpha, const double *p, const double *Hp):
         """x ← x − αp, and its face; the gradient follows without a product."""
         cdef bint stored = not self.in_two
@@ -1299,6 +1311,8 @@ cdef class Solver:
                       long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; returns whether it stopped by the stopping test."""
         cdef long idle = 0, inside = 0  # CG steps in this face
+        cdef long look = FIRST_LOOK
+        cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at last look
         cdef int letter
         cdef bint by_model, has_expanded = False
         cdef double chopped = INFINITY
@@ -1317,6 +1331,13 @@ cdef class Solver:
                 return 1
             if len(trace) >= most:
                 return 0
+            least = fmin(least, self.phi_square + self.beta_square)
+            if len(trace) >= look:
+                self.terms_of_cost()
+                if not cost - self.told[0] > NOISE * self.told[1] and 4 * least > before:
+                    return 0
+                before, least, cost = fmin(least, before), INFINITY, self.told[0]
+                look = 2 * len(trace)
             weight = self.reduced_square if self.reduced else self.phi_square
             if self.beta_square > self.Gamma_square * weight:
                 idle = idle + 1 if self.beta_square > chopped / 2 else 0

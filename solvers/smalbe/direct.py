@@ -54,7 +54,7 @@ class Direct:
         linear_solver="dense Cholesky factor, updated as the active set changes",
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
-            "inequality rows are declined: dualise first",
+            "inequality rows are declined; the dual forms of a problem have none",
             f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is the "
             "faster one from about 300 on",
         ),
@@ -65,7 +65,7 @@ class Direct:
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
-            return "takes bounds and equality rows; dualise inequality rows first"
+            return "takes bounds and equality rows, no inequality rows"
         if qp.q.size > LARGEST:
             return f"is for small problems; takes at most {LARGEST} unknowns"
         return needs_dense(qp, 3)

@@ -283,7 +283,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
             break
         tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
         at = _refreshed(problem, at, _penalty(task.rho, tighter * tol))
-    message = "no further progress: rounding, or the cost is unbounded"
+    message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
     point = replace(point, status=Status.ITERATION_LIMIT, message=message)

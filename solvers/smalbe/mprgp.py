@@ -15,6 +15,11 @@ inside) and the projected gradient g^P = φ + β, each step is one of
 Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
 length ᾱ takes beyond a bound.
 
+A run ends, too, when it *stagnates*: over as many steps as it took before these (at
+least `FIRST_LOOK`), the least ‖g^P‖ was not halved and the cost fell by no more than
+the rounding of its terms. Rounding then leaves no direction that is conjugate to those
+before and along which the cost falls.
+
 Every step but projcg's lessens the cost, and by the model τI as much as the rate of the
 book needs. Expansion never frees a component that the
 half step left at a bound, but for the first expansion by a model of directions: from
@@ -51,6 +56,8 @@ Expansion = Literal["std", "projcg", "mixed", "model"]
 #: where from one to the next `MOST_IDLE` times in a row ‖β‖² was not halved
 Proportioning = Literal["cg", "model"]
 MOST_IDLE = 2
+FIRST_LOOK = 500  #: steps of a run after which its progress is looked at first
+NOISE = 1e-13  #: part of the terms of a cost that is taken for rounding
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
 
@@ -138,13 +145,37 @@ class Directions:
         return kernels.less(none, back, *self.p), kernels.less(none, back, *self.Hp)
 
 
+class Progress(NamedTuple):
+    """Progress of a run since it was last looked at, to notice stagnation."""
+
+    least: float = math.inf  #: ‖g^P‖² since then
+    before: float = math.inf  #: the least until then
+    cost: float = math.inf  #: twice the cost then
+
+    def with_gradient(self, square: float) -> Progress:
+        """Take note of ‖g^P‖² at one more point."""
+        return self._replace(least=min(self.least, square))
+
+    def stagnates(self, cost: float, terms: float) -> bool:
+        """Return whether neither the gradient nor the cost, twice, has come down.
+
+        terms : sum of the absolute terms of the cost
+        """
+        falls = self.cost - cost > NOISE * terms
+        return not falls and 4 * self.least > self.before
+
+    def from_here(self, cost: float) -> Progress:
+        """Begin anew at this cost."""
+        return Progress(before=min(self.least, self.before), cost=cost)
+
+
 class Minimum(NamedTuple):
     """Where MPRGP stopped."""
 
     x: Vector
     g: Vector  #: Hx − b
     face: Face
-    stopped: bool  #: by `stop`; False at the step limit, or where no step leads on
+    stopped: bool  #: by `stop`; not at the step limit, nor where no step leads on
     trace: str  #: one letter per step: c, b, e, f, p
     directions: Directions  #: of the last face
 
@@ -215,7 +246,14 @@ def mprgp(
     z_of = precondition(face.free)
     p, stay = known.conjugate(z_of(face.phi)), _Stay(0, face.phi_square)
     idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
+    progress, look = Progress(), FIRST_LOOK
     while not (done := stop(at, face)) and len(trace) < max_steps:
+        progress = progress.with_gradient(face.phi_square + face.beta_square)
+        if len(trace) >= look:
+            terms = inner_products((at.x, at.g - b), (np.abs(at.x), np.abs(at.g - b)))
+            if progress.stagnates(*terms):
+                break
+            progress, look = progress.from_here(terms[0]), 2 * len(trace)
         if _disproportional(task, at, face, B):
             idle = idle + 1 if face.beta_square > chopped / 2 else 0
             chopped = face.beta_square

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.linalg import cho_solve, qr, solve_triangular
 from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -37,6 +37,8 @@ from harness.distributed.factor import (
     DependentRowsError,
     LocalFactor,
     SummedFactor,
+    factor_above,
+    independent_rows,
     local_factor,
     touched_rows,
     with_int32,
@@ -49,6 +51,7 @@ from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
 
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
+INCONSISTENT = 1e-8  #: of x̃ and e, by which rows with a solution may be missed
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
 NO_SHIFT = 1e-13  #: x̃ of this size relative to ν is rounding of e = 0
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
@@ -234,8 +237,12 @@ class _Whole:
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         if self.bordered is not None:
             return self.bordered.solver(~free, shift)
-        held = _gram(self.unit, ~free)
-        factor = self.factor.cholesky(with_int32((1 + shift) * self.matrix - held))
+        of_free, factor = _gram(self.unit, free), None
+        while factor is None:
+            try:
+                factor = self.factor.cholesky(with_int32(of_free + shift * self.matrix))
+            except CholmodNotPositiveDefiniteError:
+                shift = min(100 * shift, 1.0)  # with 1 at last: GGᵀ has a factor
         return lambda t: np.asarray(factor(t))
 
 
@@ -297,7 +304,7 @@ class _OverRanks:
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         with self.local.at.ranks.clocked("coarse"):
             held = self.bounded.summed(~np.asarray(free))
-            return self.local.completed(1 + shift, held)
+            return self.factor.shifted(shift, held)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,7 +372,8 @@ class _Bordered:
         """Return solves with (1 + shift)S − G_H G_Hᵀ."""
         L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
-        schur = cho_factor(scale * (L_cc @ L_cc.T) - self.held(held), lower=True)
+        changed = scale * (L_cc @ L_cc.T) - self.held(held)
+        schur = factor_above(changed, shift, L_cc), True
 
         def solve(t: Vector) -> Vector:
             u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
@@ -512,30 +520,64 @@ def is_sparse(G: Matrix) -> bool:
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """Orthonormalise the rows of G (m, n), as sparse ones where they are many.
 
-    Rows that depend on each other are taken as dense ones.
+    Rows that depend on each other are taken as dense ones. Where these are too many, or
+    on several ranks, as many of them as are independent stand for all.
 
     bounded : (n,) components that have a bound
+    """
+    if not is_sparse(G):
+        return orthonormal_rows(G, e)
+    G = G if isinstance(G, DistributedColumns) else csr_array(G)
+    rows = _factored(G, e, bounded)
+    if rows is not None:
+        return rows
+    m, n = G.shape
+    if isinstance(G, DistributedColumns) or too_large(
+        max(m, n), 3 * min(m, n) / max(m, n)
+    ):
+        return _independent_rows(G, e, bounded)
+    return orthonormal_rows(G, e)
+
+
+def _factored(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
+    """Factorise GGᵀ; None where rows depend on each other."""
+    over_ranks = isinstance(G, DistributedColumns)
+    return (rows_over_ranks if over_ranks else sparse_rows)(G, e, bounded)
+
+
+def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
+    """Take independent rows of G (m, n) for all of them; the others get no multiplier.
 
     Raises
     ------
     ValueError
-        Where dependent rows are too many for that.
+        Where rounding hides which of them are independent.
 
     """
-    if not is_sparse(G):
-        return orthonormal_rows(G, e)
-    if isinstance(G, DistributedColumns):
-        rows = rows_over_ranks(G, e, bounded)
-        if rows is None:
-            raise ValueError("the equality rows depend on each other")
-        return rows
-    rows = sparse_rows(csr_array(G), e, bounded)
-    if rows is not None:
-        return rows
-    m, n = G.shape
-    if reason := too_large(max(m, n), 3 * min(m, n) / max(m, n)):
-        raise ValueError(f"the equality rows depend on each other, and {reason}")
-    return orthonormal_rows(G, e)
+    gram = _gram(G)
+    kept = independent_rows(gram)
+    rows = _factored(G[kept], e[kept], bounded)
+    if rows is None:
+        raise ValueError("the equality rows nearly depend on each other")
+    size = np.sqrt(gram.diagonal())
+    size[size == 0] = 1.0
+    of_kept = rows.multipliers
+
+    def multipliers(a: Vector) -> Vector:
+        y = np.zeros(e.size)
+        y[kept] = of_kept(a)
+        return y
+
+    return replace(
+        rows, G=G, e_size=float(np.linalg.norm(e)), multipliers=multipliers,
+        consistent=_consistent((G @ rows.x_tilde - e) / size, rows.x_tilde, e / size),
+    )  # fmt: skip
+
+
+def _consistent(missed: Vector, x_tilde: Vector, e: Vector) -> bool:
+    """Return whether rows of length one, missed by `missed` (m,), have a solution."""
+    scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e).max(initial=0.0)
+    return bool((np.abs(missed) <= INCONSISTENT * scale).all())
 
 
 def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
@@ -640,12 +682,9 @@ def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
     rank = int((np.abs(np.diag(R)) > RANK).sum())
     C, R, kept = Q[:, :rank].T, R[:rank, :rank], pivot[:rank]
     x_tilde = C.T @ solve_triangular(R, (e / size)[kept], trans="T")
-    mismatch = np.abs(dense @ x_tilde - e) / size
-    scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e / size).max(initial=0.0)
-
     triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
     multipliers = partial(compiled.multipliers, e.size, *triangle)
-    consistent = bool((mismatch <= 1e-8 * scale).all())
+    consistent = _consistent((dense @ x_tilde - e) / size, x_tilde, e / size)
     C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
     pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
     return DenseRows(

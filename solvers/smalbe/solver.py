@@ -43,7 +43,7 @@ class SMALBE(Options):
         phases="preparing orthonormalises rows and runs the Lanczos process",
         sequence="point, multipliers, Ritz pairs, factor of the free block",
         limits=(
-            "inequality rows are declined: dualise first",
+            "inequality rows are declined; the dual forms of a problem have none",
             "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
             "parallel rows, tolerances to 1e-12) 3 ended as `iteration_limit`",
         ),
@@ -53,7 +53,7 @@ class SMALBE(Options):
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
-            return "takes bounds and equality rows; dualise inequality rows first"
+            return "takes bounds and equality rows, no inequality rows"
         return lacking(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:

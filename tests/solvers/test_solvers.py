@@ -128,7 +128,37 @@ def test_a_certificate_is_not_passed_off_as_a_point(name, problem):
     solution = solve(name, problem())
     assert solution.status is Status.INFEASIBLE
     assert np.isnan(solution.x).all()
-    assert np.isnan(solution.z).all()
+    if problem is unbounded:
+        assert np.isnan(solution.z).all()
+        assert np.isnan(solution.z_box).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["osqp", "clarabel", "scs", "piqp", "highs", "qpalm", "qtqp"]
+)
+def test_a_certificate_of_infeasibility_has_our_signs(name):
+    """x₀ + x₁ = −1, −x₀ ≤ −3 and x₁ ≥ −1: of each kind of row one is in its way."""
+    qp = QP(
+        P=csr_array(np.eye(3)), q=np.ones(3), A=csr_array([[1.0, 1, 0]]),
+        b=np.array([-1.0]), G=csr_array([[-1.0, 0, 0], [0, 0, 1]]),
+        h=np.array([-3.0, 5]), lb=np.array([-np.inf, -1, -np.inf]),
+        ub=np.full(3, np.inf),
+    )  # fmt: skip
+    s = solve(name, qp, 1e-6)
+    assert s.status is Status.INFEASIBLE
+    size = np.abs(s.y).max()
+    balance = qp.A.T @ s.y + qp.G.T @ s.z + s.z_box
+    assert s.z == pytest.approx([s.y[0], 0], abs=1e-2 * size)
+    assert s.z_box == pytest.approx([0, -s.y[0], 0], abs=1e-2 * size)
+    assert np.abs(balance).max() <= 1e-2 * size
+    assert qp.b @ s.y + qp.h @ s.z + qp.lb[1] * s.z_box[1] < 0
+
+
+def test_the_certificate_of_proxqp_has_our_signs():
+    s = solve("proxqp", infeasible(), 1e-6)
+    assert s.status is Status.INFEASIBLE
+    assert s.z[0] == pytest.approx(s.z[1])
+    assert s.z[0] > 0
 
 
 @pytest.mark.parametrize(("name", "library"), LIBRARIES.items())

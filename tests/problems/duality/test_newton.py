@@ -1,6 +1,7 @@
 """Newton's method at finite strain with contact: orders, convexity, load steps."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -142,6 +143,138 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
     assert clipped[-1] > 0
 
 
+@pytest.fixture(scope="module")
+def equilibrium():
+    """A path, its last configuration and the multipliers (places,) there."""
+    path = patch_path(contact="nts")
+    last = path.iterations(1)[-1]
+    lam = path._at_places(last)
+    at = path._configuration(last.answer.x, last.load_factor, last.gaps)
+    assert path.residual(at, lam, 1.0) <= newton.SETTLED
+    assert lam.min() >= 0
+    return path, at, lam
+
+
+def test_the_residual_holds_the_largest_penetration(equilibrium):
+    path, at, lam = equilibrium
+    gap = at.gap.copy()
+    open_row = int(np.argmin(lam[at.rows.place]))
+    gap[open_row] = -0.25
+    free = lam.copy()
+    free[at.rows.place[open_row]] = 0.0  # no multiplier: it is no gap under one
+    balanced = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
+    assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
+
+
+def test_the_residual_holds_gaps_under_multipliers_by_their_share(equilibrium):
+    path, at, lam = equilibrium
+    row, other = 0, 1
+    pressing = np.zeros_like(lam)
+    pressing[at.rows.place[row]], pressing[at.rows.place[other]] = 2.0, 0.5
+    gap = np.zeros_like(at.gap)
+    r = -(at.rows.B.T @ pressing[at.rows.place])
+    for apart, of in ((0.3, row), (0.3, other)):
+        at_gap = gap.copy()
+        at_gap[of] = apart
+        share = pressing[at.rows.place[of]] / 2.0
+        found = path.residual(at._replace(gap=at_gap, r=r), pressing, 1.0)
+        assert found == pytest.approx(0.3 * share, rel=1e-9)
+
+
+def test_the_residual_without_contact_forces_is_that_of_the_load(equilibrium):
+    """‖r‖ over the load; r on supports does not count."""
+    path, at, lam = equilibrium
+    load, held = path.bodies.f, path.bodies.B_D.indices
+    r = 0.125 * load
+    r[held] = 1e6
+    found = path.residual(at._replace(gap=0 * at.gap, r=r), 0 * lam, 1.0)
+    free = np.delete(np.arange(r.size), held)
+    expected = 0.125 * np.linalg.norm(load[free]) / np.linalg.norm(load[free])
+    assert found == pytest.approx(expected, rel=1e-12)
+    twice = path.residual(at._replace(gap=0 * at.gap, r=r), 0 * lam, 2.0)
+    assert twice == pytest.approx(expected / 2, rel=1e-12)
+
+
+class OneUnknown(newton.NewtonPath):
+    """A line search whose energies and gaps are tables over u."""
+
+    def _configuration(self, u, load_factor, gaps):
+        energy, gap = self.reference[float(u[0])]
+        return configuration(u[0], energy, gap)
+
+    def residual(self, at, lam, load_factor):
+        return 1.0
+
+
+def configuration(u, energy, gap):
+    return newton.Configuration(
+        u=np.array([float(u)]), rows=None, gap=np.array([gap]),
+        cells=SimpleNamespace(energy=0.0), energy=energy, r=np.array([-1.0]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("table", "length"),
+    [
+        # slope −1 − 2·½ = −2 from a merit of 0 + 2·½: 1 − 2e-4 is enough at length 1
+        ({1.0: (-2.1e-4, -0.5)}, 1.0),
+        ({1.0: (-1.9e-4, -0.5), 0.5: (-1.1e-4, -0.5)}, 0.5),
+        ({1.0: (-1.9e-4, -0.5), 0.5: (-0.9e-4, -0.5), 0.25: (-1e-4, -0.5)}, 0.25),
+        # energy may grow where penetration, times its weight, falls by more
+        ({1.0: (0.9, 0.0)}, 1.0),
+        ({1.0: (0.9, -0.1), 0.5: (0.5, -0.2)}, 0.5),
+        # a gap that opens gains nothing
+        ({1.0: (1.1, 5.0), 0.5: (0.9, 0.5)}, 0.5),
+    ],
+)
+def test_a_step_has_to_bring_its_share_of_the_predicted_decrease(table, length):
+    path = OneUnknown(bodies=None, cells=None, gaps=None, reference=table)
+    posed = SimpleNamespace(
+        load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
+    )
+    start = configuration(0.0, 0.0, -0.5)
+    at, taken, _ = path._moved(start, posed, np.zeros(1), weight=2.0, best=1.5)
+    assert taken == length
+    assert at.u[0] == length
+
+
+def test_a_full_step_that_halves_the_least_residual_is_taken_whatever_it_costs():
+    table = {1.0: (9.0, -3.0), 0.5: (-9.0, 0.0)}
+    path = OneUnknown(bodies=None, cells=None, gaps=None, reference=table)
+    posed = SimpleNamespace(
+        load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
+    )
+    start = configuration(0.0, 0.0, -0.5)
+    for best, length in ((2.0, 1.0), (1.99, 0.5)):
+        _, taken, _ = path._moved(start, posed, np.zeros(1), weight=2.0, best=best)
+        assert taken == length
+
+
+def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
+    """The penalty function is exact for weights above ‖λ‖∞, and the last stay."""
+    seen, move = [], newton.NewtonPath._moved
+
+    def spied(self, at, posed, lam, weight, best):
+        seen.append((lam.max(), weight))
+        return move(self, at, posed, lam, weight, best)
+
+    monkeypatch.setattr(newton.NewtonPath, "_moved", spied)
+    plane_path().iterations(1)
+    largest = np.maximum.accumulate([most for most, _ in seen])
+    weights = np.array([weight for _, weight in seen])
+    assert (largest > 0).all()
+    assert weights == pytest.approx(1.5 * largest, rel=1e-12)
+
+
+def test_a_load_is_settled_by_a_full_step_to_equilibrium_and_no_earlier():
+    path = plane_path()
+    *before, last = path.iterations(1)
+    assert last.length == 1
+    assert last.residual <= 2e-9
+    assert before
+    assert all(i.length < 1 or i.residual > 1e-9 for i in before)
+
+
 def test_a_load_step_that_fails_comes_in_parts(monkeypatch):
     whole = ring_path(steps=1)
     expected = whole.iterations(1)[-1].answer.x
@@ -180,6 +313,19 @@ def test_an_impossible_load_says_where_it_stopped(monkeypatch):
         r"cell \d+ is inverted: det F = .*; expected a smaller load",
     ):
         path.iterations(1)
+
+
+def test_a_load_lost_in_rounding_is_to_be_larger_and_one_beyond_all_smaller(
+    monkeypatch,
+):
+    """A tiny load has an equilibrium, that of linear elasticity; F does not show it."""
+    monkeypatch.setattr(newton, "HALVINGS", 0)
+    monkeypatch.setattr(newton, "MOST_ITERATIONS", 5)
+    with pytest.raises(InputError, match=r"expected a larger load, or kinematics=lin"):
+        plane_path(load=1e-3).iterations(1)
+    monkeypatch.setattr(newton, "MOST_ITERATIONS", 1)
+    with pytest.raises(InputError, match=r"expected a smaller load"):
+        plane_path(load=9.0).iterations(1)  # no other test has kept its iterations
 
 
 def test_an_iteration_that_is_not_there_is_refused():

@@ -212,4 +212,5 @@ def test_a_material_that_softens_is_refused_where_it_does():
 def test_there_is_no_refined_case_at_finite_strain():
     for family, own in CASES.values():
         given = {**own, "kinematics": "finite"}
-        assert family.refined(family.complete(given)) is None
+        with pytest.raises(InputError, match="expected kinematics=linear"):
+            family.refined(family.complete(given))

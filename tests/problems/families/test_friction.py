@@ -64,6 +64,30 @@ def test_a_bound_that_nothing_reaches_glues_the_flanks_as_well():
     assert found["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
     assert found["slip"] == 0
     assert found["stick"] == found["active"]
+    assert found["sliding_without_contact"] > 0
+    assert found["open"] < found["contact_rows"] - found["active"]
+
+
+def test_shear_that_tresca_grants_without_contact_is_counted_apart():
+    """Every row of the arc is open, sticks, slips, or slides without contact."""
+    case, s, found = solved("beam-ring/steps=1/friction=tresca/bound=1e6/dual")
+    friction, rows = case.mechanics.friction, found["contact_rows"]
+    states = ("open", "stick", "slip", "sliding_without_contact")
+    assert sum(found[name] for name in states) == friction.bound.size
+
+    z = case.mechanics.back(s).z
+    shear, pressed = np.abs(z[rows:]), z[:rows] > 1e-6 * z[:rows].max()
+    apart = ~pressed[friction.row] & (shear > 1e-6 * np.abs(z).max())
+    assert found["sliding_without_contact"] == apart.sum() > 0
+    share = shear[apart].sum() / shear.sum()
+    assert found["shear_without_contact"] == pytest.approx(share)
+    assert 0 < share < 1
+
+
+def test_coulomb_grants_no_shear_without_contact():
+    _, _, found = solved("beam-ring/steps=1/friction=coulomb/mu=0.3/dual")
+    assert found["sliding_without_contact"] == 0
+    assert found["shear_without_contact"] == 0
 
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
@@ -164,6 +188,28 @@ def test_a_block_on_an_incline_slips_at_its_limit():
     assert across / -onto == pytest.approx(0.3, abs=1e-3)
     with pytest.raises(InputError, match="no equilibrium was found with the"):
         block_on_incline(limit + 4e-4, COULOMB)
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
+    """The block of length 1 m carries at most its bound times that, from the law."""
+    across = (0.2 - 0.1) / np.hypot(1, 0.1) * WEIGHT
+    law = FrictionLaw("tresca", bound=share * across)
+    if share > 1:
+        found = block_on_incline(0.2, law)
+        got = found.quantities(reference_solution(found.qp))["contact_force"]
+        assert abs(got[0]) == pytest.approx(across, rel=1e-6)
+        return
+    told = r"friction cannot hold the load; within .* nothing balances 0\.\d\d% of it"
+    with pytest.raises(InputError, match=told):
+        block_on_incline(0.2, law)
+
+
+def test_the_limit_of_coulomb_is_refused_in_the_same_words():
+    with pytest.raises(
+        InputError, match=r"no equilibrium .* friction cannot hold the load; expected"
+    ):
+        block_on_incline(0.412371 + 4e-4, COULOMB)
 
 
 def test_loads_are_balanced_where_friction_may_hold_them():

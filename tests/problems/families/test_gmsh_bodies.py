@@ -17,7 +17,7 @@ from problems.models.beam_ring import model
 from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
-from tests.support import ROOT
+from tests.support import ROOT, press
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -521,7 +521,8 @@ def bent(points):
          " in the .geo file, or gmsh -2 -order 1"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3] * 2]}, {}, {}, 16),
          "cells of type quad8; expected cells of first order: Mesh.ElementOrder = 1"),
-        (lambda p, c: (p, {"a": c}, {}, {}, 4), "cells of type tetra; expected plane"),
+        (lambda p, c: (p, {"a": c}, {}, {}, 4), "cells of type tetra; three dimensions "
+         "are not supported yet: expected plane bodies, gmsh -2"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
          ' named surface: Physical Surface("NAME") in the .geo file'),
@@ -660,3 +661,39 @@ def test_a_pair_may_lack_the_friction_that_the_others_have(described):
     qp = build(f"{name}/friction=coulomb/mu=1/dual-bounds").qp
 
     assert np.isinf(qp.ub).all()
+
+
+def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described):
+    """A tetrahedron; and a surface that is not plane."""
+    nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    solid = msh22(nodes, {"block": np.array([[0, 1, 2, 3]])}, {}, {}, quad_type=4)
+    bent = POINTS + np.outer(POINTS[:, 0] ** 2, [0, 0, 1])
+    for mesh, what in (
+        (solid, "cells of type tetra"),
+        (msh22(bent, *parts()), "plane"),
+    ):
+        described(mesh)
+        with pytest.raises(
+            InputError, match=f"{what}; three dimensions are not supported yet"
+        ):
+            described_bodies(Path("a.toml"), "strain")
+
+
+def test_contact_forces_of_several_pairs_are_told_pair_by_pair(tmp_path):
+    """2 MN/m pass through a disc: each of its two contacts bears all of it."""
+    case = build(f"bodies:{press.described(tmp_path)}/dual")
+    found = case.quantities(reference_solution(case.qp))
+
+    assert "contact_force" not in found
+    assert [pair["force"]["disc"][1] for pair in found["contacts"].values()] == (
+        pytest.approx([2e6, -2e6], rel=1e-6)
+    )
+
+
+def test_the_contact_force_of_one_pair_is_its_force_on_the_master(described):
+    case = build(described() + "/step=1/dual")
+    found = case.quantities(reference_solution(case.qp))
+
+    assert found["contact_force"] == pytest.approx(
+        found["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
+    )

@@ -327,3 +327,25 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, told):
 
     assert told in str(e.value)
     assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
+def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(ratio):
+    """Even arcs must not wind around it: K would be indefinite."""
+    params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
+    bodies, exact = two_cylinders(params)
+    assert exact.a > 4 * 0.008
+    x, y = np.moveaxis(bodies.mesh.points[bodies.mesh.cells], -1, 0)
+    area = 0.5 * (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
+    half_discs = np.pi * 0.008**2
+
+    assert area.min() > 0
+    assert 0.7 * half_discs < area.sum() < half_discs
+
+
+def test_a_cylinder_on_a_very_soft_one_is_solved():
+    case = parse("hertz-cylinder/n=3/m=2/ratio=1e-9/dual", PROBLEMS)
+    built = case.build(reference_solution)
+    answer = SMALBE().prepare(built.qp, 1e-8)()
+
+    assert kkt_residuals(built.qp, answer).worst < 1e-7

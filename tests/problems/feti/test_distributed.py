@@ -1,8 +1,11 @@
 """Who forms the blocks of which kind."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import numpy as np
 
-from problems.feti.distributed import AFTER_FACTOR, Forming, forming, meanwhile
+from problems.feti.distributed import AFTER_FACTOR, Forming, Halo, forming, meanwhile
 
 
 def loads(work):
@@ -73,3 +76,18 @@ def test_nobody_gets_more_to_do_than_who_gives_it_away():
             whole[task.factor] += work[task.factor][name]
         assert set(tasks) == set().union(*work)
         assert loads(work).max() <= whole.max()
+
+
+def test_what_several_neighbours_return_for_one_row_is_added_up():
+    """Row 0 was lent to both neighbours, rows 2 and 1 to one each."""
+    arriving = np.array([1.0, 10.0, 100.0, 1000.0])
+    at = Halo(
+        ranks=SimpleNamespace(
+            clocked=lambda name: nullcontext(),
+            exchange=lambda *what: lambda: arriving,
+        ),
+        rows=np.arange(3), own=np.arange(3), lent=np.array([0, 2, 0, 1]),
+        borrowed=np.zeros(0, dtype=np.int64), lends=np.array([0, 2, 2]),
+        borrows=np.zeros(3, dtype=np.int64),
+    )  # fmt: skip
+    assert at.added(np.array([0.5, 0.25, 0.125])).tolist() == [101.5, 1000.25, 10.125]

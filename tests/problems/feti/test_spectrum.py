@@ -70,6 +70,22 @@ def test_errors_of_ritz_values_come_from_the_last_entries_of_their_vectors() -> 
     assert found.condition_error == pytest.approx(6 * (errors[0] + errors[1] / 6))
 
 
+@pytest.mark.parametrize(
+    ("errors", "is_within"),
+    [
+        ((0.01, 0.1), True),
+        ((0.02, 0.0), False),
+        ((0.0, 0.2), False),
+        ((0.0, 0.0), True),
+    ],
+)
+def test_both_errors_are_held_against_their_own_eigenvalue(
+    errors: tuple[float, float], is_within: bool
+) -> None:
+    """1 % of the eigenvalues 1 and 10 are 0.01 and 0.1."""
+    assert Spectrum(1.0, 10.0, *errors, 7).within(0.01) is is_within
+
+
 @pytest.mark.parametrize("rows", ["orthonormal", "chain", "redundant"])
 def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
     _, _, pair = torn_pair(rows)

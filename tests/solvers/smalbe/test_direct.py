@@ -156,5 +156,5 @@ def test_it_says_what_it_declines():
     )  # fmt: skip
 
     assert str(LARGEST) in DIRECT.declines(large)
-    assert "dualise" in DIRECT.declines(rows)
+    assert "no inequality rows" in DIRECT.declines(rows)
     assert DIRECT.declines(box_qp(np.eye(2), [1, 1], 0)) is None

@@ -107,13 +107,54 @@ def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
     assert len(rows.C) == 9
 
 
-def test_rows_that_depend_and_are_too_many_are_a_reason(G, e, monkeypatch):
+def test_of_dependent_rows_that_are_too_many_some_stand_for_all(G, e, monkeypatch):
     monkeypatch.setattr(module, "MOST_DENSE", 0)
     monkeypatch.setattr(module, "too_large", lambda n, copies: "too large")
-    twice = csr_array(np.vstack([G.toarray(), G.toarray()[3:4]]))
+    dependent = np.vstack(
+        [G.toarray(), G.toarray()[1] - 2 * G.toarray()[3], np.zeros(40)]
+    )
+    right = np.append(e, [e[1] - 2 * e[3], 0.0])
+    rows = equality_rows(csr_array(dependent), right, ALL)
 
-    with pytest.raises(ValueError, match="depend on each other"):
-        equality_rows(twice, np.append(e, e[3]), ALL)
+    assert isinstance(rows, SparseRows)
+    assert len(rows.C) == 9
+    assert rows.consistent
+    assert dependent @ rows.x_tilde == pytest.approx(right, abs=1e-12)
+    a = np.random.default_rng(SEED).normal(size=9)
+    assert dependent.T @ rows.multipliers(a) == pytest.approx(rows.C.T @ a, abs=1e-12)
+    right[9] += 1
+    assert not equality_rows(csr_array(dependent), right, ALL).consistent
+
+
+@pytest.mark.parametrize("border", [True, False], ids=["border", "whole"])
+@pytest.mark.parametrize("shift", [1e-6, 1e-10, 1e-14])
+def test_a_motion_that_held_components_alone_feel_leaves_a_factor(
+    monkeypatch, border, shift
+):
+    """Free components: rows of integers, of which one is the sum of two others.
+
+    It differs from that sum in held components alone, and there by as little as the
+    rounding of G_H G_Hᵀ. A right-hand side G_F v has a solution whatever the shift.
+    """
+    if not border:
+        monkeypatch.setattr(module, "MOST_BORDER", 0)
+    rng = np.random.default_rng(7)
+    free = rng.integers(-3, 4, size=(12, 40)).astype(float)
+    free[11] = free[0] + free[5]
+    held = np.zeros((12, 4))
+    held[11] = 1e-5 * np.arange(1, 5)
+    held[0, 0] = held[5, 1] = 7.0
+    dense = np.hstack([held, free])
+    bounded = np.arange(44) < 4
+    rows = sparse_rows(csr_array(dense), dense @ np.ones(44), bounded)
+    assert rows is not None
+    on_face = np.arange(44) >= 4
+    unit = dense / np.linalg.norm(dense, axis=1)[:, None]
+    t = unit[:, on_face] @ rng.normal(size=40)
+    y = rows.gram.in_face(on_face, shift)(t)
+    G_F = unit[:, on_face]
+    missed = G_F @ (G_F.T @ y) + shift * (unit @ (unit.T @ y)) - t
+    assert np.abs(missed).max() <= 1e-6 * np.abs(t).max()
 
 
 @pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])

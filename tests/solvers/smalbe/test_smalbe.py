@@ -11,6 +11,7 @@ from harness import QP, Status, kkt_residuals, no_rows
 from problems import PROBLEMS
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
+from solvers.smalbe import driver
 from solvers.smalbe.mprgp import Rules
 from solvers.smalbe.outer_loop import Constants, InnerSolver, first_iterate, smalbe
 from solvers.smalbe.projected import by_lanczos, projected_problem
@@ -281,6 +282,32 @@ def test_too_few_steps_are_not_called_solved(dual):
     assert "step limit" in s.message
 
 
+@pytest.mark.parametrize("is_compiled", [True, False])
+@pytest.mark.parametrize("bounds", [False, True])
+@pytest.mark.parametrize("orders", [6, 9])
+def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
+    orders, bounds, is_compiled, monkeypatch
+):
+    """No point has the residual that is asked for; eigenvalues 1 … 10^orders."""
+    loop = partial(driver.outer_loop, is_compiled=is_compiled)
+    monkeypatch.setattr(driver, "outer_loop", loop)
+    rng, n = np.random.default_rng(1), 60
+    Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    P = (Q * np.logspace(0, orders, n)) @ Q.T
+    qp = QP(
+        P=(P + P.T) / 2, q=rng.standard_normal(n), A=no_rows(n), b=np.zeros(0),
+        G=no_rows(n), h=np.zeros(0), ub=np.full(n, np.inf),
+        lb=np.where(np.arange(n) % 3 == 0, 0.0 if bounds else -np.inf, -np.inf),
+    )  # fmt: skip
+    s = SMALBE(lanczos_steps=5).prepare(qp, 1e-300)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.counts["P_products"] <= 10_000
+    worst = kkt_residuals(qp, s).worst
+    assert 0 < worst <= 10.0 ** (orders - 16)
+    assert f"stagnated at residual {worst:.1e}" in s.message
+
+
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_M_shrinks_while_the_lagrangian_grows_too_little(dual, seed):
     """And at no other time; checked from the recorded L, ‖Cν‖ and M."""
@@ -386,7 +413,7 @@ def test_the_power_method_stops_at_its_tolerance():
 def test_inequality_rows_are_declined_with_a_way_out(manufactured):
     qp, _ = manufactured("inequalities")
 
-    assert "dualise" in SMALBE().declines(qp)
+    assert "no inequality rows" in SMALBE().declines(qp)
 
 
 @pytest.mark.parametrize("exponent", [-30, 30])

@@ -6,8 +6,10 @@ import pytest
 from harness import Status, kkt_residuals
 from problems import PROBLEMS
 from solvers.reference.solve import reference_solution
+from solvers.smalbe import rows as rows_module
 from solvers.smalbe.rows import SparseRows, equality_rows
 from solvers.smalbe.solver import SMALBE
+from tests.support.held_by_contact import torn_disc_between_plates
 
 pytestmark = pytest.mark.together
 
@@ -74,3 +76,28 @@ def test_a_sequence_is_warm():
     assert sum(s.counts["P_products"] for s in warm) < sum(
         s.counts["P_products"] for s in cold
     )
+
+
+@pytest.mark.parametrize("basis", ["standard", "dual"])
+@pytest.mark.parametrize("parts", [4, 20])
+def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
+    """As on ranks, with sparse rows: G_F G_Fᵀ has an eigenvalue that is rounding."""
+    monkeypatch.setattr(rows_module, "MOST_DENSE", 0)
+    qp = torn_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
+    assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
+    s = SMALBE().prepare(qp, 1e-8)()
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 1e-7
+
+
+def test_a_solve_that_rounding_stops_ends():
+    """Moduli 10⁸ apart: CG finds no direction any more that is conjugate to others."""
+    given = {"n": 6, "pattern": "checkerboard", "jump": 1e8}
+    plate = PROBLEMS["plate"]
+    qp = plate.build("dual", plate.complete(given), reference_solution).qp
+    s = SMALBE().prepare(qp, 1e-9)()
+    assert s.counts["P_products"] <= 5000
+    if s.status is Status.SOLVED:
+        assert kkt_residuals(qp, s).worst <= 1e-8
+    else:
+        assert "stagnated at residual" in s.message

@@ -1,0 +1,80 @@
+"""Local problems of torn bodies against dense algebra with the stored stiffness."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag, null_space
+
+from problems.feti.substructures import LocalProblems
+from tests.support.torn_bodies import torn_pair
+
+
+@pytest.fixture(scope="module")
+def parts() -> LocalProblems:
+    """The beam on its ring in subdomains of 4² cells at most."""
+    return LocalProblems(torn_pair(most=8)[2])
+
+
+def dense(parts: LocalProblems) -> np.ndarray:
+    torn = parts.torn
+    return np.asarray(block_diag(*(torn.kinds[k].K.toarray() for k in torn.kind)))
+
+
+def test_a_solve_takes_the_rigid_part_from_forces_and_from_motions(
+    parts: LocalProblems,
+) -> None:
+    """PK⁺Pb is the pseudoinverse of PKP, for forces with resultants too."""
+    K, R = dense(parts), parts.kernel.toarray()
+    rng = np.random.default_rng(8)
+    b = rng.standard_normal(len(K)) + 1e3 * (R @ rng.standard_normal(R.shape[1]))
+    found = parts.solve(b)
+
+    balanced = b - R @ np.linalg.lstsq(R, b, rcond=None)[0]
+    assert_allclose(K @ found, balanced, atol=1e-9 * np.abs(balanced).max())
+    assert np.abs(R.T @ found).max() <= 1e-9 * np.abs(found).max()
+
+
+def test_a_subdomain_without_force_stays_where_it_is(parts: LocalProblems) -> None:
+    start = parts.torn.domains.start
+    b = np.zeros(start[-1])
+    b[start[1] : start[2]] = np.random.default_rng(9).standard_normal(
+        start[2] - start[1]
+    )
+    found = parts.solve(b)
+    assert found[start[1] : start[2]].any()
+    assert not found[: start[1]].any()
+    assert not found[start[2] :].any()
+
+
+def test_the_kernel_is_that_of_the_stiffness(parts: LocalProblems) -> None:
+    """Three motions of each subdomain, and these span the null space of its K."""
+    R, start = parts.kernel.toarray(), parts.torn.domains.start
+    assert R.shape[1] == 3 * (start.size - 1)
+    own = slice(start[0], start[1])
+    N = null_space(dense(parts)[own, own], rcond=1e-10)
+    assert N.shape[1] == 3
+    assert_allclose(N @ (N.T @ R[own]), R[own], atol=1e-9)
+
+
+def test_weights_are_traces_of_nodal_blocks_and_diagonals_those_of_the_whole(
+    parts: LocalProblems,
+) -> None:
+    K, T = dense(parts), parts.spread.toarray()
+    trace = K.diagonal().reshape(-1, 2).sum(axis=1)
+    assert_allclose(parts.weight, np.repeat(trace, 2))
+    at = np.flatnonzero(T.any(axis=0))[::7]
+    assert_allclose(parts.diagonal(at), (T.T @ K @ T).diagonal()[at])
+
+
+def test_a_product_takes_the_rigid_part_from_both_sides(parts: LocalProblems) -> None:
+    K, R = dense(parts), parts.kernel.toarray()
+    rng = np.random.default_rng(10)
+    v = rng.standard_normal(len(K)) + 10 * (R @ rng.standard_normal(R.shape[1]))
+    P = np.eye(len(K)) - R @ np.linalg.pinv(R)
+    expected = P @ (K @ (P @ v))
+    for precision in (np.float64, np.longdouble):
+        found = parts.product(v.astype(precision))
+        assert found.dtype == precision
+        assert_allclose(
+            found.astype(float), expected, atol=1e-11 * np.abs(expected).max()
+        )
