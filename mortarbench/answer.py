@@ -1,4 +1,4 @@
-"""One solver on one case, once: its answer, measured in a process and judged."""
+"""One answer to one case: of a solver, measured in a process, or from elsewhere."""
 
 from __future__ import annotations
 
@@ -10,31 +10,48 @@ from functools import partial
 from html import escape
 from pathlib import Path
 from sys import stderr
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from harness import Fields, Record, Residuals, Solution, Verdict
+import numpy as np
+
+from harness import QP, Fields, Record, Residuals, Solution, Solver, Verdict
 from harness.distributed.mpi import ranks_asked
 from harness.environment.environment import digest
 from harness.errors import InputError
-from harness.names import assemble, emitted_by_ranks, parse
-from harness.processes.measurement import measured_once, single_worker
+from harness.names import assemble, emitted_by_ranks
+from harness.processes.measurement import (
+    measured_once,
+    scratch_folder,
+    single_worker,
+)
+from harness.processes.solver_file import write_solver
+from harness.processes.termination import ended_by_signals
+from harness.qp import Vector, numeric_vector
 from harness.record import finite
-from harness.registry import PluginFile, SolverSpec, options_of, resolve
+from harness.registry import SolverSpec, check_solver, options_of, resolve
 from harness.solution import History
+from harness.verify.kkt import allowed, kkt_residuals, verdict
+from harness.verify.multipliers import with_multipliers
+from harness.verify.optimum import decided, proves
 from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.arguments import (
     GRIDS,
     PICTURES,
     drawn_scale,
+    solver_options,
     tolerance,
     writable,
 )
-from mortarbench.case import Case, built_case
-from mortarbench.registries import Plugins, Registries, known, one_thread
+from mortarbench.case import Case, as_case, built_case
+from mortarbench.registries import TURN, Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from harness.crossval.discretisation import Discretisation
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -45,6 +62,7 @@ class Answer:
     record: Record  #: the measurement, as a line of a journal
     solution: Solution | None  #: point and claim; None where the process ended
     spec: SolverSpec
+    solver: str | Solver  #: as given to `solve`: a name or an object
     defaults: Mapping[str, Any]  #: options that the solver has if none are given
 
     @property
@@ -87,6 +105,21 @@ class Answer:
         history = finite(plain(self.history))
         return {**json.loads(self.record.to_json()), "history": history}
 
+    def mesh_error(self, budget: float = 60.0) -> Discretisation:
+        """Estimate the error of the mesh, to which that of the solver adds.
+
+        Solves the case on finer meshes by the reference, not by the solver.
+
+        budget : s; a mesh that would take longer than what is left is not begun
+        """
+        from harness.crossval.discretisation import discretisation_errors
+
+        with TemporaryDirectory() as folder:
+            (found,) = discretisation_errors(
+                [self.case.id], self.case.registries.reference, Path(folder), budget
+            )
+        return found
+
     def fields(self) -> Fields:
         """Give the deformed bodies.
 
@@ -100,13 +133,16 @@ class Answer:
             raise InputError(f"no picture: {self.record.solver} returned no point")
         return self.case.fields(self.solution)
 
-    def plot(self, path: str | Path | None = None, *, scale: float = 1.0) -> Figure:
+    def plot(
+        self, path: str | Path | None = None, *, scale: float | None = None
+    ) -> Figure:
         """Draw the deformed bodies with their stresses, and each contact enlarged.
 
         Of half planes, which have no ends, the tractions between them.
 
         path : of a file to write, too: .png, .pdf or .svg
-        scale : of the displacement, as drawn
+        scale : of the displacement, as drawn; None: 1 where that can be seen, else a
+            round factor that the title states
 
         Raises
         ------
@@ -118,7 +154,8 @@ class Answer:
         from reports.figures.tractions import traction_figure
         from reports.render.saving import draw, save
 
-        fields, drawn = self.fields(), drawn_scale(scale)
+        fields = self.fields()
+        drawn = None if scale is None else drawn_scale(scale)
         figure = (
             deformed_figure(fields, drawn)
             if len(fields.cells) else traction_figure(fields)
@@ -126,7 +163,7 @@ class Answer:
         if figure is None:
             raise InputError("no bodies and no tractions: there is no picture")
         if path is not None:
-            save(figure, writable(Path(path), PICTURES))
+            save(figure, writable(path, PICTURES))
         return draw(figure)
 
     def save_vtu(self, path: str | Path) -> Path:
@@ -141,7 +178,7 @@ class Answer:
         """
         from reports.export.vtu import write_series, write_vtu
 
-        path, fields = writable(Path(path), GRIDS), self.fields()
+        path, fields = writable(path, GRIDS), self.fields()
         if not len(fields.cells):
             raise InputError(f"{path}: {self.case.name} has no bodies to write")
         if path.suffix == ".vtu":
@@ -153,8 +190,8 @@ class Answer:
             case_id = assemble(self.case.id.family, params, self.case.form)
             earlier = solve(
                 built_case(case_id, self.case.registries),
-                self.spec.name,
-                tol=self.record.tol,
+                self.solver,
+                self.record.tol,
                 options=self.spec.options,
             )
             if not earlier.has_point:
@@ -175,53 +212,54 @@ class Answer:
         return f"<table>{''.join(rows)}</table>"
 
 
+@TURN
+@ended_by_signals()
 def solve(
-    case: Case | str,
-    solver: str,
-    *,
+    case: Case | QP | str,
+    solver: str | Solver,
     tol: float = 1e-8,
+    *,
     options: Mapping[str, Any] | None = None,
     plugins: Plugins = (),
     ranks: int = 1,
+    **more: Any,
 ) -> Answer:
     """Run one solver on one case, once, in a process of its own, and judge its answer.
 
+    A solver that is an object is copied into that process by cloudpickle. Its class may
+    stand in a notebook, a script or a module; what it refers to must allow pickling: no
+    open files, locks or handles of a C library in its attributes.
+
     Parameters
     ----------
-    case : what `build` returned, or a name
-    solver : a name of `solvers`
+    case : a case of `build`, its name, or a QP
+    solver : a name of `solvers`, or an object with the methods `declines` and `prepare`
     tol : relative KKT accuracy asked for
-    options : of the solver, that differ from its defaults. A solver that can tell of
-        its iterations does, unless they say ``history = False``
+    options : of the solver, where they differ from its defaults. A solver that records
+        its iterations does, unless they contain ``history = False``
     plugins : Python files with more solvers or families
     ranks : processes of MPI that solve it together
+    more : further options of the solver
 
     Raises
     ------
     InputError
-        When there is no such case, solver or option, or the case cannot be built; when
-        ranks are asked for and there is no MPI.
+        When there is no such case, solver or option, the case cannot be built, or the
+        solver cannot be copied; when ranks are asked for and there is no MPI.
 
     """
-    tolerance(tol)
-    if isinstance(case, str):
-        registries = known(plugins)
-        case = Case(id=parse(case, registries.families), registries=registries)
-    else:
-        registries = case.registries
-        held = {file.resolved() for file in registries.files}
-        asked = map(PluginFile.of, plugins)
-        registries = registries.with_files(
-            [file for file in asked if file.resolved() not in held]
-        )
+    tol = tolerance(tol)
+    options = {**solver_options(options), **more}
+    check_solver(solver)
+    problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")
-    with answers_of(solver, registries, options, ranks=ranks) as answer:
-        return answer(case, tol)
+    with answers_of(solver, problem.registries, options, ranks=ranks) as answer:
+        return answer(problem, tol)
 
 
 @contextmanager
 def answers_of(
-    solver: str,
+    solver: str | Solver,
     registries: Registries,
     options: Mapping[str, Any] | None = None,
     *,
@@ -241,16 +279,20 @@ def answers_of(
         When there is no such solver or option.
 
     """
-    given = dict(options or {})
-    spec = SolverSpec(name=solver, label=solver, options=given).on(ranks)
-    configured = resolve(spec, registries.solvers)
-    plainly = SolverSpec(name=solver, label=solver)
-    defaults = options_of(resolve(plainly, registries.solvers))
+    given = solver_options(options)
+    if isinstance(solver, str):
+        name, solvers = solver, registries.solvers
+    else:
+        name = type(solver).__name__
+        solvers = {name: solver}
+    spec = SolverSpec(name=name, label=name, options=given).on(ranks)
+    configured = resolve(spec, solvers)
+    defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
     if options_of(configured).get("history") is False and "history" not in given:
         # what telling costs is not at stake where nothing is compared
         defaults = {**defaults, "history": True}
         spec = replace(spec, options={**given, "history": True})
-        configured = resolve(spec, registries.solvers)
+        configured = resolve(spec, solvers)
     environment = digest(registries.environment())
 
     def answer(case: Case, tol: float) -> Answer:
@@ -269,14 +311,98 @@ def answers_of(
                 emits=emits, evaluates=emits and registries.hold_own_code_only(),
             )  # fmt: skip
         return Answer(
-            case=case, record=record, solution=solution, spec=spec, defaults=defaults
-        )
+            case=case, record=record, solution=solution, spec=spec, solver=solver,
+            defaults=defaults,
+        )  # fmt: skip
 
-    command = registries.worker_command(spec)
     work = None
     if forks and ranks == 1:
         from harness.processes.worker import serve  # late: few need it here
 
         work = partial(serve, configured)
-    with single_worker(command, work) as worker:
-        yield answer
+    with scratch_folder() as scratch:
+        copy = None if isinstance(solver, str) else scratch / "solver.pickle"
+        if copy is not None:
+            write_solver(copy, configured)
+        with single_worker(registries.worker_command(spec, copy), work) as worker:
+            yield answer
+
+
+class Multipliers(NamedTuple):
+    """Multipliers in the sign convention of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
+
+    y: Vector  #: (m,) of A x = b
+    z: Vector  #: (p,) of G x ≤ h
+    z_box: Vector  #: (n,) of the bounds
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Verification:
+    """A judgement on a point from elsewhere."""
+
+    verdict: Verdict  #: `verified`, or `inaccurate` or `wrong` where it is refuted
+    residuals: Residuals  #: relative KKT residuals
+    multipliers: Multipliers  #: as given; where left out, the best ones
+    objective: float  #: ½xᵀPx + qᵀx
+    optimum_error: float | None  #: against a proven optimum, where that decided
+    tol: float  #: verified means every residual ≤ 10·tol
+
+    def __repr__(self) -> str:
+        if self.optimum_error is not None:
+            found = f"off the proven optimum by {self.optimum_error:.2g}"
+        else:
+            values = self.residuals._asdict().items()
+            found = ", ".join(f"{name} {value:.2g}" for name, value in values)
+        return f"<{self.verdict}: {found}; allowed {allowed(self.tol):.2g}>"
+
+
+def verify(
+    qp: QP | Case | str,
+    x: ArrayLike,
+    y: ArrayLike | None = None,
+    z: ArrayLike | None = None,
+    z_box: ArrayLike | None = None,
+    tol: float = 1e-8,
+) -> Verification:
+    """Judge a point from elsewhere by its KKT residuals, as answers of solvers are.
+
+    Multipliers that are left out are computed by nonnegative least squares on the
+    active rows and bounds, see `harness.verify.multipliers`. Residuals that they leave
+    show that the point is not optimal to that accuracy.
+
+    Parameters
+    ----------
+    qp : a QP, a case of `build`, or its name
+    x : (n,) the point
+    y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, where known
+    tol : relative KKT accuracy; verified means that every residual is within 10·tol
+
+    Raises
+    ------
+    InputError
+        When a vector does not fit the QP, or there are too many multipliers to compute.
+
+    """
+    tol = tolerance(tol)
+    case = as_case(qp)
+    problem = case.made.qp
+    sizes = {"x": problem.q, "y": problem.b, "z": problem.h, "z_box": problem.q}
+    given = {"x": x, "y": y, "z": z, "z_box": z_box}
+    known = {
+        name: numeric_vector(name, v, sizes[name].size)
+        for name, v in given.items()
+        if v is not None or name == "x"
+    }
+    with one_thread():
+        s = with_multipliers(problem, **known)
+        with np.errstate(all="ignore"):  # a point may hold NaN or 1e300
+            residuals, objective = kkt_residuals(problem, s), problem.objective(s.x)
+        error = decided(problem, s, residuals, tol, proves(case.registries.reference))
+    return Verification(
+        verdict=verdict(s.status, residuals, tol, error=error),
+        residuals=residuals,
+        multipliers=Multipliers(s.y, s.z, s.z_box),
+        objective=objective,
+        optimum_error=error,
+        tol=tol,
+    )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
-from harness.errors import InputError, unknown
+from harness import checked
+from harness.errors import InputError, shown, unknown
 
 EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")
@@ -15,7 +19,7 @@ MOST_SCALE = 1e9  #: of displacements in pictures
 GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
 
 
-def writable(path: Path, suffixes: tuple[str, ...]) -> Path:
+def writable(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     """Refuse a file that could not be written.
 
     Raises
@@ -24,6 +28,7 @@ def writable(path: Path, suffixes: tuple[str, ...]) -> Path:
         When its ending is none of `suffixes`, it is a folder, or its folder is missing.
 
     """
+    path = checked.path("path", path)
     if path.suffix not in suffixes:
         raise InputError(
             f"{path}: unknown format {path.suffix!r}; expected {' or '.join(suffixes)}"
@@ -44,8 +49,8 @@ def existing(folder: Path) -> Path:
         With what it is instead.
 
     """
-    if not folder.is_dir():
-        what = "a file" if folder.exists() else "no such folder"
+    if not os.path.isdir(folder):
+        what = "a file" if os.path.exists(folder) else "no such folder"
         raise InputError(f"{folder}: {what}; expected a result folder of `run`")
     return folder
 
@@ -59,9 +64,28 @@ def tolerance(tol: float, where: str = "tol") -> float:
         For any other number.
 
     """
-    if not 0 < tol < 1:
-        raise InputError(f"{where} = {tol}; expected a number between 0 and 1")
-    return tol
+    if not isinstance(tol, Real) or isinstance(tol, bool) or not 0 < tol < 1:
+        raise InputError(f"{where} = {shown(tol)}; expected a number between 0 and 1")
+    return float(tol)
+
+
+def solver_options(options: object) -> dict[str, Any]:
+    """Copy the options of a solver.
+
+    Raises
+    ------
+    InputError
+        Unless they are a mapping from names to values, or None.
+
+    """
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping) or not all(isinstance(k, str) for k in options):
+        raise InputError(
+            f"options = {shown(options)}; expected a dict from names to values, such "
+            "as {'max_iter': 50}"
+        )
+    return dict(options)
 
 
 def drawn_scale(scale: float, where: str = "scale") -> float:
@@ -89,8 +113,10 @@ def budget(seconds: float, where: str = "budget") -> float:
         For any other number.
 
     """
-    if not seconds >= 0:  # a NaN, too
-        raise InputError(f"{where} {seconds:g}; expected a number of seconds ≥ 0")
+    if not checked.is_number(seconds) or not seconds >= 0:  # a NaN, too
+        raise InputError(
+            f"{where} = {shown(seconds)}; expected a number of seconds ≥ 0"
+        )
     return seconds
 
 

@@ -1,27 +1,34 @@
-"""One case: its QP, and the way back from a point to the physical problem."""
+"""A case by name, or a bare QP: its QP, and the way back to the physical problem."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
-from harness import QP, Fields, Solution, plugin
-from harness.errors import InputError
+import numpy as np
+from scipy.sparse import csc_array, csc_matrix
+
+from harness import QP, Fields, Matrix, Solution, plugin
+from harness.errors import InputError, shown
 from harness.names import CaseId, parse, unbuilt
 from harness.verify.verdicts import plain
 from mortarbench.arguments import EXPORTS, writable
-from mortarbench.registries import Plugins, Registries, known, one_thread
+from mortarbench.registries import TURN, Plugins, Registries, known, one_thread
+
+if TYPE_CHECKING:
+    from harness import Mechanics, Vector
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class Case:
-    """One QP of one problem, under its canonical name."""
+class Case(plugin.Case):
+    """One QP of one problem, under its canonical name, built when first used."""
 
-    id: CaseId  #: its name, in parts
-    registries: Registries  #: those that it is built with
+    def __init__(self, *, id: CaseId, registries: Registries) -> None:  # noqa: A002
+        self.id = id  #: its name, in parts
+        self.registries = registries  #: those that it is built with
 
     @cached_property
     def made(self) -> plugin.Case:
@@ -50,10 +57,49 @@ class Case:
         """FAMILY/key=value/…/FORM, without keys that others imply."""
         return self.id.name
 
-    @property
+    @cached_property
     def qp(self) -> QP:
-        """The QP, non-dimensional: energy in SI = scale·objective + constant."""
-        return self.made.qp
+        """The QP, non-dimensional: energy in SI = scale·objective + constant.
+
+        Its matrices are of the types that other libraries take: ``scipy.sparse``
+        ``csc_matrix`` with 32-bit indices, or dense arrays. P of a decomposed problem
+        is an operator, whose matrix is ``P @ numpy.eye(n)``.
+        """
+        return self.made.qp.with_matrices(_exported)
+
+    @property
+    def scale(self) -> float:
+        """Factor from the objective of the QP to an energy in SI."""
+        return self.made.scale
+
+    @property
+    def constant(self) -> float:
+        """Energy in SI where the objective of the QP is zero."""
+        return self.made.constant
+
+    @property
+    def matrices(self) -> Mapping[str, Any]:
+        """Matrices of a dual form in the notation of the paper."""
+        return self.made.matrices
+
+    @property
+    def dualise_seconds(self) -> float | None:
+        """Time to assemble a dual form, factorisation included; None for a primal."""
+        return self.made.dualise_seconds
+
+    @property
+    def mechanics(self) -> Mechanics | None:
+        """Mechanical problem that certificates use, or None."""
+        return self.made.mechanics
+
+    @property
+    def unsettled(self) -> float:
+        """Relative distance of the QP from the fixed point that it approximates."""
+        return self.made.unsettled
+
+    def recover(self, solution: Solution) -> Vector:
+        """Compute the physical unknown of a point, SI."""
+        return self.made.recover(solution)
 
     @property
     def params(self) -> Mapping[str, plugin.Value]:
@@ -70,10 +116,12 @@ class Case:
         """What may be wrong with the input, a line each: moduli of odd sizes."""
         return self.made.remarks
 
+    @TURN
     def quantities(self, solution: Solution) -> dict[str, Any]:
         """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
         return dict(plain(self.made.quantities(solution)))
 
+    @TURN
     def fields(self, solution: Solution) -> Fields:
         """Give the deformed bodies of a point, with stresses and contact forces, SI.
 
@@ -97,7 +145,7 @@ class Case:
             or the file cannot be written.
 
         """
-        path = writable(Path(path), EXPORTS)
+        path = writable(path, EXPORTS)
         meta = plain(
             {
                 "name": self.name,
@@ -131,10 +179,98 @@ class Case:
     def __repr__(self) -> str:
         if "made" not in vars(self):
             return f"<Case {self.name}, not built>"
-        sizes = ", ".join(f"{n} {what}" for what, n in self.qp.sizes.items())
+        sizes = ", ".join(f"{n} {what}" for what, n in self.made.qp.sizes.items())
         return f"<Case {self.name}: {sizes}>"
 
 
+def _exported(M: Matrix) -> Matrix:
+    """Return a sparse matrix as a `csc_matrix`, with 32-bit indices if they suffice."""
+    M = csc_matrix(M)
+    if max(M.nnz, *M.shape) < 2**31:
+        narrow = (M.indices.astype(np.int32), M.indptr.astype(np.int32))
+        M = csc_matrix((M.data, *narrow), shape=M.shape)
+    M.sum_duplicates()
+    return M
+
+
+@dataclass(frozen=True)
+class GivenQP(plugin.Family):
+    """A QP from a script, as a family of one problem."""
+
+    qp: QP
+    name: str = "qp"
+    defaults: Mapping[str, plugin.Value] = field(
+        default_factory=lambda: MappingProxyType({}), hash=False
+    )
+    forms: tuple[str, ...] = ("qp",)
+
+    def build(
+        self,
+        form: str,
+        params: Mapping[str, plugin.Value],
+        reference: plugin.Reference,
+    ) -> plugin.Case:
+        """Return the QP as a case without physical results."""
+        return plugin.Case(qp=self.qp, recover=lambda s: s.x, quantities=lambda _: {})
+
+
+def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
+    """Return the case of a name, not built yet, or of a QP; a case as it is.
+
+    plugins : Python files with more families or solvers
+
+    Raises
+    ------
+    InputError
+        When the problem is of another type, there is no such case, or a plug-in cannot
+        be loaded.
+
+    """
+    match problem:
+        case Case():
+            files = problem.registries.missing(plugins)
+            if not files:
+                return problem
+            registries = problem.registries.with_files(files)
+            extended = Case(id=problem.id, registries=registries)
+            if "made" in vars(problem):
+                extended.__dict__["made"] = problem.made
+            return extended
+        case QP():
+            # our own code multiplies sparse arrays, not matrices, which differ in `*`
+            family = GivenQP(problem.with_matrices(csc_array))
+            name = CaseId(family=family, name="qp", params={}, form="qp")
+            return Case(id=name, registries=known(plugins))
+        case str():
+            registries = known(plugins)
+            return Case(id=parse(problem, registries.families), registries=registries)
+    hint = f"; a file is 'file:{problem}'" if isinstance(problem, Path) else ""
+    raise InputError(
+        f"case = {shown(problem)}; expected the name of a case, what build() returns, "
+        f"or a QP{hint}"
+    )
+
+
+def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
+    """Write a QP for other people's solvers: .npz, .mat, .parquet or .qps.
+
+    Parameters
+    ----------
+    case : a name, a case of `build`, or a QP
+    path : of the file; its ending names the format
+    plugins : Python files with more families
+
+    Raises
+    ------
+    InputError
+        When there is no such case, it cannot be built, the ending is none of these, the
+        format has no place for the numbers, or the file cannot be written.
+
+    """
+    return as_case(case, plugins).save(path)
+
+
+@TURN
 def build(name: str, *, plugins: Plugins = ()) -> Case:
     """Build the case of a name, such as ``beam-ring/Nr=4/Nh=3/steps=1/dual``.
 

@@ -84,7 +84,7 @@ def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> L
         When a plug-in cannot be loaded.
 
     """
-    registries = known(plugins) if registries is None else registries
+    registries = known(plugins, registries)
     entries = getattr(registries.solvers, "entries", {})
     return Listing(
         _row(
@@ -108,7 +108,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
         When a plug-in cannot be loaded.
 
     """
-    registries = known(plugins) if registries is None else registries
+    registries = known(plugins, registries)
     return Listing(
         {
             "name": name,
@@ -122,7 +122,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
 
 def suites(*, registries: Registries | None = None) -> Listing:
     """List the suites that come with us: name, description, path."""
-    folder = (registries or Registries()).suites
+    folder = known((), Registries() if registries is None else registries).suites
     return Listing(
         {"name": path.stem, "description": first_comment(path), "path": str(path)}
         for path in sorted(folder.glob("*.toml"), key=attrgetter("stem"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from harness.distributed.vectors import Emitted, Ranks
@@ -11,6 +12,7 @@ from harness.errors import InputError
 from harness.processes.case_worker import CaseWorker
 from harness.processes.case_worker import serve as serve_cases
 from harness.processes.ranks import launch, this_rank
+from harness.processes.solver_file import read_solver
 from harness.processes.worker import serve
 from harness.registry import SolverSpec, resolve
 from mortarbench.registries import Registries
@@ -24,7 +26,10 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     spec = SolverSpec(
         name=request["name"], label=request["name"], options=request["options"]
     )
-    solver = resolve(spec, registries.solvers)
+    solvers = registries.solvers
+    if "copy" in request:
+        solvers = {spec.name: read_solver(Path(request["copy"]))}
+    solver = resolve(spec, solvers)
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
     def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted:

@@ -15,6 +15,8 @@ from html import escape as html_escape
 from time import monotonic
 from typing import Any, TextIO
 
+from harness.errors import InputError
+from harness.errors import shown as repeated
 from harness.record import Record, Verdict
 from harness.running.progress import Progress
 
@@ -101,20 +103,24 @@ class _Told(_State):
         self._tell(record=record)
 
 
-class _Lines(_State):
-    """Writes a line per measurement."""
+class _Warnings(_State):
+    """Writes what went wrong, and nothing else."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
         self._stream = stream
 
-    def start(self, total: int) -> None:
-        super().start(total)
-        self.warn(f"{total} measurement{'s' * (total != 1)}")
-
     def warn(self, text: str) -> None:
         with suppress(BrokenPipeError):  # nobody listens: no reason to stop measuring
             print(text, file=self._stream, flush=True)
+
+
+class _Lines(_Warnings):
+    """Writes a line per measurement."""
+
+    def start(self, total: int) -> None:
+        super().start(total)
+        self.warn(f"{total} measurement{'s' * (total != 1)}")
 
     def advance(self, record: Record | None) -> None:
         super().advance(record)
@@ -128,12 +134,12 @@ def in_words(record: Record) -> str:
     took = "" if seconds is None else f" in {seconds:.3g} s"
     if record.verdict is Verdict.DECLINED and record.message:
         took = f": {record.message[:_REASON]}"
-    return f"{record.solver} on {record.case}: {record.verdict}{took}"
+    return f"{record.solver} on {record.case}: {record.verdict.words}{took}"
 
 
 def stands_out(record: Record) -> bool:
     """Whether a measurement is worth a line above a bar: it was not verified."""
-    return record.verdict not in (Verdict.VERIFIED, Verdict.DECLINED)
+    return not record.verdict.is_verified and record.verdict is not Verdict.DECLINED
 
 
 class _Bar(_State):
@@ -264,6 +270,12 @@ def shown_on(stream: TextIO) -> Iterator[Progress]:
 
 
 @contextmanager
+def quiet_on(stream: TextIO) -> Iterator[Progress]:
+    """Show on a stream what goes wrong in a run, and nothing else."""
+    yield _Warnings(stream)
+
+
+@contextmanager
 def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
     """Show a run as the user asks: see `mortarbench.run`."""
     if progress is None and in_notebook():
@@ -278,8 +290,12 @@ def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
         yield progress
     elif callable(progress):
         yield _Told(progress)
-    else:
+    elif progress in (None, False):
         yield _Silent()
+    else:
+        raise InputError(
+            f"progress = {repeated(progress)}; expected True, False, None or a function"
+        )
 
 
 def ignore(text: str) -> None:

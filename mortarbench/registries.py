@@ -11,9 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from harness.errors import InputError, unknown
+from harness import checked
+from harness.errors import InputError, shown, unknown
 from harness.limits import ONE_THREAD
 from harness.plugin import Family, Reference, Solver
+from harness.processes.turns import Turn
 from harness.registry import (
     COPIES,
     Plugin,
@@ -33,6 +35,10 @@ if TYPE_CHECKING:
     from harness.results.work_unit import Commands
     from harness.solution import Solution
 
+#: of the thread that loads plug-ins, builds, solves, runs or validates: these set
+#: numbers of threads, standard output and modules of the whole process
+TURN = Turn()
+
 #: Python files that define SOLVERS or PROBLEMS; a text may be LABEL=FILE.py
 Plugins = Sequence[str | Path | PluginFile]
 
@@ -51,6 +57,20 @@ class Reporter(Protocol):
         """Report; verdicts are those at factor·tol, forms are compared together."""
 
 
+def _plugin_files(files: Plugins) -> list[PluginFile]:
+    """Parse a list of plug-ins; a lone text or path is a likely slip, and refused."""
+    if isinstance(files, str | Path) or not isinstance(files, Iterable):
+        raise InputError(
+            f"plugins = {shown(files)}; expected a list of Python files, such as "
+            "['mine.py']"
+        )
+    listed = list(files)
+    for file in listed:
+        if not isinstance(file, PluginFile):
+            checked.path("plugins", file)
+    return [PluginFile.of(file) for file in listed]
+
+
 def suites_folder() -> Path:
     """Say where the suites lie: in the package, or beside it in a checkout."""
     inside = Path(__file__).parent / "suites"
@@ -62,13 +82,14 @@ def one_thread() -> Iterator[None]:
     """Keep every library to one thread, as the processes of a run do.
 
     Sums in another order would make another QP of the same case, in its last digits.
+    Another thread of ours that wants the same waits until this one is done.
     """
     from scipy import linalg  # libraries that are loaded, and only they, can be told
     from sksparse import cholmod
     from threadpoolctl import threadpool_limits
 
     del linalg, cholmod
-    with threadpool_limits(limits=1):
+    with TURN, threadpool_limits(limits=1):
         yield
 
 
@@ -79,13 +100,14 @@ def reference(qp: QP) -> Solution:
     return reference_solution(qp)
 
 
-def _report(
+def report_folder(
     folder: Path,
     formats: Sequence[str],
     *,
     factor: float | None = None,
     pool_forms: bool = False,
 ) -> list[Path]:
+    """Write our report on a result folder."""
     from harness.record import VERIFIED_FACTOR
     from reports import write_report
 
@@ -113,7 +135,7 @@ class Registries:
     families: Mapping[str, Family] = field(default_factory=lambda: PROBLEMS)
     solvers: Mapping[str, Solver] = field(default_factory=lambda: SOLVERS)
     reference: Reference = reference
-    report: Reporter = _report
+    report: Reporter = report_folder
     validation_page: ValidationPage = _validation_page
     #: what puts an operator P together, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
@@ -146,6 +168,7 @@ class Registries:
             origins={**self.origins, **dict.fromkeys(plugin.problems, plugin.origin)},
         )
 
+    @TURN
     def with_files(self, files: Plugins) -> Registries:
         """Add the plug-ins in `files`.
 
@@ -156,7 +179,7 @@ class Registries:
 
         """
         extended = self
-        for file in map(PluginFile.of, files):
+        for file in _plugin_files(files):
             plugin = load_plugin(file)
             try:
                 extended = extended.extended(plugin)
@@ -164,6 +187,18 @@ class Registries:
                 raise InputError(f"{file.path}: {e}") from None
             extended = replace(extended, files=(*extended.files, file))
         return extended
+
+    def missing(self, files: Plugins) -> list[PluginFile]:
+        """List the plug-ins of `files` that are not loaded yet.
+
+        Raises
+        ------
+        InputError
+            When they are not a list of files.
+
+        """
+        loaded = {file.resolved() for file in self.files}
+        return [f for f in _plugin_files(files) if f.resolved() not in loaded]
 
     def hold_own_code_only(self) -> bool:
         """Whether nothing of a plug-in has been loaded."""
@@ -174,17 +209,35 @@ class Registries:
             and not self.files
         )
 
-    def worker_command(self, spec: SolverSpec) -> list[str]:
-        """Make the command that starts the worker of a solver, less its two pipes."""
+    def worker_command(self, spec: SolverSpec, copy: Path | None = None) -> list[str]:
+        """Return the command that starts the worker of a solver, less its two pipes.
+
+        copy : file that holds the configured solver, if it is an object; see
+            `harness.processes.solver_file`
+
+        Raises
+        ------
+        InputError
+            When an option is no plain data.
+
+        """
         request: dict[str, Any] = {
             "name": spec.name,
-            "options": spec.options,
+            "options": spec.options if copy is None else {},
             "plugins": self._absolute_files(),
         }
+        if copy is not None:
+            request["copy"] = str(copy)
         if spec.ranks > 1:
             request |= {"ranks": spec.ranks, "copies": spec.role == COPIES}
         name = "ranks" if spec.ranks > 1 else "worker"
-        return [*self.start, name, json.dumps(request)]
+        try:
+            return [*self.start, name, json.dumps(request)]
+        except TypeError:
+            raise InputError(
+                f"{spec.name}: options {shown(dict(spec.options))}; expected numbers, "
+                "texts, true or false, or lists and dicts of these"
+            ) from None
 
     def commands(self, specs: Iterable[SolverSpec]) -> Commands:
         """Make the commands that start the processes of a run."""
@@ -223,7 +276,7 @@ class Registries:
             When there is neither.
 
         """
-        path = Path(text)
+        path = checked.path("suite", text)
         if path.is_file():
             return path
         known = {p.stem: p for p in self.suites.glob("*.toml")}
@@ -248,8 +301,11 @@ def installed(registries: Registries) -> Registries:
     return registries.extended(entry_point_plugins())
 
 
-def known(plugins: Plugins = ()) -> Registries:
+@TURN
+def known(plugins: Plugins = (), registries: Registries | None = None) -> Registries:
     """Give all that is known: ours, installed plug-ins, and those in files.
+
+    registries : what is known instead, where it is given
 
     Raises
     ------
@@ -257,4 +313,8 @@ def known(plugins: Plugins = ()) -> Registries:
         When a plug-in cannot be loaded, or one of its names exists.
 
     """
-    return installed(Registries()).with_files(plugins)
+    if registries is None:
+        return installed(Registries()).with_files(plugins)
+    if not isinstance(registries, Registries):
+        raise InputError(f"registries = {shown(registries)}; expected Registries")
+    return registries

@@ -12,9 +12,12 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from harness import checked
+from harness.checked import located
 from harness.environment.doctor import load_advice
 from harness.environment.environment import digest
-from harness.errors import InputError, some
+from harness.errors import InputError, some, unknown
+from harness.errors import shown as given
 from harness.record import Record, Verdict
 from harness.registry import resolve
 from harness.results.faults import in_words
@@ -27,14 +30,16 @@ from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
 from harness.suite.solver_options import as_given
-from harness.suite.suite import load_suite
+from harness.suite.suite import load_suite, parse_suite, suite_text
+from mortarbench.arguments import PICTURES, writable
 from mortarbench.progress import Callback, ignore, shown
-from mortarbench.registries import Plugins, Registries, known
+from mortarbench.registries import TURN, Plugins, Registries, known
 from mortarbench.reporting import Report, report
 from mortarbench.text import summary, summary_rows
 from mortarbench.validation import Validation, validate
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
 
     from harness.results.work_unit import Opens
@@ -73,8 +78,12 @@ class Results:
 
         A limit that was met is among them; what a solver declined is not.
         """
-        answered = (*REFUTED, Verdict.VERIFIED, Verdict.DECLINED)
-        return tuple(r for r in self._asked if r.verdict not in answered)
+        ended = (*REFUTED, Verdict.DECLINED)
+        return tuple(
+            r
+            for r in self._asked
+            if r.verdict not in ended and not r.verdict.is_verified
+        )
 
     @property
     def _asked(self) -> tuple[Record, ...]:
@@ -115,6 +124,33 @@ class Results:
     def report(self, **options: object) -> Report:
         """Write the report; see `mortarbench.report`."""
         return report(self.folder, **options)  # type: ignore[arg-type]
+
+    def plot(self, kind: str, path: str | Path | None = None) -> Figure:
+        """Draw a figure of the report.
+
+        kind : its name in the folder ``figures`` of the report, such as ``accuracy`` or
+            ``scaling-1``; ``scaling`` where there is only one of these
+        path : of a file to write it to: .png, .pdf or .svg
+
+        Raises
+        ------
+        InputError
+            When the report has no such figure, with those that it has, or the file
+            cannot be written.
+
+        """
+        from reports import figures
+        from reports.render.saving import draw, save
+
+        target = None if path is None else writable(path, PICTURES)
+        drawn = figures(self.folder)
+        wanted = [name for name in drawn if name == kind or name.startswith(f"{kind}-")]
+        if len(wanted) != 1:
+            raise unknown("figure", str(kind), drawn, where=str(self.folder))
+        figure = drawn[wanted[0]]
+        if target is not None:
+            save(figure, target)
+        return draw(figure)
 
     def validate(self, **options: object) -> Validation:
         """Cross-validate the answers; see `mortarbench.validate`."""
@@ -162,7 +198,8 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
         When the folder holds no measurements.
 
     """
-    path = Path(folder)
+    path = checked.path("folder", folder)
+    checked.function("warn", warn)
     records = read_journal(path, warn)
     if not records:
         raise InputError(f"{path}: no measurements; expected a result folder of `run`")
@@ -189,12 +226,16 @@ def merge(
     """
     if not folders:
         raise InputError("no folder to merge; expected result folders of `run`")
-    records = merge_folders([*map(Path, folders)], Path(out), tell)
-    return Results(folder=Path(out), records=tuple(records))
+    sources = [checked.path("folders", folder) for folder in folders]
+    target = checked.path("out", out)
+    checked.function("tell", tell)
+    records = merge_folders(sources, target, tell)
+    return Results(folder=target, records=tuple(records))
 
 
+@TURN
 def run(
-    suite: str | Path,
+    suite: str | Path | Mapping[str, Any],
     *,
     out: str | Path | None = None,
     solvers: Sequence[str] = (),
@@ -213,7 +254,8 @@ def run(
 
     Parameters
     ----------
-    suite : path of a TOML, or the name of one of `suites`
+    suite : path of a TOML, the name of one of `suites`, or a dict with the keys of a
+        TOML, whose relative paths start in the working directory
     out : the result folder; ``out/NAME`` of the suite if not given
     solvers : only these; names that the suite has not are added
     cases : only these, patterns or names
@@ -232,21 +274,29 @@ def run(
         When something of that is wrong, the folder is in use, or its disk is full.
 
     """
-    registries = known(plugins) if registries is None else registries
+    registries = known(plugins, registries)
+    folder = None if out is None else checked.path("out", out)
+    if not isinstance(dask, str | None):
+        raise InputError(f"dask = {given(dask)}; expected the address of a scheduler")
+    families, known_solvers = registries.families, registries.solvers
+    if isinstance(suite, Mapping):
+        with located("suite"):
+            text = suite_text(suite)
+        loaded = parse_suite(text, "suite", Path(), families, known_solvers)
+    else:
+        loaded = load_suite(registries.suite_path(suite), families, known_solvers)
     asked = with_overrides(
-        load_suite(
-            registries.suite_path(suite), registries.families, registries.solvers
-        ),
+        loaded,
         registries.families,
         registries.solvers,
-        solvers=solvers,
-        cases=cases,
+        solvers=checked.texts("solvers", solvers),
+        cases=checked.texts("cases", cases),
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
-        options=as_given(options or {}),
+        options=as_given({} if options is None else options),
     )
-    folder = Path("out") / asked.name if out is None else Path(out)
+    folder = folder or Path("out") / asked.name
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
         if load_advice(busy := os.getloadavg()[0]):
@@ -278,7 +328,7 @@ def run(
             environment=environment,
             digest=digest(environment),
             progress=display,
-            fresh=fresh,
+            fresh=checked.flag("fresh", fresh),
             engine=engine,
         )
         records = read_journal(folder, display.warn)

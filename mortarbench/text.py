@@ -27,6 +27,7 @@ UNITS = {
     "stress_error": "(dimensionless)",
 }
 _CONTACTS = "contacts"  #: the quantity that has a table per pair of sides
+_SHARE = "shear_without_contact"  #: beside `sliding_without_contact`
 _OF_A_CONTACT = {
     "largest_pressure": "Pa",
     "smallest_gap": "m",
@@ -116,8 +117,8 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
         declined = [r for r in every if r.verdict is Verdict.DECLINED]
         own = [r for r in every if r.verdict is not Verdict.DECLINED]
         claimed = [r for r in own if r.claimed == CLAIMED_SOLVED]
-        verified = [r for r in own if r.verdict is Verdict.VERIFIED]
-        refuted = [r for r in claimed if r.verdict is not Verdict.VERIFIED]
+        verified = [r for r in own if r.verdict.is_verified]
+        refuted = [r for r in claimed if not r.verdict.is_verified]
         other = len(own) - len(verified) - len(refuted)
         counts = map(len, (own, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
@@ -145,7 +146,7 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
         ("solver", f"{r.solver} ({options})" if options else r.solver),
         ("tolerance", f"{r.tol:g}"),
-        ("status", f"{r.verdict} (claimed {r.claimed})"),
+        ("status", f"{r.verdict.words} (claimed {r.claimed})"),
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),
@@ -162,16 +163,24 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
             for name in ("primal", "dual", "complementarity", "gap")
         ),
         ("off optimum", _text(_known(r.optimum_error), digits=2)),
-        ("energy error", _bound(r)),
+        ("solver error", _bound(r)),
         ("objective", _text(_known(r.objective))),
         *(
-            (name.replace("_", " "), _text(value, units.get(name, "")))
-            for name, value in r.quantities.items()
-            if name != _CONTACTS
+            (name.replace("_", " "), _quantity(r, name, units.get(name, "")))
+            for name in r.quantities
+            if name not in (_CONTACTS, _SHARE)
         ),
         *_contacts(r.quantities.get(_CONTACTS)),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def _quantity(r: Record, name: str, unit: str) -> str:
+    """Show a quantity; of nodes that slide without contact their part of the shear."""
+    text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
+    if name != "sliding_without_contact" or not isinstance(share, float):
+        return text
+    return f"{text}, with {share:.2%} of the shear"
 
 
 def _contacts(pairs: object) -> list[tuple[str, str]]:
@@ -195,7 +204,10 @@ def _bound(r: Record) -> str:
     if r.energy_bound is None:
         return ""
     beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
-    return f"at most {r.energy_bound:.2g} (certified, relative{beside})"
+    return (
+        f"at most {r.energy_bound:.2g} in the energy norm (certified, relative{beside};"
+        " the mesh adds more)"
+    )
 
 
 def convergence(history: History) -> str:

@@ -1,22 +1,30 @@
-"""Cross-validation: whether the answers that a result folder holds agree."""
+"""Cross-validation of the answers in a result folder, and conformance of a solver."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
+from harness import checked
+from harness.conformance.conformance import CHECKS, FINDS, KEEPS, Grade, Result
 from harness.crossval.comparison import brief
 from harness.crossval.discretisation import Discretisation, discretisation_errors
 from harness.crossval.summary import as_data
 from harness.crossval.validation import validated
-from harness.errors import InputError
+from harness.errors import InputError, unknown
 from harness.files.durable import full_disk_told, replace_file
 from harness.names import CaseId, assemble
+from harness.plugin import Solver
+from harness.processes.measurement import scratch_folder
+from harness.processes.solver_file import write_solver
+from harness.processes.supervisor import WorkerProcess
+from harness.registry import SolverSpec, check_solver, resolve
 from harness.results.journal import read_journal
 from mortarbench.arguments import budget as checked_budget
 from mortarbench.progress import ignore
@@ -24,6 +32,8 @@ from mortarbench.registries import Plugins, Registries, known, one_thread
 from mortarbench.text import aligned, legible
 
 OURS = "smalbe"  #: the solver that every other one is set against
+TIME_LIMIT = 60.0  #: s per check of the conformance suite
+MEMORY_LIMIT = 4096.0  #: MiB per check
 _MOST = 12  #: entries of a list on the terminal; the page has them all
 
 
@@ -73,9 +83,10 @@ def validate(
         When the folder holds no answer that can be judged.
 
     """
+    path = checked.path("folder", folder)
     checked_budget(budget)
-    registries = known(plugins) if registries is None else registries
-    path = Path(folder)
+    checked.function("progress", progress)
+    registries = known(plugins, registries)
     with one_thread():
         return _validated(path, budget, progress, registries)
 
@@ -88,7 +99,7 @@ def _validated(
 ) -> Validation:
     found = validated(path, registries.families, registries.reference, progress)
     data = as_data(found, path.resolve().name, ours=OURS)
-    if not (data["counts"]["answers"] or found.false_claims):
+    if not (data["counts"]["answers"] or found.false_claims or found.proven):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
@@ -109,7 +120,7 @@ def _meshes(
     seconds: float,
     progress: Callable[[str], None],
 ) -> list[Discretisation]:
-    """Solve the folder's cases on finer meshes, where families say what these are."""
+    """Solve the folder's elastic cases on finer meshes, or say why there are none."""
     families = registries.families
     records = {r.case: r for r in read_journal(folder, progress)}
     cases = []
@@ -117,22 +128,17 @@ def _meshes(
         if r.family in families:
             with suppress(InputError):  # of another version: listed as not validated
                 case = assemble(families[r.family], r.params, r.form)
-                if _refines(case):
+                if r.energy_bound is not None or _refines(case):
                     cases.append(case)
     return discretisation_errors(cases, registries.reference, folder, seconds, progress)
 
 
 def _refines(case: CaseId) -> bool:
-    """Whether its family says what a finer mesh is, or why there is none."""
+    """Return whether there is a finer mesh, or a reason why its family has none."""
     try:
         return case.family.refined(case.params) is not None
-    except InputError:  # which is told of the case
+    except InputError:  # the reason, which `discretisation_errors` repeats
         return True
-
-
-def _mesh(d: Discretisation) -> str:
-    before = "less than " if d.kind == "rounding" else ""
-    return f"{before}{_e(d.error)}{' to the next mesh' * (d.kind == 'change')}"
 
 
 def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
@@ -163,12 +169,12 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
         if data["counts"][key]
     ]
     parts += ["; ".join(small) + "."] if small else []
-    if known := [d for d in meshes if d.error is not None]:
+    if meshes:
         title = (
-            "Discretisation errors, relative, in the energy norm; `report` shows what "
-            "they are worth"
+            "Errors of the meshes, relative, in the energy norm, to which the "
+            "certified ones add; `report` shows what they are worth"
         )
-        parts.append(_list(title, [f"{d.case}: {_mesh(d)}" for d in known]))
+        parts.append(_list(title, [f"{d.case}: {d}" for d in meshes]))
     return "\n\n".join(parts)
 
 
@@ -192,7 +198,10 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
         for row in rows
     ]
     table = aligned([head, *lines], right=range(1, len(head)))
-    return f"Certified errors: relative, in the energy norm.\n{table}"
+    return (
+        "Certified errors: relative, in the energy norm. They are those of the "
+        f"solvers; the mesh adds its own.\n{table}"
+    )
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -246,3 +255,100 @@ def _e(value: float | None) -> str:
     if value is None:
         return "-"
     return brief(value) if value else "0"
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Conformance:
+    """Results of the conformance suite for one solver."""
+
+    solver: str  #: its name, or the class of an object
+    results: Mapping[str, Result]  #: by the name of the check
+
+    @property
+    def conforms(self) -> bool:
+        """True if no check fails, and the solver solved something."""
+        solved = any(
+            r.grade is Grade.PASS and name.startswith(FINDS)
+            for name, r in self.results.items()
+        )
+        return solved and not self.failed
+
+    @property
+    def failed(self) -> Mapping[str, str]:
+        """Messages of the checks that fail, by name."""
+        return {n: r.message for n, r in self.results.items() if r.grade is Grade.FAIL}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data; `checks` is what ``test-solver --json`` prints."""
+        checks = [
+            dict(solver=self.solver, check=name, **r._asdict())
+            for name, r in self.results.items()
+        ]
+        return {"solver": self.solver, "conforms": self.conforms, "checks": checks}
+
+    def __repr__(self) -> str:
+        rows = [(r.grade, name, r.message) for name, r in self.results.items()]
+        grades = Counter(r.grade for r in self.results.values())
+        counts = ", ".join(f"{grades[g]} {g}" for g in Grade)
+        return f"{aligned(rows)}\n{self.solver}: {counts}"
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def test_solver(
+    solver: str | Solver,
+    *,
+    plugins: Plugins = (),  # noqa: PT028  # not a test
+    checks: Iterable[str] | None = None,  # noqa: PT028
+    registries: Registries | None = None,  # noqa: PT028
+) -> Conformance:
+    """Run the conformance suite on a solver, in a process of its own.
+
+    A check whose process is killed or hangs fails; the others go on.
+
+    Parameters
+    ----------
+    solver : a name of `solvers`, or an object as `mortarbench.solve` takes it
+    plugins : Python files with more solvers
+    checks : names of checks; None: all
+    registries : what is known, instead of ours, what is installed and `plugins`
+
+    Raises
+    ------
+    InputError
+        When there is no such solver or check, or the solver cannot be copied.
+
+    """
+    check_solver(solver)
+    registries = known(plugins) if registries is None else registries
+    wanted = list(CHECKS if checks is None else checks)
+    for check in wanted:
+        if check not in CHECKS:
+            raise unknown("check", str(check), CHECKS)
+    name = solver if isinstance(solver, str) else type(solver).__name__
+    spec = SolverSpec(name=name, label=name)
+    with scratch_folder() as scratch, ExitStack() as stack:
+        copy = None
+        if isinstance(solver, str):
+            resolve(spec, registries.solvers)
+        else:
+            copy = scratch / "solver.pickle"
+            write_solver(copy, solver)
+        command = registries.worker_command(spec, copy)
+        worker = WorkerProcess(command, scratch / "worker.log")
+        stack.callback(worker.close)
+        results = {check: _checked(worker, check) for check in wanted}
+    return Conformance(solver=name, results=results)
+
+
+def _checked(worker: WorkerProcess, check: str) -> Result:
+    """Run one check; what ends the process of the solver is a failure of it."""
+    reply = worker.ask(
+        {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
+    )
+    if reply.answer is None:
+        is_weakness = check.startswith(KEEPS)
+        return Result(Grade.WEAK if is_weakness else Grade.FAIL, reply.message)
+    grade, *others = (reply.answer[field] for field in Result._fields)
+    return Result(Grade(grade), *others)

@@ -1,7 +1,8 @@
 """The command line: options, exit codes, and which function does what.
 
 Exit codes: 0 done; 1 done, and the answer is no; 2 the input was wrong, one line on
-stderr; 3 a fault of ours, with a traceback; 130 interrupted.
+stderr; 3 a fault of ours, with a traceback; 129 hung up (SIGHUP), 130 interrupted, 143
+terminated (SIGTERM).
 """
 
 from __future__ import annotations
@@ -9,14 +10,18 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from typing import NoReturn
 
 from harness.errors import InputError, one_line
+from harness.processes.termination import TerminatedError, ended_by_signals
 from harness.registry import PluginFile
 from mortarbench.arguments import FORMATS, GATES
 from mortarbench.registries import Registries, installed
@@ -39,6 +44,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(registries: Registries, argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
+    _open_standard_streams()
     _show_what_can_be_shown()
     try:
         return _run(registries, argv)
@@ -68,12 +74,22 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
             "generator": processes.case_worker,
         }  # fmt: skip
         return starts[argv[0]](registries, argv[1:])
+    for argument in takewhile(lambda text: text != "--", argv):
+        if re.fullmatch(r"--[\w-]+=--", argument):  # argparse would drop the value
+            option = argument.removesuffix("=--")
+            raise InputError(f"{argument}: -- is no value; expected {option}=VALUE")
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
-    run: _Run = import_module(options.module).run
-    code = run(registries, options)
-    print(end="", flush=True)  # here, where a reader that has gone is no surprise
+    with ended_by_signals():
+        run: _Run = import_module(options.module).run
+        try:
+            code = run(registries, options)
+        except TerminatedError:
+            if argv[:1] != ["run"]:  # which says that it can be continued
+                _complain("terminated")
+            raise
+        print(end="", flush=True)  # here, where a reader that has gone is no surprise
     return code
 
 
@@ -99,8 +115,22 @@ def _remedied(e: OSError, path: Path) -> str:
 
 def _complain(message: str) -> int:
     """Say in one line what is wrong, and return the exit code of wrong input."""
-    print(f"mortarbench: {one_line(message)}", file=sys.stderr)
+    with suppress(OSError):  # nobody reads it
+        print(f"mortarbench: {one_line(message)}", file=sys.stderr, flush=True)
     return 2
+
+
+def _open_standard_streams() -> None:
+    """Open /dev/null where a standard stream is closed.
+
+    Its number would else be that of the next file, into which libraries would print.
+    """
+    while (fd := os.open(os.devnull, os.O_RDWR)) < len(_STREAMS):
+        os.set_inheritable(fd, True)
+    os.close(fd)
+    for fd, (name, mode) in enumerate(_STREAMS.items()):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(fd, mode, closefd=False))
 
 
 def _show_what_can_be_shown() -> None:
@@ -116,6 +146,11 @@ def _print_no_more() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+_STREAMS = {
+    "stdin": "r",
+    "stdout": "w",
+    "stderr": "w",
+}  #: in the order of their numbers
 _CASE = "FAMILY/key=value/…/FORM, as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md"
 _RESULTS = "a result folder, as `run` writes it"
 
@@ -260,6 +295,7 @@ def _add_solve_options(command: _Parser) -> None:
     _add_option(command, "an option of the solver, instead of its default")
     command.add_argument(
         "--mpi",
+        "--ranks",
         metavar="N",
         type=int,
         default=1,
@@ -275,8 +311,8 @@ def _add_solve_options(command: _Parser) -> None:
         "--scale",
         metavar="S",
         type=float,
-        default=1.0,
-        help="multiply the displacement in the picture; default: 1",
+        help="multiply the displacement in the picture; default: 1 where it can be "
+        "seen, else a round factor that the picture states",
     )
     command.add_argument(
         "--vtu",
@@ -284,6 +320,11 @@ def _add_solve_options(command: _Parser) -> None:
         type=Path,
         help="write them for ParaView, and a CSV along each contact; FILE.pvd: all "
         "load steps up to this one",
+    )
+    command.add_argument(
+        "--mesh-error",
+        action="store_true",
+        help="estimate the error of the mesh, too, from finer ones (at most a minute)",
     )
     _add_plugin(command)
     _add_json(command)
@@ -348,6 +389,11 @@ def _add_report_options(command: _Parser) -> None:
         metavar=",".join(GATES),
         help="exit with 1 where a verdict became worse, or a solver slower beyond "
         "chance, from DIR to DIR2",
+    )
+    command.add_argument(
+        "--verbose",
+        action="store_true",
+        help="print the path of every file that was written, not of the page alone",
     )
     _add_json(command)
 
@@ -474,6 +520,11 @@ def _add_run_options(command: _Parser) -> None:
         "--strict",
         action="store_true",
         help="exit with 1 where a claim is refuted or a solver failed",
+    )
+    command.add_argument(
+        "--quiet",
+        action="store_true",
+        help="print only warnings and what could not be measured",
     )
     _add_json(command)
 

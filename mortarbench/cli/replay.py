@@ -14,7 +14,7 @@ def run(registries: Registries, options: Namespace) -> int:
     existing(options.folder)
     registries = registries.with_files(options.plugin)
 
-    from mortarbench.replay import render, replay
+    from mortarbench.replaying import render, replay
 
     found = replay(options.folder, options.run_id, registries=registries)
     print(json.dumps(found.to_dict()) if options.json else render(found))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
 
 from harness.checked import positive
 from harness.errors import InputError
@@ -38,8 +40,15 @@ def run(registries: Registries, options: Namespace) -> int:
     if options.json:
         print(json.dumps(found.to_dict(), allow_nan=False))
     else:
-        pages = [file for file in found.files if file.suffix == ".html"]
-        shown = pages or found.files if options.others else found.files
+        shown = found.files if options.verbose else _main_paths(found.files)
         failed = [f"failed on {', '.join(found.failed_on)}"] * bool(found.failed_on)
         print(*found.said, *shown, *failed, sep="\n")
     return 1 if found.failed_on else 0
+
+
+def _main_paths(files: Sequence[Path]) -> list[Path]:
+    """List the pages to open: HTML, else Markdown, else the folders of the files."""
+    for suffix in (".html", ".md"):
+        if pages := [file for file in files if file.suffix == suffix]:
+            return pages
+    return list(dict.fromkeys(file.parent for file in files))

@@ -27,10 +27,10 @@ def run(registries: Registries, options: Namespace) -> int:
     changed = given_options(options.option)
 
     from mortarbench import results
-    from mortarbench.progress import shown_on
+    from mortarbench.progress import quiet_on, shown_on
     from mortarbench.reporting import report
 
-    with shown_on(sys.stderr) as progress:
+    with quiet_on(sys.stderr) if options.quiet else shown_on(sys.stderr) as progress:
         found = results.run(
             path,
             out=options.out,
@@ -45,18 +45,21 @@ def run(registries: Registries, options: Namespace) -> int:
             progress=progress,
             registries=registries,
         )
-    if not options.json:
+    if not options.json and not options.quiet:
         print(found)
     pages: list[Path] = []
+    said: tuple[str, ...] = ()
     if found.records:
         with full_disk_told(found.folder):
-            files = report(found.folder, registries=registries).files
-        pages = [file for file in files if file.suffix == ".html"]
+            written = report(found.folder, registries=registries)
+        pages = [file for file in written.files if file.suffix == ".html"]
+        said = written.said
     failed = len(found.refuted) + len(found.failed) if options.strict else 0
     if options.json:
         print(json.dumps({**found.to_dict(), "pages": [*map(str, pages)]}))
     else:
-        for line in [*pages, *[_strict(found)] * bool(failed)]:
+        summary = found.shortfall if options.quiet else [*said, *pages]
+        for line in [*summary, *[_strict(found)] * bool(failed)]:
             print(line)
     return 1 if found.shortfall or failed else 0
 

@@ -6,11 +6,12 @@ import json
 import os
 import sys
 from argparse import Namespace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from harness.distributed.mpi import ranks_asked
 from harness.errors import InputError, say
-from harness.names import emitted_by_ranks, parse
+from harness.names import assemble, emitted_by_ranks, parse
 from harness.registry import check_name
 from harness.suite.solver_options import options_for
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
@@ -25,23 +26,12 @@ if TYPE_CHECKING:
 
 def run(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
-    tolerance(options.tol, "--tol")
-    if options.plot is not None:
-        writable(options.plot, PICTURES)
-    drawn_scale(options.scale, "--scale")
-    if options.plot is None and options.scale != 1.0:
-        raise InputError(
-            f"--scale {options.scale:g} without --plot; expected a picture"
-        )
-    if options.vtu is not None:
-        writable(options.vtu, GRIDS)
-    ranks_asked(options.mpi, "--mpi")
+    _check(options)
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
     changed = options_for(options.solver, options.option, registries.solvers)
 
-    from harness.record import Verdict
     from mortarbench.answer import answers_of
     from mortarbench.case import Case
 
@@ -56,17 +46,44 @@ def run(registries: Registries, options: Namespace) -> int:
         if drawn or options.mpi == 1 or not (is_ours and emitted_by_ranks(parsed)):
             _build(case, drawn)  # after the fork, which has no use for it
         answer = solved(case, options.tol)
-    record = answer.record
-    if options.json:
-        print(json.dumps(answer.to_dict(), allow_nan=False))
-    elif record.verdict is not Verdict.DECLINED:
-        print(answer)
-        _show_iterations(answer)
-    if record.verdict is Verdict.DECLINED:
-        say(f"{record.solver} declines {record.case}: {record.message}")
+    _print(answer, options)
     if drawn:
         _draw(answer, options)
-    return 0 if record.verdict is Verdict.VERIFIED else 1
+    return 0 if answer.verdict.is_verified else 1
+
+
+def _check(options: Namespace) -> None:
+    """Refuse options out of range, before any work is done."""
+    tolerance(options.tol, "--tol")
+    if options.plot is not None:
+        writable(options.plot, PICTURES)
+    if options.scale is not None:
+        drawn_scale(options.scale, "--scale")
+    if options.plot is None and options.scale is not None:
+        raise InputError(
+            f"--scale {options.scale:g} without --plot; expected a picture"
+        )
+    if options.vtu is not None:
+        writable(options.vtu, GRIDS)
+    ranks_asked(options.mpi, "--mpi")
+
+
+def _print(answer: Answer, options: Namespace) -> None:
+    """Print the answer, and the error of the mesh where it was asked for."""
+    from harness.record import Verdict
+
+    record = answer.record
+    mesh = answer.mesh_error() if options.mesh_error else None
+    if options.json:
+        data = answer.to_dict() | ({"discretisation": asdict(mesh)} if mesh else {})
+        print(json.dumps(data, allow_nan=False))
+    elif record.verdict is not Verdict.DECLINED:
+        print(answer)
+        if mesh is not None:
+            print(f"error of the mesh, relative, in the energy norm: {mesh}")
+        _show_iterations(answer)
+    if record.verdict is Verdict.DECLINED:
+        say(f"{record.solver} declines {record.case}: {record.message}{_hint(answer)}")
 
 
 def _build(case: Case, drawn: Sequence[str]) -> None:
@@ -76,6 +93,28 @@ def _build(case: Case, drawn: Sequence[str]) -> None:
     if drawn and case.made.fields is None:
         wanted = ", ".join(f"--{o}" for o in drawn)
         raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
+
+
+def _hint(answer: Answer) -> str:
+    """Name the dual of a case if its solver declines it for its inequality rows."""
+    case = answer.case
+    if case.form != "primal" or "dual" not in case.id.family.forms:
+        return ""
+    import numpy as np
+
+    from harness.qp import no_rows
+    from harness.registry import resolve
+
+    qp = case.made.qp
+    n = qp.q.size
+    like_dual = replace(qp, G=no_rows(n), h=qp.h[:0], lb=0 * qp.q, ub=0 * qp.q + np.inf)
+    solver = resolve(answer.spec, case.registries.solvers)
+    try:
+        dual = assemble(case.id.family, case.params, "dual").name
+        declined = solver.declines(like_dual)  # bounds in place of inequality rows
+    except Exception:  # the family's or the solver's code: there is no hint then
+        return ""
+    return "" if declined else f"; dualise inequality rows first: solve {dual}"
 
 
 def _loads_from_here() -> bool:

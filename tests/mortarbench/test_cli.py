@@ -197,13 +197,27 @@ def test_an_exported_qp_is_the_emitted_one_and_says_whose_it_is(cli, tmp_path):
 
 def test_report_names_the_files_that_it_wrote(cli, tmp_path):
     (tmp_path / "folder").mkdir()
-    code, out, _ = cli("report", "folder", "--format", "md,tex")
+    code, out, _ = cli("report", "folder", "--format", "md,tex", "--verbose")
 
     assert (code, out.splitlines()) == (
         0,
         ["folder/index.md", "folder/index.tex"],
     )
-    assert len(cli("report", "folder")[1].splitlines()) == 5
+    assert len(cli("report", "folder", "--verbose")[1].splitlines()) == 5
+
+
+@pytest.mark.parametrize(
+    ("formats", "printed"),
+    [("md,html,csv", "index.html"), ("csv,md", "index.md"), ("csv,tex", "")],
+)
+def test_report_prints_the_main_path_only(cli, tmp_path, formats, printed):
+    """The page; where there is none, the folder of what was written."""
+    (tmp_path / "folder").mkdir()
+    code, out, err = cli("report", "folder", "--format", formats)
+
+    assert (code, err) == (0, "")
+    assert Path(out.strip()) == Path("folder") / printed
+    assert len(out.splitlines()) == 1
 
 
 def test_report_judges_at_the_factor_that_is_asked_for(cli, tmp_path):
@@ -244,8 +258,10 @@ def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(
         0,
         ["one and two at 3", "nothing changed", "two/html.html"],
     )
-    _, out, _ = cli(*argv, "--format", "csv,md")
+    _, out, _ = cli(*argv, "--format", "csv,md", "--verbose")
     assert out.splitlines()[2:] == ["two/csv.csv", "two/md.md"]
+    _, out, _ = cli(*argv, "--format", "csv,md")
+    assert out.splitlines()[2:] == ["two/md.md"]
 
 
 @pytest.mark.parametrize("factor", ["0", "-1", "nan", "inf"])
@@ -827,3 +843,56 @@ def test_the_registries_are_not_changed_by_plugins(registries, tmp_path):
     assert set(extended.solvers) == {*SOLVERS, "times"}
     assert set(extended.families) == {"well", "pit"}
     assert registries == before
+
+
+def test_a_quiet_run_prints_nothing_where_all_was_measured(cli):
+    assert cli("run", "tiny", "--quiet") == (0, "", "")
+    code, out, err = cli("run", "tiny", "--quiet", "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(out)["solvers"]["exact"] == {"verified": 6}
+
+
+def test_a_quiet_run_prints_warnings_and_what_it_could_not_do(
+    cli, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 99.0, 99.0))
+    (tmp_path / "s.toml").write_text(
+        "name = 's'\nsolvers = ['lost']\n[[problems]]\nfamily = 'well'\n"
+        "forms = ['primal']\n"
+    )
+    code, out, err = cli("run", "s.toml", "--quiet", "--strict", "--repeats", "1")
+
+    assert code == 1
+    assert out.startswith("strict: 1 measurement without an answer (lost on well/pri")
+    assert err.count("\n") == 1
+    assert "other programs keep 99.0 cores busy" in err
+
+
+def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypatch):
+    """A command can solve the dual of a problem; of a QP in a file there is none."""
+    from mortarbench import QP, export
+
+    monkeypatch.chdir(tmp_path)
+    case = "beam-ring/Nr=2/Nh=2/steps=1"
+
+    def declined(name, solver):
+        assert main(Registries(), ["solve", name, "--solver", solver]) == 1
+        return capsys.readouterr().err
+
+    assert f"dualise inequality rows first: solve {case}/dual\n" in declined(
+        f"{case}/primal", "smalbe"
+    )
+    export(QP.from_arrays([[1.0]], [0.0], G=[[1.0]], h=[1.0]), "a.npz")
+    assert declined("file:a.npz", "smalbe") == (
+        "mortarbench: smalbe declines file:a.npz: takes bounds and equality rows, no "
+        "inequality rows\n"
+    )
+    assert "dualise" not in declined(f"{case}/primal", "feti")
+
+
+def test_the_dual_that_a_decline_names_is_solved(capsys):
+    case = "beam-ring/Nr=2/Nh=2/steps=1"
+    main(Registries(), ["solve", f"{case}/primal", "--solver", "smalbe-direct"])
+    named = capsys.readouterr().err.rpartition("solve ")[2].strip()
+
+    assert main(Registries(), ["solve", named, "--solver", "smalbe-direct"]) == 0

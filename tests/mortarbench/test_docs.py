@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from importlib.metadata import version
 
 import pytest
 import yaml
@@ -162,3 +163,20 @@ def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, cap
             allowed = {0, 1} if by_chance else {0}
             assert main(Registries(), words) in allowed, (words, capsys.readouterr())
     assert (tmp_path / "out/ci/new/report/against-base/index.html").is_file()
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper():
+    """CITATION.cff, and the BibTeX of the README, which must not disagree."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    bibtex = (ROOT / "README.md").read_text("utf-8").partition("```bibtex\n")[2]
+    fields = dict(re.findall(r"^  (\w+) += \{(.*)\},$", bibtex, re.M))
+    (paper,) = citation["references"]
+
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["version"] == fields["version"] == version("mortarbench")
+    assert citation["title"] == re.sub("[{}]", "", fields["title"])
+    assert citation["license"] == fields["license"] == "BSD-3-Clause"
+    assert paper["doi"] == "10.4203/ccc.9.10.5"
+    assert [a["family-names"] for a in paper["authors"]] == [
+        "Pospíšil", "Světlík", "Varga", "Čermák",
+    ]  # fmt: skip

@@ -88,6 +88,9 @@ SHORTER = {
     "mortarbench report out/make-demo --factor 1": (
         "mortarbench report out/demo --format md --factor 1"
     ),
+    "mortarbench report out/make-demo --verbose": (
+        "mortarbench report out/demo --format md --verbose"
+    ),
     "mortarbench report out/make-demo --pool-forms": (
         "mortarbench report out/demo --format csv --pool-forms"
     ),

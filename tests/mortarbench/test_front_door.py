@@ -88,6 +88,20 @@ def test_an_answer_is_judged_certified_and_told(answer):
     assert json.loads(json.dumps(answer.to_dict()))["case"] == SMALL
 
 
+def test_an_answer_says_what_the_mesh_adds_to_its_error():
+    """The patch test's solution is in the space; a cantilever has no finer mesh."""
+    patch, beam = (
+        mb.solve(name, "clarabel")
+        for name in ("contact-patch/primal", "cantilever/ny=1/primal")
+    )
+
+    assert "the mesh adds more" in repr(patch)
+    assert patch.mesh_error().kind == "rounding"
+    assert str(patch.mesh_error()).startswith("less than ")
+    assert str(beam.mesh_error()).startswith("unknown: ")
+    assert "cantilever offers no refined mesh" in beam.mesh_error().note
+
+
 def test_an_answer_is_drawn_and_written_for_paraview(answer, tmp_path):
     figure = answer.plot(tmp_path / "a.pdf")
 
@@ -190,7 +204,9 @@ def test_a_report_names_its_page(results, svg_only):
         compared = mb.report(results.folder, results.folder, formats=["md"])
 
     assert found.page == results.folder / "report/index.html"
-    assert repr(found) == str(found.page)
+    assert repr(found).splitlines() == [*found.said, str(found.page)]
+    assert len(found.said) == 1
+    assert "exact" in found.said[0]
     assert str(found.page) in found._repr_html_()
     assert compared.said
 

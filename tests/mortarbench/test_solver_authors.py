@@ -12,8 +12,8 @@ from harness.registry import load_plugin
 from harness.results.journal import read_journal
 from harness.suite.suite import load_suite
 from mortarbench.cli.main import main
-from mortarbench.cli.test_solver import conforms
 from mortarbench.registries import Registries
+from mortarbench.validation import Conformance
 from tests.support import TOY_PROBLEM
 
 TOY = load_plugin(TOY_PROBLEM)
@@ -169,7 +169,7 @@ def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
 
     assert (code, out) == (0, "my-own.py\n")
     assert "mortarbench test-solver my-own --plugin my-own.py" in err
-    assert conforms(results)
+    assert Conformance(solver="my-own", results=results).conforms
     declined = {c for c, r in results.items() if r.grade is Grade.DECLINE}
     assert declined == {"solves a sequence"}
 

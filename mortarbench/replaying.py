@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from html import escape
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -11,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from harness import checked
+from harness.checked import text
 from harness.environment.environment import digest
 from harness.errors import FaultError, InputError
 from harness.files.store import Arrays, digest_of, load_solution, point_arrays
@@ -20,7 +23,7 @@ from harness.results.stored_run import StoredRun, open_stored_run, work_unit_of
 from harness.results.work_unit import Result, Unbuilt, Unmade
 from harness.running.executor import one_by_one
 from harness.solution import Status
-from mortarbench.registries import Plugins, Registries, known
+from mortarbench.registries import TURN, Plugins, Registries, known
 from mortarbench.text import aligned
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
@@ -28,7 +31,7 @@ _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
 _SHOWN = 48  #: characters of a value of an environment
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Replay:
     """A stored measurement (`then`) and its repetition (`now`)."""
 
@@ -49,6 +52,12 @@ class Replay:
         """Whether the same QP got the same verdict."""
         return self.same_qp is not False and self.then.verdict is self.now.verdict
 
+    def __repr__(self) -> str:
+        return render(self)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data for JSON."""
         lines = {"then": self.then.to_dict(), "now": self.now.to_dict()}
@@ -62,6 +71,7 @@ class Replay:
         return data
 
 
+@TURN
 def replay(
     folder: str | Path,
     run_id: str,
@@ -85,9 +95,11 @@ def replay(
         When something else than the solver prevented it.
 
     """
-    registries = known(plugins) if registries is None else registries
+    registries = known(plugins, registries)
     families, solvers = registries.families, registries.solvers
-    stored = open_stored_run(Path(folder), run_id, families, solvers)
+    stored = open_stored_run(
+        checked.path("folder", folder), text("run_id", run_id), families, solvers
+    )
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
     commands = registries.commands([stored.spec])
@@ -239,9 +251,12 @@ def _ratio(
 def _keyed(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Name each thread pool by its library, so that one that differs is named."""
     threads = environment.get("threads")
-    if not isinstance(threads, Mapping) or "pools" not in threads:
+    if not isinstance(threads, Mapping):
         return dict(environment)
-    pools = {f"{p['library']} of {p['owner']}": p for p in threads["pools"]}
+    found = threads.get("pools")
+    if not isinstance(found, list) or not all(isinstance(p, Mapping) for p in found):
+        return dict(environment)
+    pools = {f"{p.get('library')} of {p.get('owner')}": p for p in found}
     return {**environment, "threads": {**threads, "pools": pools}}
 
 

@@ -1,0 +1,522 @@
+"""The library in a script: QPs and solver objects, answers from elsewhere, refusals."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix
+
+import mortarbench as mb
+from harness import plugin
+from mortarbench.registries import Registries
+from tests.support import TOY_PROBLEM
+
+pytestmark = pytest.mark.together
+
+SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
+#: min ½(x₁² + 2x₂²) − x₁ − x₂ with x₁ ≤ ½: x = (½, ½), z = ½
+QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
+
+
+@dataclass(frozen=True)
+class ActiveRow:
+    """Solves the QP above if its row is active; `shift` moves the answer."""
+
+    shift: float = 0.0
+
+    def declines(self, qp):
+        return None if (qp.q.size, qp.h.size) == (2, 1) else "other sizes"
+
+    def prepare(self, qp, tol):
+        x = np.array([qp.h[0], -qp.q[1] / 2]) + self.shift
+        z = np.array([-qp.q[0] - qp.h[0]])
+        none = np.zeros(0)
+        solution = mb.Solution(
+            status=mb.Status.SOLVED, x=x, y=none, z=z, z_box=np.zeros(2)
+        )
+        return lambda: solution
+
+
+def test_a_qp_is_solved_like_a_case():
+    answer = mb.solve(QP, "clarabel", 1e-8)
+
+    assert answer.verdict is mb.Verdict.VERIFIED
+    assert answer.solution.x == pytest.approx([0.5, 0.5], abs=1e-7)
+    assert answer.solution.z == pytest.approx([0.5], abs=1e-7)
+    assert answer.case.name == answer.record.case == "qp"
+    assert "verified (claimed solved)" in repr(answer)
+
+
+def test_a_solver_object_is_measured_in_a_process_of_its_own():
+    answer = mb.solve(QP, ActiveRow())
+
+    assert answer.verdict is mb.Verdict.VERIFIED
+    assert answer.residuals.worst == 0
+    assert answer.record.solver == "ActiveRow"
+    assert answer.record.peak_mib > 0
+    assert mb.solve(QP, ActiveRow(shift=1e-3)).verdict is mb.Verdict.WRONG
+    assert mb.solve(SMALL, ActiveRow()).record.message == "other sizes"
+
+
+def test_fields_of_a_solver_object_are_its_options():
+    assert mb.solve(QP, ActiveRow(shift=0.5)).record.options == {"shift": 0.5}
+    answer = mb.solve(QP, ActiveRow(), options={"shift": 0.25})
+    assert answer.solution.x.tolist() == [0.75, 0.75]
+    assert mb.solve(QP, ActiveRow(), shift=0.25).solution.x.tolist() == [0.75, 0.75]
+    with pytest.raises(mb.InputError, match="unknown option 'shif'; did you mean 'sh"):
+        mb.solve(QP, ActiveRow(), shif=1)
+
+
+def test_an_option_that_cannot_be_written_down_is_refused(tmp_path):
+    """Where the default is None, every type is accepted until a worker is started."""
+    file = tmp_path / "free.py"
+    file.write_text(
+        "from dataclasses import dataclass\n"
+        "@dataclass(frozen=True)\n"
+        "class Free:\n"
+        "    guess: object = None\n"
+        "    def declines(self, qp): return 'always'\n"
+        "    def prepare(self, qp, tol): pass\n"
+        "SOLVERS = {'free': Free()}\n"
+    )
+    assert mb.solve(QP, "free", plugins=[file], guess=[1, 2]).verdict == "declined"
+    with pytest.raises(
+        mb.InputError, match=r"free: options {'guess': <object .*expecte"
+    ):
+        mb.solve(QP, "free", plugins=[file], guess=object())
+
+
+def test_options_of_a_named_solver_may_be_keywords():
+    assert mb.solve(QP, "clarabel", max_iter=7).record.options["max_iter"] == 7
+
+
+def test_a_solver_object_meets_a_case_of_a_plug_in():
+    case = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
+
+    assert mb.solve(case, ActiveRow()).verdict is mb.Verdict.DECLINED
+    assert mb.solve(QP, "lost", plugins=[TOY_PROBLEM]).verdict is mb.Verdict.FAILED
+
+
+SCRIPT = """
+import mortarbench as mb, numpy as np
+import beside
+from beside import HALF
+
+NAMES = {"x": "a name that the class looks up"}
+
+class Exact:
+    def __init__(self, scale):
+        self.scale = scale
+        self.keep = lambda v: v * scale
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        assert NAMES["x"]
+        x = self.keep(beside.solve(qp.P.diagonal(), qp.q)) / self.scale + 0 * HALF
+        zero = np.zeros(0)
+        return lambda: mb.Solution(
+            status=mb.Status.SOLVED, x=x, y=zero, z=zero, z_box=0 * x
+        )
+
+qp = mb.QP.from_arrays(np.diag([1.0, 4.0]), [-1.0, -2.0])
+answer = mb.solve(qp, Exact(3.0))
+print(answer.verdict, answer.solution.x.tolist(), answer.record.solver)
+found = mb.test_solver(Exact(2.0), checks=["solves a sequence"])
+print(*(result.grade for result in found.results.values()))
+"""
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
+    """Also where the script has other threads, as a notebook has, so must not fork."""
+    (tmp_path / "beside.py").write_text(
+        "HALF = 0.5\ndef solve(d, q):\n    return -q / d\n"
+    )
+    start = (
+        "import threading, time\n"
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+    )
+    (tmp_path / "script.py").write_text(start * threads + SCRIPT)
+    done = subprocess.run(
+        [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+
+    assert done.stdout.splitlines() == ["verified [1.0, 0.5] Exact", "decline"], (
+        done.stderr
+    )
+
+
+def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_path):
+    """The script's own `solvers.py` and `msgspec.py` come first in the script only."""
+    for name in ("solvers", "msgspec"):
+        (tmp_path / f"{name}.py").write_text("raise ImportError('not for workers')\n")
+    (tmp_path / "helper.py").write_text(
+        "import mortarbench as mb, numpy as np\n"
+        "class Zero:\n"
+        "    def declines(self, qp): return None\n"
+        "    def prepare(self, qp, tol):\n"
+        "        z = np.zeros\n"
+        "        return lambda: mb.Solution(status=mb.Status.SOLVED, x=z(qp.q.size), "
+        "y=z(0), z=z(0), z_box=z(qp.q.size))\n"
+    )
+    program = (
+        "import sys; here = sys.path.pop(0)\n"
+        "import mortarbench as mb\n"
+        f"sys.path.append({str(tmp_path)!r})\n"
+        "from helper import Zero\n"
+        "print(mb.solve(mb.QP.from_arrays([[1.0]], [0.0]), Zero()).verdict)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+
+    assert done.stdout == "verified\n", done.stderr
+
+
+class _Uncopied(ActiveRow):
+    """Holds what no process can hand to another."""
+
+    def __reduce__(self):
+        raise TypeError("cannot pickle the handle of a library")
+
+
+class _Unloaded(ActiveRow):
+    """Is copied, and cannot be put together again."""
+
+    def __reduce__(self):
+        return int, ("not a number",)
+
+
+def test_a_solver_that_cannot_be_copied_is_refused_with_the_remedy():
+    message = (
+        r"solver _Uncopied cannot be copied into a worker process: cannot pickle the "
+        r"handle of a library; expected .* or its name and plugins=\[FILE.py\]"
+    )
+    for call in (lambda s: mb.solve(QP, s), mb.test_solver):
+        with pytest.raises(mb.InputError, match=message):
+            call(_Uncopied())
+
+
+def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
+    answer = mb.solve(QP, _Unloaded())
+
+    assert answer.verdict is mb.Verdict.CRASHED
+    assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
+
+
+def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
+    """The series needs the solver once more, by object or from its plug-in."""
+    plugin_file = tmp_path / "clara.py"
+    plugin_file.write_text(
+        "from solvers import SOLVERS as ALL\nSOLVERS = {'clara': ALL['clarabel']}\n"
+    )
+    name = "beam-ring/Nr=2/Nh=2/steps=2/step=2/dual"
+    answer = mb.solve(mb.build(name), "clara", plugins=[plugin_file])
+
+    assert answer.save_vtu(tmp_path / "a.pvd").is_file()
+
+
+# Answers from elsewhere.
+
+
+def test_a_point_is_verified_with_and_without_its_multipliers():
+    found = mb.verify(QP, [0.5, 0.5], z=[0.5])
+    alone = mb.verify(QP, [0.5, 0.5])
+
+    assert found.verdict is alone.verdict is mb.Verdict.VERIFIED
+    assert alone.multipliers.z == pytest.approx([0.5], abs=1e-15)
+    assert found.residuals == (0, 0, 0, 0)
+    assert found.objective == -0.625
+    assert repr(alone).startswith("<verified: off the proven optimum by 0")
+
+
+def test_a_point_that_is_not_optimal_is_refuted():
+    assert mb.verify(QP, [0.5, 0.4]).verdict is mb.Verdict.WRONG
+    assert mb.verify(QP, [0.6, 0.5]).verdict is mb.Verdict.WRONG
+    assert mb.verify(QP, [0.5, 0.5 + 1e-5]).verdict is mb.Verdict.INACCURATE
+    assert mb.verify(QP, [0.5, 0.5 + 1e-5], tol=1e-3).verdict is mb.Verdict.VERIFIED
+    assert mb.verify(QP, [np.nan, 0.5]).verdict is mb.Verdict.WRONG
+
+
+def test_wrong_multipliers_are_refuted_at_the_right_point():
+    assert mb.verify(QP, [0.5, 0.5], z=[-0.5]).verdict is mb.Verdict.WRONG
+    assert mb.verify(QP, [0.5, 0.5], z=[0.0]).residuals.dual > 0.1
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
+def test_verify_agrees_with_solve(form):
+    """On the point alone, and on the point with the solver's multipliers."""
+    case = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}")
+    answer = mb.solve(case, "clarabel")
+    s = answer.solution
+    given = mb.verify(case, s.x, s.y, s.z, s.z_box)
+
+    assert answer.verdict is mb.Verdict.VERIFIED
+    assert given.residuals == answer.residuals
+    assert mb.verify(case.qp, s.x).verdict is mb.Verdict.VERIFIED
+    assert mb.verify(case, 0.999 * s.x).verdict is not mb.Verdict.VERIFIED
+
+
+# Exports.
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
+def test_sparse_matrices_of_a_case_are_csc_with_narrow_indices(form):
+    """The types that qpsolvers (csc_matrix only) and OSQP (32-bit indices) take."""
+    qp = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}").qp
+    for M in (qp.P, qp.G, qp.A):
+        if not isinstance(M, np.ndarray):
+            assert isinstance(M, csc_matrix)
+            assert {M.indices.dtype, M.indptr.dtype} == {np.dtype(np.int32)}
+            assert M.has_canonical_format
+
+
+def test_a_qp_is_the_same_whether_its_case_or_itself_is_solved():
+    case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/primal")
+    by_name, by_qp = mb.solve(case, "clarabel"), mb.solve(case.qp, "clarabel")
+
+    assert by_qp.solution.x.tolist() == by_name.solution.x.tolist()
+
+
+def test_an_operator_gives_its_matrix_by_a_product_with_the_identity():
+    qp = mb.build("membranes/S=2/n=4/dual").qp
+    P = qp.P @ np.eye(qp.q.size)
+
+    assert not qp.is_explicit
+    assert np.abs(P - P.T).max() <= 1e-12 * np.abs(P).max()
+    assert np.linalg.eigvalsh(P)[0] >= -1e-10 * np.abs(P).max()
+
+
+@pytest.mark.parametrize("ending", ["npz", "mat", "parquet", "qps"])
+@pytest.mark.parametrize("what", [QP, SMALL])
+def test_what_is_exported_is_the_same_qp(tmp_path, monkeypatch, what, ending):
+    monkeypatch.chdir(tmp_path)
+    path = mb.export(what, f"qp.{ending}")
+    qp = what if isinstance(what, mb.QP) else mb.build(what).qp
+    back = mb.build(f"file:{path}").qp
+    x = np.random.default_rng(0).standard_normal(qp.q.size)
+
+    assert back.objective(x) == pytest.approx(qp.objective(x), rel=1e-12)
+    assert back.sizes == qp.sizes
+
+
+def test_the_parts_in_an_npz_are_those_that_solvers_take(tmp_path):
+    with np.load(
+        mb.export(SMALL.replace("dual", "primal"), tmp_path / "a.npz")
+    ) as file:
+        assert file["P_indices"].dtype == file["G_indptr"].dtype == np.int32
+
+
+# Suites, figures, replays, conformance.
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    out = tmp_path_factory.mktemp("results")
+    suite = {
+        "name": "from-python",
+        "tolerances": (1e-6,),
+        "repeats": 1,
+        "solvers": ["clarabel", {"name": "osqp", "options": {"max_iter": 5000}}],
+        "problems": [
+            {
+                "family": "beam-ring",
+                "forms": ["dual"],
+                "params": {"Nr": np.array([2, 3, 4]), "Nh": 2, "steps": 1},
+            }
+        ],
+    }
+    return mb.run(suite, out=out)
+
+
+def test_a_suite_may_be_a_dict(results):
+    assert len(results) == 6
+    assert set(results.df.status) == {"verified"}
+    written = (results.folder / "suite.toml").read_text("utf-8")
+    again = results.folder.parent / "again.toml"
+    again.write_text(written)
+    assert len(mb.run(again, out=results.folder)) == 6  # the same suite: all is there
+
+
+@pytest.mark.parametrize(
+    ("suite", "message"),
+    [
+        ({}, "suite: name is missing"),
+        ({"name": None}, "suite: name = None; expected a text, .*leave out keys"),
+        ({5: 5}, "suite: key 5; expected a text"),
+        ({"name": "a", "solvers": [object()]}, r"suite: solvers\[0\] = <object"),
+        ({"name": "a", "problem": []}, "suite: unknown key 'problem'; did you mean"),
+        (
+            {"name": 'a"\nb', "solvers": ["osqp"], "problems": []},
+            "suite: name = .* without control characters",
+        ),
+    ],
+)
+def test_a_dict_that_is_no_suite_is_refused_in_one_line(tmp_path, suite, message):
+    with pytest.raises(mb.InputError, match=message) as e:
+        mb.run(suite, out=tmp_path)
+    assert "\n" not in str(e.value)
+
+
+def test_a_figure_of_the_report_is_drawn(results, tmp_path):
+    figure = results.plot("accuracy", tmp_path / "a.svg")
+
+    assert figure.axes
+    assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
+    assert results.plot("scaling").axes  # the only one of its kind, scaling-1
+
+
+def test_an_unknown_figure_is_refused_with_those_that_there_are(results, tmp_path):
+    with pytest.raises(mb.InputError, match=r"unknown figure 'acuracy'; did you mean "
+                       r"'accuracy'\? known: accuracy, .*scaling-1"):  # fmt: skip
+        results.plot("acuracy")
+    with pytest.raises(mb.InputError, match=r"unknown format '\.txt'"):
+        results.plot("accuracy", tmp_path / "a.txt")
+
+
+def test_a_measurement_is_replayed(results):
+    found = mb.replay(results.folder, results.df.run_id[0])
+
+    assert found.reproduced
+    assert found.same_qp
+    assert repr(found).endswith("Reproduced: the same verdict.")
+
+
+def test_the_name_of_a_function_is_not_taken_by_a_module():
+    """Whatever was imported before: a submodule is an attribute of its package."""
+    program = (
+        "import pkgutil, importlib, mortarbench as mb\n"
+        "names = {m.name for m in pkgutil.iter_modules(mb.__path__)} - {'__main__'}\n"
+        "for n in names: importlib.import_module(f'mortarbench.{n}')\n"
+        "print([n for n in mb.__all__ if type(getattr(mb, n)).__name__ == 'module'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+
+    assert done.stdout == "[]\n"
+
+
+def test_a_solver_object_goes_through_the_conformance_suite():
+    """Of a solver that knows one QP only, every check declines or shows its fault."""
+    checks = ["solves a sequence"]
+    found = mb.test_solver(ActiveRow(), checks=checks)
+
+    assert found.solver == "ActiveRow"
+    assert not found.conforms
+    assert list(found.results) == checks
+    assert json.loads(json.dumps(found.to_dict()))["checks"][0]["grade"] == "decline"
+    assert "ActiveRow: 0 pass, 1 decline" in repr(found)
+    with pytest.raises(mb.InputError, match="unknown check 'solves'"):
+        mb.test_solver("clarabel", checks=["solves"])
+
+
+# Names.
+
+
+def test_completion_lists_public_names_only():
+    assert dir(mb) == sorted(mb.__all__)
+    assert not [name for name in dir(mb) if name.startswith("_")]
+
+
+def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
+    assert {"QP", "Solution", "Status", "Family", "Case"} <= set(dir(mb))
+    assert mb.Case is plugin.Case
+    case = mb.build("obstacle/dim=1/n=4/primal")
+    assert isinstance(case, mb.Case)
+    assert (case.scale, case.constant) == (case.made.scale, case.made.constant)
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from dataclasses import dataclass, field\n"
+        "from mortarbench import QP, Case, Family, Solution, Status\n"
+        "@dataclass(frozen=True)\n"
+        "class Point(Family):\n"
+        "    name: str = 'point'\n"
+        "    defaults: dict = field(default_factory=lambda: {'n': 2}, hash=False)\n"
+        "    forms: tuple = ('primal',)\n"
+        "    def build(self, form, params, reference):\n"
+        "        qp = QP.from_arrays([[2.0]], [-4.0], ub=params['n'])\n"
+        "        return Case(qp=qp, recover=lambda s: s.x,\n"
+        "                    quantities=lambda s: {'x': float(s.x[0])})\n"
+        "PROBLEMS = {'point': Point()}\n"
+    )
+    answer = mb.solve("point/n=1/primal", "clarabel", plugins=[file])
+    assert answer.quantities["x"] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: mb.solve(None, "clarabel"), "case = None; expected the name of a cas"),
+        (lambda: mb.solve(Path("a.npz"), "clarabel"), "QP; a file is 'file:a.npz'"),
+        (
+            lambda: mb.solve(QP, None),
+            "solver = None; expected the name of a solver, or",
+        ),
+        (lambda: mb.solve(QP, ActiveRow), r"is a class; expected .* ActiveRow\(\)"),
+        (
+            lambda: mb.solve(QP, object()),
+            "an object with the methods declines and prep",
+        ),
+        (lambda: mb.solve(QP, "clarable"), "did you mean 'clarabel'"),
+        (
+            lambda: mb.solve(QP, "clarabel", "1e-6"),
+            "tol = '1e-6'; expected a number be",
+        ),
+        (lambda: mb.solve(QP, "clarabel", True), "tol = True; expected a number"),
+        (lambda: mb.solve(QP, "clarabel", tol=None), "tol = None; expected a number"),
+        (
+            lambda: mb.solve(QP, "clarabel", options={5: 5}),
+            "options = {5: 5}; expected",
+        ),
+        (
+            lambda: mb.solve(QP, "clarabel", options=["a"]),
+            r"options = \['a'\]; expected",
+        ),
+        (lambda: mb.solve(QP, "clarabel", options={"a": 5}), "unknown option 'a'"),
+        (
+            lambda: mb.solve(QP, "clarabel", plugins="a.py"),
+            "expected a list of Python f",
+        ),
+        (
+            lambda: mb.solve(QP, "clarabel", plugins=[5]),
+            "plugins = 5; expected a path",
+        ),
+        (lambda: mb.solve(QP, "clarabel", ranks="2"), "ranks = '2'; expected a number"),
+        (lambda: mb.verify(QP, None), "x is missing; expected an array of numbers"),
+        (lambda: mb.verify(QP, [1, 2, 3]), r"x has shape \(3,\); expected \(2,\)"),
+        (lambda: mb.verify(QP, [1, 2], z=[1, 2]), r"z has shape \(2,\); expected \(1,"),
+        (lambda: mb.verify(QP, "ab"), "x is of type <U2; expected an array of numbers"),
+        (lambda: mb.verify(5, [1]), "case = 5; expected the name of a case"),
+        (lambda: mb.verify(QP, [1, 2], tol=0), "tol = 0; expected a number between"),
+        (lambda: mb.export(QP, 5), "path = 5; expected a path"),
+        (lambda: mb.export(QP, "a.txt"), "unknown format '.txt'; expected .npz or"),
+        (lambda: mb.export(5, "a.npz"), "case = 5; expected the name of a case"),
+        (lambda: mb.replay("nowhere", "abc"), "nowhere"),
+        (lambda: mb.replay(None, "abc"), "folder = None; expected a path"),
+        (lambda: mb.replay("nowhere", 5), "run_id = 5; expected a text"),
+        (lambda: mb.test_solver(5), "solver = 5; expected the name of a solver"),
+        (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
+    ],
+)
+def test_what_is_of_the_wrong_type_is_told_what_was_expected(call, message):
+    with pytest.raises(mb.InputError, match=message) as e:
+        call()
+    assert "\n" not in str(e.value)
+
+
+def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
+    case = mb.solve(QP, "clarabel").case
+
+    assert repr(case) == (
+        "<Case qp: 2 variables, 0 equalities, 1 inequalities, 0 bounds>"
+    )
+    assert isinstance(case.registries, Registries)

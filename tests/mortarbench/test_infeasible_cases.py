@@ -1,0 +1,93 @@
+"""A right claim of infeasibility is an answer, from the solver to the report."""
+
+import json
+
+import pytest
+
+import mortarbench as mb
+from harness import Verdict
+from harness.conformance.manufactured import infeasible, manufactured, unbounded
+from harness.files.qpfile import save_qp
+from mortarbench.cli.main import main as command_line
+from mortarbench.registries import Registries
+from reports.data.evidence import read_evidence
+
+
+def main(argv):
+    return command_line(Registries(), argv)
+
+
+@pytest.fixture
+def qps(tmp_path):
+    problems = {
+        "none": infeasible(), "some": manufactured("everything")[0], "far": unbounded()
+    }  # fmt: skip
+    for name, qp in problems.items():
+        save_qp(tmp_path / f"{name}.npz", qp, {"name": name})
+    return tmp_path
+
+
+def write(folder, *names):
+    paths = ", ".join(f'"{folder / name}.npz"' for name in names)
+    text = (
+        'name = "claims"\ntolerances = [1e-6]\nrepeats = 1\n'
+        'solvers = ["osqp", "quadprog"]\n[[problems]]\nfamily = "file"\n'
+        f"params = {{ path = [{paths}] }}\n"
+    )
+    path = folder / "claims.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_solve_ends_well_and_says_so_in_words(qps, capsys):
+    assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp"]) == 0
+    assert "verified infeasible (claimed infeasible)" in capsys.readouterr().out
+    assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "verified_infeasible"
+
+
+def test_a_claim_that_the_objective_is_unbounded_is_not_verified(qps, capsys):
+    assert main(["solve", f"file:{qps}/far.npz", "--solver", "osqp", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["status"] == "infeasible_claim"
+
+
+def test_a_run_counts_it_as_verified_and_a_strict_one_passes(qps, tmp_path, capsys):
+    out = tmp_path / "out"
+    path = write(qps, "none", "some")
+    assert main(["run", path, "--out", str(out), "--strict"]) == 0
+    found = mb.load(out)
+    assert not found.refuted
+    assert not found.failed
+    count = {r.verdict for r in found.records}
+    assert count == {Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE}
+    for factor in (10.0, 0.01, 1e4):
+        outcomes = read_evidence(out, factor).flat
+        none = [o for o in outcomes if "none" in o.case]
+        assert all(o.verified for o in none)
+        assert len(none) == 2
+    assert main(["validate", str(out)]) == 0
+    capsys.readouterr()
+    main(["report", str(out), "--format", "md"])
+    page = (out / "report" / "report.md").read_text()
+    assert "✓ verified infeasible" in page
+    assert "Refuted claims" not in page
+
+
+def test_a_folder_of_nothing_else_is_validated_and_a_forged_proof_is_found(
+    qps, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    main(["run", write(qps, "none"), "--out", str(out)])
+    capsys.readouterr()
+    assert main(["validate", str(out)]) == 0
+    assert "2 claims of infeasibility proven" in capsys.readouterr().out
+
+    forged = tmp_path / "forged"
+    main(["run", write(qps, "far"), "--out", str(forged)])
+    (journal,) = (forged / "journal").glob("*.jsonl")
+    lines = journal.read_text()
+    assert '"infeasible_claim"' in lines
+    journal.write_text(lines.replace('"infeasible_claim"', '"verified_infeasible"'))
+    capsys.readouterr()
+    assert main(["validate", str(forged)]) == 2
+    assert "no certificate of infeasibility was found again" in capsys.readouterr().err

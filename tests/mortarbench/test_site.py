@@ -1,0 +1,103 @@
+"""Formulas of the documentation arrive on the site whole."""
+
+import re
+import sys
+import unicodedata
+from xml.etree import ElementTree
+
+import markdown
+import pytest
+import yaml
+
+from tests.support import ROOT
+
+sys.path.append(str(ROOT / "tools" / "site"))
+import pages  # the hook of mkdocs
+
+SOURCES = {
+    p.name: p
+    for p in (
+        *ROOT.glob("docs/*.md"),
+        *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    )
+}
+#: written from docstrings, which terminals show, and what was written before
+UNICODE = {"solvers.md", "weaknesses.md", "CHANGELOG.md"}
+#: letters of formulas that plain text has no business with
+FORMULA = re.compile(r"[ᵀ‖½√∑Σ∫∂𝒫ᵢⱼₖ⁺λΩ\u0302\u0303]")
+CODE = re.compile(r"^```.*?^```$|`[^`]*`|<!--.*?-->", re.DOTALL | re.MULTILINE)
+
+
+class Loader(yaml.SafeLoader):
+    """mkdocs.yml names Python objects, which are not needed here."""
+
+
+Loader.add_multi_constructor("", lambda *_: None)
+
+
+def rendered(text):
+    """HTML as mkdocs has it before its hooks."""
+    options = yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), Loader)
+    named = [
+        next(iter(e.items())) if isinstance(e, dict) else (e, {})
+        for e in options["markdown_extensions"]
+    ]
+    return markdown.markdown(
+        text, extensions=[name for name, _ in named], extension_configs=dict(named)
+    )
+
+
+def formulas(source):
+    """LaTeX between dollars, found without Markdown."""
+    prose = CODE.sub("", source)
+    found = re.findall(
+        r"\$\$(.+?)\$\$|(?<![\\$])\$(?!\s)([^$]+?)(?<!\s)\$", prose, re.S
+    )
+    return sorted(" ".join((a or b).split()) for a, b in found)
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES))
+def test_every_formula_of_a_page_becomes_mathml(name):
+    source = SOURCES[name].read_text("utf-8")
+    before = rendered(source)
+    after = pages.typeset(before)
+
+    arrived = [
+        " ".join(pages.html.unescape(tex).split())
+        for _, tex in pages.FORMULA.findall(before)
+    ]
+    assert sorted(arrived) == formulas(source)
+    assert after.count("<math") == len(arrived)
+    assert "$" not in re.sub(r"<(code|pre)\b.*?</\1>", "", after, flags=re.S)
+
+
+@pytest.mark.parametrize("name", sorted(SOURCES.keys() - UNICODE))
+def test_no_formula_of_a_page_is_plain_text(name):
+    """LaTeX in the sources, but in code and in the signs of numbers."""
+    prose = CODE.sub("", SOURCES[name].read_text("utf-8"))
+    prose = unicodedata.normalize("NFD", re.sub(r"\$\$?[^$]+\$\$?", "", prose))
+
+    assert FORMULA.findall(prose) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["‖u*‖ and ‖v*‖", "D(λ*) = J(u*)", "max |x*| and |y*|"]
+)
+def test_a_formula_that_markdown_swallows_ends_the_build(text):
+    with pytest.raises(ValueError, match="emphasis within a word"):
+        pages.typeset(rendered(text))
+    assert "*" not in rendered(text)  # which a reader would not notice
+
+
+@pytest.mark.parametrize("tex", [r"\norm{u}", r"\frac{a", r"u^{*"])
+def test_a_formula_that_cannot_be_converted_ends_the_build(tex):
+    with pytest.raises(ValueError, match="formula"):
+        pages.typeset(rendered(f"Let ${tex}$ be."))
+
+
+def test_letters_and_signs_of_a_formula_are_those_of_its_source():
+    html = pages.typeset(rendered(r"$\tfrac12\hat u^{\mathsf T}Ku - f^* \le 10^{-8}$"))
+    (formula,) = re.findall(r"<math>.*</math>", html)
+    text = "".join(ElementTree.fromstring(formula).itertext())
+
+    assert unicodedata.normalize("NFKC", text) == "12uˆTKu−f∗≤10−8"
