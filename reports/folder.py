@@ -14,29 +14,30 @@ from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
 from reports.data.fastest import answers_of, fastest_solvers
 from reports.data.size_series import SizeSeries, size_series, sweeps
+from reports.data.ways import compare_ways
+from reports.document.fields import FieldFigure
+from reports.document.figure import Figure
 from reports.document.formatting import TIMED, clean
 from reports.document.layout import Page, Picture, Section
-from reports.export.csv_tables import csv_tables
+from reports.export.csv_tables import csv_tables, frame_csv
 from reports.export.parquet import write_records
 from reports.figures.accuracy import accuracy_figure
-from reports.figures.scaling import scaling_figure
+from reports.figures.scaling import MOST_SERIES, scaling_figure
 from reports.render.writing import RENDERED, write_page, write_text
-from reports.sections.answer import answer as fastest_section
-from reports.sections.answer import answer_statements
+from reports.sections.answer import opening
 from reports.sections.convergence import convergence
 from reports.sections.performance import profiles
 from reports.sections.physics import agreement, deformed, physics, tractions
 from reports.sections.ranking import left_out, means, ranking
 from reports.sections.ranks import ranks
 from reports.sections.results import claim_counts, claims, errors, iterations
-from reports.sections.scaling import growth, scaling, steps
+from reports.sections.scaling import growth, own_results, scaling, steps
 from reports.sections.settings import cases, definitions, environment
 from reports.sections.summary import summary
 from reports.sections.sweeps import accuracy, certified_sweeps
 from reports.sections.times import precision, ratios, times
 from reports.sections.value_of_accuracy import value_of_accuracy
 
-MOST_SERIES = 6  #: that are drawn; all are tabulated
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 
 # What sections that may be missing are called, and what they need.
@@ -111,7 +112,7 @@ def write_report(
         written += write_page(page, target, formats)
     if "csv" in formats:
         written += [
-            write_text(target / "tables" / f"{name}.csv", frame.to_csv(index=False))
+            write_text(target / "tables" / f"{name}.csv", frame_csv(frame))
             for name, frame in csv_tables(evidence, pool_forms=pool_forms).items()
         ]
     if "parquet" in formats:
@@ -119,10 +120,29 @@ def write_report(
     return written
 
 
-def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
-    """Say per form who was fastest, by how much, and who failed: a line per sentence.
+def figures(
+    directory: Path, factor: float = VERIFIED_FACTOR
+) -> dict[str, Figure | FieldFigure]:
+    """Compute the figures of the report on a folder, by the names of their files.
 
-    The sentences are those that the report of the folder opens with.
+    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
+
+    Raises
+    ------
+    InputError
+        For a folder that holds no measurements.
+
+    """
+    page = compose(read_evidence(directory, factor))
+    pictures = (picture for section in page.sections for picture in section.pictures)
+    return {picture.name: picture.figure for picture in pictures}
+
+
+def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
+    """Return the sentences that the report of a folder opens with, a line each.
+
+    The first one names the best way from the mesh to a verified answer over all forms;
+    the others compare the solvers of each form, and name those that failed.
 
     factor : verdicts are those at factor·tol; the journal's are those at 10·tol
 
@@ -133,30 +153,39 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
 
     """
     evidence = read_evidence(Path(directory), factor)
-    groups = all_groups(evidence)
-    rankings = [ranking_of(group) for group in groups if group.comparable]
+    sections = _opening(evidence, all_groups(evidence), size_series(evidence))
+    return [line for s in sections for told in s.statements for line in told.lines]
+
+
+def _opening(
+    evidence: Evidence, groups: Sequence[ComparisonGroup], sizes: Sequence[SizeSeries]
+) -> list[Section]:
     answers = answers_of(evidence)
-    found = fastest_solvers(answers, groups, rankings)
-    told = answer_statements(found, answers, certified_sweeps(evidence))
-    return [line for statement in told for line in statement.lines]
+    return opening(
+        evidence,
+        compare_ways(evidence),
+        fastest_solvers(answers, groups),
+        answers,
+        certified_sweeps(evidence),
+        own_results(evidence, sizes),
+    )
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
-    """Put the report together: who was fastest, then what that rests on.
+    """Put the report together: the answer, then what it rests on.
 
-    Who was fastest is told of each form apart, whatever `pool_forms`.
+    The answer compares ways over all forms and solvers form by form, whatever
+    `pool_forms`.
     """
     found = size_series(evidence)
     groups = all_groups(evidence)
     rankings = [ranking_of(group) for group in groups if group.comparable]
-    answers = answers_of(evidence)
-    fastest = fastest_solvers(answers, groups, rankings)
     shown = all_groups(evidence, pool_forms=True) if pool_forms else groups
     left = left_out(shown, poolable=not pool_forms and _poolable(evidence, groups))
     if pool_forms:
         rankings = [ranking_of(group) for group in shown if group.comparable]
     parts = (
-        (fastest_section(evidence, fastest, answers, certified_sweeps(evidence)), ""),
+        *((section, "") for section in _opening(evidence, groups, found)),
         (summary(evidence), ""),
         (cases(evidence), ""),
         (claim_counts(evidence), ""),

@@ -17,7 +17,7 @@ from scipy.special import ndtri, stdtrit
 
 from harness.running.pairs import Ratio, unpaired_ratio
 from reports.compare.conditions import hardware
-from reports.data.evidence import SEVERITY, Evidence, Outcome
+from reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Outcome
 from reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
@@ -25,7 +25,8 @@ ALIKE = 1.5  #: an interval that excludes such a factor either way can tell "no 
 FEWEST = 3  #: cells that an interval over cells needs
 _NEGLIGIBLE = 1e-12  #: energies below, of QPs with data of order one, are rounding
 
-Key = tuple[str, float, str]  #: case, tolerance, solver with its mode
+#: case (of a QP from a file its digest), tolerance, solver with its mode
+Key = tuple[str, float, str]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -271,7 +272,9 @@ def _cells(evidence: Evidence) -> dict[Key, Outcome]:
 
 
 def _key(outcome: Outcome) -> Key:
-    return outcome.case, outcome.tol, outcome.solver
+    r = outcome.first
+    case = r.qp if r.family == FROM_FILE and r.qp is not None else outcome.case
+    return case, outcome.tol, outcome.solver
 
 
 def _seconds(outcome: Outcome) -> list[float]:

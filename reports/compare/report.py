@@ -15,6 +15,7 @@ from reports.compare.conclusions import verdict_lines
 from reports.compare.overview import overview
 from reports.compare.page import compose
 from reports.data.evidence import Outcome, read_evidence
+from reports.export.csv_tables import frame_csv
 from reports.render.writing import RENDERED, write_page, write_text
 
 
@@ -51,7 +52,7 @@ def _write(comparison: Comparison, formats: Sequence[str]) -> list[Path]:
         written = write_page(compose(comparison), target, formats)
     tables, frame = target / "tables", changes_frame(comparison)
     if "csv" in formats:
-        text = frame.to_csv(index=False)
+        text = frame_csv(frame)
         written.append(write_text(tables / "changes.csv", text))
     if "parquet" in formats:
         tables.mkdir(parents=True, exist_ok=True)

@@ -72,7 +72,8 @@ class ComparisonGroup:
     cases: tuple[str, ...]
     solvers: tuple[str, ...]
     times: Times  #: (cases, solvers) s; inf unless every repeat was verified
-    claimed: Times  #: the same; inf unless every repeat was claimed to be solved
+    claimed: Times  #: the same; inf unless every repeat was claimed to be solved, or is
+    #: rightly claimed to be infeasible
     stopped: Times  #: s after which time ran out; NaN where that was not the end
     limit: float  #: s per measurement; the longest one, where the suite has no limit
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
@@ -225,7 +226,7 @@ def _blocks(
         by_tol.setdefault(r.tol, []).append(r)
 
     def rank(answer: list[Record]) -> tuple[bool, float]:
-        failed = any(r.verdict is not Verdict.VERIFIED for r in answer)
+        failed = not all(r.verdict.is_verified for r in answer)
         return failed, float(np.median([r.total_seconds or np.inf for r in answer]))
 
     return {
@@ -277,8 +278,8 @@ def _row(r: Record) -> dict[str, float]:
     return {
         "tol": r.tol,
         "seconds": np.nan if r.total_seconds is None else r.total_seconds,
-        "verified": r.verdict is Verdict.VERIFIED,
-        "claimed": r.claimed == "solved",
+        "verified": r.verdict.is_verified,
+        "claimed": r.claims_answer,
         "late": r.verdict is Verdict.TIME_LIMIT,
         "declined": r.verdict is Verdict.DECLINED,
     }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,14 +12,17 @@ from typing import Any
 
 from harness import InputError, Record, Verdict
 from harness.errors import say, some
-from harness.files.reading import read_json, read_toml
+from harness.files.reading import read_json
 from harness.record import VERIFIED_FACTOR
 from harness.results.faults import Fault, left, read_faults
+from harness.results.folder import environment_of, times_compare
 from harness.results.journal import read_journal
 from harness.running.pairs import Block
+from harness.suite.suite import read_stored
 from harness.verify.kkt import allowed, rejudged
 from reports.statistics.intervals import Interval, median_interval
 
+FROM_FILE = "file"  #: the family of QPs from files, whose cases are named by paths
 _MARKED = 6  #: digits of an environment, after the label of a solver
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
@@ -34,6 +39,7 @@ SEVERITY = (
     Verdict.TIME_LIMIT,
     Verdict.ITERATION_LIMIT,
     Verdict.DECLINED,
+    Verdict.VERIFIED_INFEASIBLE,
     Verdict.VERIFIED,
 )
 
@@ -83,7 +89,7 @@ class Outcome:
     @property
     def verified(self) -> bool:
         """Whether every repeat was verified."""
-        return self.verdict is Verdict.VERIFIED
+        return self.verdict.is_verified
 
     @cached_property
     def claims(self) -> tuple[str, ...]:
@@ -231,10 +237,16 @@ class Evidence:
         return tuple(o for row in self.outcomes.values() for o in row.values())
 
 
-def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
+def read_evidence(
+    directory: Path,
+    factor: float = VERIFIED_FACTOR,
+    *,
+    warn: Callable[[str], None] = say,
+) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
 
     factor : verdicts are those at factor·tol; at 10 they are those of the journal
+    warn : of damaged lines and of records that contradict themselves
 
     Raises
     ------
@@ -242,29 +254,66 @@ def read_evidence(directory: Path, factor: float = VERIFIED_FACTOR) -> Evidence:
         When the folder or its measurements are missing, or a file is malformed.
 
     """
-    records = read_journal(directory, say)
+    records = read_journal(directory, warn)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
-    _tell_contradicted(directory, records)
-    environment = _read(directory / "environment.json", read_json)
+    _tell_contradicted(directory, records, warn)
+    journal = tuple(records)
+    environment = _environment(directory / "environment.json")
+    suite = directory / "suite.toml"
+    records = _one_name_each(_in_like_environments(directory, records))
     marks = _marks(records, str(environment.get("digest", "")))
     return Evidence(
         directory=directory,
-        journal=tuple(records),
+        journal=journal,
         records=arrange(_apart(_judged(r, factor), marks) for r in records),
         environment=environment,
         marks=marks,
-        suite=_read(directory / "suite.toml", read_toml),
+        suite=read_stored(suite) if os.path.lexists(suite) else {},
         factor=factor,
         faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
     )
 
 
-def _tell_contradicted(directory: Path, records: Iterable[Record]) -> None:
-    """Tell of records that say verified beside residuals that are too large for it."""
+def _in_like_environments(directory: Path, records: list[Record]) -> list[Record]:
+    """Give environments whose times compare one digest: that of the first of them."""
+    known: dict[str, Mapping[str, Any]] = {}
+    of: dict[str, str] = {}
+    for digest in dict.fromkeys(r.environment for r in records):
+        of[digest] = digest
+        try:
+            found = environment_of(directory, digest)
+        except InputError:  # nothing is known of it
+            continue
+        of[digest] = next((d for d in known if times_compare(known[d], found)), digest)
+        known.setdefault(of[digest], found)
+    return [
+        r if of[r.environment] == r.environment
+        else r.but(environment=of[r.environment])
+        for r in records
+    ]  # fmt: skip
+
+
+def _one_name_each(records: list[Record]) -> list[Record]:
+    """Give a QP that lies in several files the name and path of the first of them."""
+    first: dict[str, Record] = {}
+    for r in records:
+        if r.family == FROM_FILE and r.qp is not None:
+            first.setdefault(r.qp, r)
+    return [
+        r.but(case=same.case, params=same.params)
+        if r.family == FROM_FILE and (same := first.get(r.qp or "")) else r
+        for r in records
+    ]  # fmt: skip
+
+
+def _tell_contradicted(
+    directory: Path, records: Iterable[Record], warn: Callable[[str], None]
+) -> None:
+    """Warn of records that say verified beside residuals that are too large for it."""
     wrong = [r.run_id for r in records if _is_contradicted(r)]
     if wrong:
-        say(
+        warn(
             f"{directory}: verified, by their journal, with residuals above "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
             "that, and `validate` judges the points anew"
@@ -278,11 +327,11 @@ def _is_contradicted(r: Record) -> bool:
     return r.verdict is Verdict.VERIFIED and is_above
 
 
-def _read(path: Path, read: Callable[[Path, str], Any]) -> dict[str, Any]:
-    """Read a table that a run wrote beside its journal; empty without a file."""
-    if not path.exists():
+def _environment(path: Path) -> dict[str, Any]:
+    """Read what a run wrote of its machine; empty without a file."""
+    if not os.path.lexists(path):
         return {}
-    table = read(path, _AS_WRITTEN)
+    table = read_json(path, _AS_WRITTEN)
     if not isinstance(table, dict):
         raise InputError(f"{path}: no JSON object; expected {_AS_WRITTEN}")
     return table
@@ -319,6 +368,27 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
     several = dict.fromkeys(e for of in cells.values() if len(of) > 1 for e in of)
     plain = first if first in several else next(iter(several), "")
     return {e: f" @{e[:_MARKED]}" for e in several if e != plain}
+
+
+def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
+    """Count the cases of each family: "6 cases of beam-ring"."""
+    of = {o.case: o.first.family for o in outcomes}
+    families = Counter(of.values())
+    if len(families) > 2:
+        return f"{len(of)} {noun}s of {len(families)} families"
+    return ", ".join(
+        f"{n} {noun}{'s' * (n > 1)} of {family}" for family, n in families.items()
+    )
+
+
+def shared(outcomes: Iterable[Outcome]) -> str:
+    """Name forms, tolerances and cases of some answers, as a figure states them."""
+    known = list(outcomes)
+    forms = sorted({o.first.form for o in known} - {""})
+    tols = sorted({o.tol for o in known}, reverse=True)
+    ends = dict.fromkeys(f"{tol:g}" for tol in (tols[0], tols[-1]))
+    parts = [" and ".join(forms)] * bool(forms)
+    return ", ".join([*parts, f"tol {' to '.join(ends)}", case_set(known)])
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:

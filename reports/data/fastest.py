@@ -1,12 +1,19 @@
 """Who was fastest at equal verified accuracy, per form and accuracy, and how surely.
 
 A solver competes if all of its answers are verified: on every case of the group that
-anybody solved. The fastest has the smallest geometric mean of times. It is named only
-if all others are told to be slower:
+anybody solved. The first has the smallest geometric mean of times. It is called the
+fastest only if each other competitor is slower:
 
-- over `CASES` cases or more, if the ranking tells them apart, which holds for all pairs
-  at once, and the paired ratio over the cases excludes 1;
-- over fewer cases, if on each of them the paired ratio within blocks excludes 1.
+- over `CASES` cases or more, if the interval of the ratio over the cases excludes 1;
+- over fewer cases, if on each of them the interval of the ratio within blocks does.
+
+Every interval covers 95 % by itself. A wrong name takes a wrong interval of the first
+and its equal, so that the name needs no correction for the number of solvers [1]_.
+
+References
+----------
+.. [1] R. L. Berger, Multiparameter Hypothesis Testing and Acceptance Sampling,
+   Technometrics 24 (1982) 295-300
 
 """
 
@@ -21,9 +28,15 @@ import numpy as np
 
 from harness import Verdict
 from harness.running.pairs import Ratio, paired_ratio, ratio_of
-from reports.data.aggregation import Ranking
-from reports.data.comparison_groups import CASES, ComparisonGroup, Kind, kind_of
+from reports.data.comparison_groups import (
+    CASES,
+    POOLED,
+    ComparisonGroup,
+    Kind,
+    kind_of,
+)
 from reports.data.evidence import Evidence, Outcome
+from reports.statistics.resampling import symmetric_interval
 
 Row = Mapping[str, Outcome]  #: by solver
 Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
@@ -54,6 +67,8 @@ class Competitor:
     slower: bool = False  #: told to be slower than the first
     ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
     by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
+    form: str = ""  #: of the QPs, where forms compete with each other
+    apart: bool = False  #: not measured in the blocks of the first on some case
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -101,9 +116,9 @@ class FastestSolver:
         """The next that is told to be slower; None if there is none."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
-    def fastest_on(self) -> dict[str, str | None]:
-        """Name the fastest of each case by its blocks; None where it is not told."""
-        return {case: _fastest_on(self.competitors, case) for case in self.cases}
+    def fronts(self) -> dict[str, tuple[Competitor, ...]]:
+        """Return per case the fastest and those whose interval does not exclude it."""
+        return {case: _front(self.competitors, case) for case in self.cases}
 
 
 class Unverified(NamedTuple):
@@ -116,30 +131,23 @@ class Unverified(NamedTuple):
 
 
 def fastest_solvers(
-    answers: Answers, groups: Iterable[ComparisonGroup], rankings: Iterable[Ranking]
+    answers: Answers, groups: Iterable[ComparisonGroup]
 ) -> tuple[FastestSolver, ...]:
-    """Find the fastest solver of every group.
-
-    groups : all of them, whatever can be said
-    rankings : of those with statements over cases
-    """
-    ranked = {ranking.group.kind: ranking for ranking in rankings}
+    """Find the fastest solver of every group."""
     return tuple(
-        _fastest(
-            group,
-            ranked.get(group.kind),
-            {case: answers[group.kind][case] for case in group.cases},
-        )
+        _fastest(group, {case: answers[group.kind][case] for case in group.cases})
         for group in groups
     )
 
 
-def answers_of(evidence: Evidence) -> Answers:
+def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
     """Choose the answer of every solver to every case; null arms take no part."""
     found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
     for o in evidence.flat:
         if not o.first.role:
-            cases = found.setdefault(kind_of(o.first), {})
+            kind = kind_of(o.first)
+            kind = kind._replace(form=POOLED) if pool_forms else kind
+            cases = found.setdefault(kind, {})
             cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
     return {
         kind: {
@@ -186,16 +194,14 @@ def time_of(outcome: Outcome) -> float | None:
     return time.value if time is not None and time.value > 0 else None
 
 
-def _fastest(
-    group: ComparisonGroup, ranking: Ranking | None, rows: Mapping[str, Row]
-) -> FastestSolver:
+def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
     solved = {
         case: row
         for case, row in rows.items()
         if any(time_of(row[s]) is not None for s in group.solvers)
     }
-    if len(solved) < CASES:  # as where a sequence ended: too few for a test over cases
-        ranking = None
+    # of the cases of a sequence that ended early too few may be left
+    over_cases = group.comparable and len(solved) >= CASES
     entered = [
         Competitor(solver=s, outcomes={case: row[s] for case, row in solved.items()})
         for s in group.solvers
@@ -206,17 +212,16 @@ def _fastest(
     others.sort(key=lambda c: -len(c.verified))
     if full:
         first = full[0]
-        full[1:] = sorted(
-            (_compared(c, first, ranking) for c in full[1:]), key=_geometric_mean
-        )
-        others = [_compared(c, first, ranking) for c in others]
+        compared = [_compared(c, first, group, over_cases) for c in full[1:]]
+        full[1:] = sorted(compared, key=_geometric_mean)
+        others = [_compared(c, first, group, over_cases) for c in others]
     return FastestSolver(
         kind=group.kind,
-        finding=_finding(group, solved, full, over_cases=ranking is not None),
+        finding=_finding(group, solved, full, over_cases=over_cases),
         cases=tuple(solved),
         competitors=tuple(full),
         others=tuple(others),
-        over_cases=ranking is not None,
+        over_cases=over_cases,
         unsolved=len(rows) - len(solved),
         notes=group.unmeasured + group.sessions,
     )
@@ -226,22 +231,45 @@ def _geometric_mean(c: Competitor) -> float:
     return float(np.mean([np.log(time_of(o) or np.inf) for o in c.outcomes.values()]))
 
 
-def _compared(c: Competitor, first: Competitor, ranking: Ranking | None) -> Competitor:
+def _compared(
+    c: Competitor, first: Competitor, group: ComparisonGroup, over_cases: bool
+) -> Competitor:
     """Compare with the first on the cases that both solved, in one environment."""
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
         return c
-    if ranking is None:
-        return _within_blocks(c, first, both)
+    within = _within_blocks(c, first, both)
+    if not over_cases:
+        return within
+    ratio = _over_cases(c, first, both) if len(both) >= CASES else None
+    slower = ratio is not None and ratio.low > 1
+    apart = False
+    if group.apart.any():  # of different sessions: no pairs
+        one, other = (group.solvers.index(s.solver) for s in (first, c))
+        apart = bool(group.apart[one, other])
+        slower = slower and (not apart or bool(group.told[one, other]))
+    return replace(within, ratio=ratio, slower=slower, apart=apart)
+
+
+def _over_cases(c: Competitor, first: Competitor, cases: Sequence[str]) -> Ratio | None:
+    """Compare over cases: Student's interval, widened to that of flipped signs.
+
+    Student's presumes logarithms that scatter normally, the other one that they scatter
+    alike to both sides. Neither presumption is safe for six cases, so both must hold 1
+    out before two solvers count as different.
+    """
     mine, its = (
-        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(both)}
+        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(cases)}
         for one in (c, first)
     )
-    ratio = paired_ratio(mine, its) if len(both) >= CASES else None
-    names = ranking.group.solvers
-    told = ranking.faster[names.index(first.solver), names.index(c.solver)]
-    slower = ratio is not None and bool(told) and ratio.low > 1
-    return replace(c, compared=tuple(both), ratio=ratio, slower=slower)
+    ratio = paired_ratio(mine, its)
+    if ratio is None:
+        return None
+    logs = np.log([mine[i] / its[i] for i in mine])
+    low, high = np.exp(symmetric_interval(logs, cases))
+    return ratio._replace(
+        low=min(ratio.low, float(low)), high=max(ratio.high, float(high))
+    )
 
 
 def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
@@ -296,12 +324,13 @@ def _finding(
     return Finding.DIVIDED if faster else Finding.TIE
 
 
-def _fastest_on(competitors: Sequence[Competitor], case: str) -> str | None:
-    """Name the solver with the smallest time on a case, if it is told from all."""
+def _front(competitors: Sequence[Competitor], case: str) -> tuple[Competitor, ...]:
     first = min(competitors, key=lambda c: time_of(c.outcomes[case]) or np.inf)
     its = first.outcomes[case].by_block
-    ratios = [
-        ratio_of(c.outcomes[case].by_block, its) for c in competitors if c is not first
-    ]
-    told = all(ratio is not None and ratio.low > 1 for ratio in ratios)
-    return first.solver if told else None
+
+    def is_slower(c: Competitor) -> bool:
+        ratio = ratio_of(c.outcomes[case].by_block, its)
+        return ratio is not None and ratio.low > 1
+
+    tied = (c for c in competitors if c is not first and not is_slower(c))
+    return (first, *tied)

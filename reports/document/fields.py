@@ -105,6 +105,7 @@ class Label:
     offset: tuple[float, float] = (0.0, 0.0)  #: points
     colour: str = INK
     cased: bool = False
+    size: float = 9.5  #: points
 
 
 FieldMark = ColourField | Polygons | Strokes | Path | Vectors | Arrow | Label

@@ -22,6 +22,9 @@ Direction = Literal["x", "y"]
 
 INK = "#20242a"  #: text and axes; a page replaces it by its own text colour
 WIDTH = 6.9  #: of a figure, inches
+#: Between the ends of a logarithmic axis that follows its points: on a shorter one, 19
+#: to 22 iterations would look like growth.
+SPAN = 10.0
 MARGIN = 0.05  #: beyond the points, as a part of what they take
 
 
@@ -140,6 +143,7 @@ class Axis:
     most: int | None = None  #: numbers along it, about
     integers: bool = False  #: numbers are whole
     plain: bool = False  #: numbers without powers of ten
+    span: float = SPAN  #: least factor between the ends of a logarithmic axis
     numbered: bool = True  #: whether ticks have their names
     marked: bool = True  #: whether ticks have their strokes
     line: bool = True
@@ -219,6 +223,7 @@ class Figure:
     height: float  #: inches
     width: float = WIDTH
     legend: Legend | None = None
+    title: str = ""  #: form, tolerance and cases, where no panel names them
 
     @property
     def panels(self) -> tuple[Panel, ...]:
@@ -274,8 +279,10 @@ def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
     else:
         places = shown or [0.0, 1.0]
     a, b = min(places), max(places)
-    lone = 0.5 if axis.log else 0.5 * abs(a) or 0.5
-    pad = MARGIN * (b - a) if b > a else lone
+    lone = 0.5 * abs(a) or 0.5
+    pad = MARGIN * (b - a) if b > a or axis.log else lone
+    if axis.log:
+        pad = max(pad, (log10(axis.span) - (b - a)) / 2)
     low, high = a - pad, b + pad
     if axis.log:
         low, high = 10.0 ** max(low, -300), 10.0 ** min(high, 300)

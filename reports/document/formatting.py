@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 from harness import Verdict
+from harness.files.csvfile import inert
 from reports.statistics.intervals import Interval, PowerLaw
 
 ABSENT = "–"  #: what was not or cannot be measured
@@ -22,6 +23,7 @@ TIMED = (
 #: Symbol and words of every verdict: colour alone says nothing to many readers.
 VERDICTS = {
     Verdict.VERIFIED: ("✓", "verified"),
+    Verdict.VERIFIED_INFEASIBLE: ("✓", "verified infeasible"),
     Verdict.INACCURATE: ("△", "inaccurate"),
     Verdict.WRONG: ("✗", "wrong"),
     Verdict.INFEASIBLE_CLAIM: ("∅", "infeasible claim"),
@@ -58,9 +60,10 @@ def clean(text: str, limit: int = 96) -> str:
     """Make foreign text fit for a table: one line, no control characters, not longer.
 
     The middle is left out of what is too long, since names differ at their ends. A
-    letter keeps two accents; one that has no letter to stand on gets a circle.
+    letter keeps two accents; one that has no letter to stand on gets a circle. What a
+    spreadsheet would take for a formula, pasted there, gets an apostrophe.
     """
-    line = " ".join(text.split())
+    line = inert(" ".join(text.split()))
     if not line.isascii() or not line.isprintable():
         visible = "".join("\ufffd" if _invisible(c) else c for c in line)
         line = _PILED.sub(r"\1", unicodedata.normalize("NFC", visible))
@@ -68,6 +71,11 @@ def clean(text: str, limit: int = 96) -> str:
         tail = limit // 3
         line = f"{line[: limit - tail - 1]}…{line[-tail:]}"
     return f"◌{line[: limit - 1]}" if line and unicodedata.combining(line[0]) else line
+
+
+def plain_value(value: object, limit: int = 96) -> str:
+    """Print a value of plain data: a number as it is, anything else as `clean` does."""
+    return str(value) if isinstance(value, int | float) else clean(str(value), limit)
 
 
 def _invisible(char: str) -> bool:

@@ -12,7 +12,7 @@ from reports.document.layout import Cell, Table, name_cell
 def mesh_table(found: Sequence[Discretisation]) -> Table:
     """List the error of every mesh, or why it is not known."""
     return Table(
-        caption="Discretisation errors: relative, in the energy norm.",
+        caption="Errors of the meshes: relative, in the energy norm.",
         notes=(
             "From the solutions on meshes with every cell halved once and twice; the "
             "reference solve found them, no solver under test. Rate: of the error, "

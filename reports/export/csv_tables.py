@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from harness import Record, Verdict
+from harness.files.csvfile import csv_text
 from harness.record import JOURNAL
 from reports.data.aggregation import (
     EVERY,
@@ -62,6 +63,12 @@ def csv_tables(
     }
     found |= comparison_tables(evidence, pool_forms=pool_forms)
     return {name: _counted(frame) for name, frame in found.items() if len(frame)}
+
+
+def frame_csv(frame: pd.DataFrame) -> str:
+    """Write a data frame as CSV, see `harness.files.csvfile`."""
+    rows = frame.astype(object).where(frame.notna(), None)
+    return csv_text(list(frame.columns), rows.itertuples(index=False, name=None))
 
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:
@@ -186,5 +193,5 @@ def _means(ranking: Ranking) -> list[dict[str, Any]]:
 
 
 def _spelt(names: Sequence[str]) -> list[str]:
-    """Spell out lone surrogates, which no file can hold."""
+    """Spell out lone surrogates, which no column of text can hold."""
     return [name.encode(errors="backslashreplace").decode() for name in names]

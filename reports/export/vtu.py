@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import ContactSide, Fields, InputError, Vector
+from harness.files.csvfile import csv_text
 from harness.files.durable import replacing
 
 #: a node is in contact where its force exceeds this · the largest; of pairs with
@@ -29,7 +30,8 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     Point data: displacement (m), contact_force (N/m, on slave nodes, else 0),
     in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m, on slave nodes
     that face a master, else NaN, which ParaView leaves out) and the nodal fields; cell
-    data: body. Triangles come before quadrilaterals. *Warp By Vector* in ParaView takes
+    data: body, and subdomain of torn bodies. Triangles come before quadrilaterals.
+    *Warp By Vector* in ParaView takes
     vectors of three components only.
 
     Returns the files written: the .vtu, and a CSV for each contact.
@@ -44,7 +46,10 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     if fields.contact_nodes is not None and fields.contact_forces is not None:
         forces[fields.contact_nodes] = fields.contact_forces
     touching = _in_contact(fields, forces)
-    cells, bodies = np.asarray(fields.cells), np.asarray(fields.bodies).astype(np.int32)
+    cells = np.asarray(fields.cells)
+    of_cells = {"body": fields.bodies}
+    if fields.subdomains is not None:
+        of_cells["subdomain"] = fields.subdomains
     triangle = cells[:, 2] == cells[:, 3]
     blocks = [
         (kind, which, corners)
@@ -61,7 +66,10 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
             **_along_sides(fields),
             **fields.nodal,
         },
-        cell_data={"body": [bodies[which] for _, which, _ in blocks]},
+        cell_data={
+            name: [np.asarray(values).astype(np.int32)[which] for _, which, _ in blocks]
+            for name, values in of_cells.items()
+        },
     )
     try:
         mesh.write(path, file_format="vtu")
@@ -124,21 +132,18 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
         **({} if side.shear is None else {"shear_Pa": side.shear}),
         **({} if side.friction is None else {"friction": side.friction}),
     }
-    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-    lines = [",".join(columns), *(",".join(map(_number, row)) for row in rows), ""]
+    rows = zip(*(map(_known, v.tolist()) for v in columns.values()), strict=True)
     try:
         with replacing(path) as file:
-            file.write("\n".join(lines).encode())
+            file.write(csv_text([*columns], rows).encode())
     except OSError as e:
         raise InputError(f"{path}: cannot be written: {e.strerror}") from None
     return path
 
 
-def _number(value: float | str) -> str:
-    """Write a number with all its digits; what there is none of is left empty."""
-    if isinstance(value, str):
-        return value
-    return "" if value != value else repr(value)
+def _known(value: float | str) -> float | str | None:
+    """Replace a NaN, where there is no such number, by None."""
+    return None if value != value else value
 
 
 def _spelt(name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from reports.data.evidence import Evidence, Outcome
+from reports.data.evidence import Evidence, Outcome, shared
 from reports.document.figure import (
     INK,
     Figure,
@@ -18,7 +18,7 @@ from reports.document.figure import (
     Series,
     Text,
 )
-from reports.figures.style import LEGEND_LINE, legible, log, look, run_ids
+from reports.figures.style import LEGEND_LINE, TITLE, legible, log, look, run_ids
 
 CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
 _LEAST = 1e-10  #: worst residuals over the tolerance below, zero among them
@@ -55,7 +55,8 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
     keys = tuple(Key(label=legible(s), look=looks[s], solver=s) for s in names)
     return Figure(
         rows=(Row(panels=(panel,)),),
-        height=max(3.2, 0.5 + LEGEND_LINE * len(names)),
+        height=TITLE + max(3.2, 0.5 + LEGEND_LINE * len(names)),
+        title=legible(shared(shown), 96),
         legend=Legend(keys=keys, place="right"),
     )
 

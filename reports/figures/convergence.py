@@ -29,8 +29,8 @@ from reports.document.figure import (
     limits,
     numbers,
 )
-from reports.document.formatting import VERDICTS
-from reports.figures.style import below, legible, look
+from reports.document.formatting import VERDICTS, tolerance
+from reports.figures.style import TITLE, below, legible, look
 
 #: letter of a step, its name, and its mark; the others, CG above all, are bare
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
@@ -124,8 +124,12 @@ def _figure(
         axis = replace(panel.x, label="", numbered=False, marked=False)
         stack[i] = replace(row, panels=(replace(panel, x=axis),))
     lines = ceil((len(c.runs) + len(marked(c))) / COLUMNS)
-    height = sum(row.height for row in stack) + 0.5 + 0.2 * lines
-    return Figure(rows=tuple(stack), height=height, legend=_legend(c, runs, kinds))
+    height = sum(row.height for row in stack) + 0.5 + 0.2 * lines + TITLE
+    one = c.runs[0].outcome
+    return Figure(
+        rows=tuple(stack), height=height, legend=_legend(c, runs, kinds),
+        title=legible(f"{one.case}, tol {tolerance(one.tol)}", 96),
+    )  # fmt: skip
 
 
 def _work(c: CaseHistories) -> Axis:

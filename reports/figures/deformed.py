@@ -26,6 +26,9 @@ from reports.document.figure import INK, Look
 
 PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corners
 SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them
+#: Displacements below this part of the size of the bodies cannot be seen, and are drawn
+#: larger, so that the largest takes about `SHOWN` of it.
+SEEN, SHOWN = 0.01, 0.05
 _MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
 _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
@@ -36,6 +39,11 @@ _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
 _FLAT = 0.34  #: height over width of the enlargement
 _PLAIN = ColourScale(colours="Greys", low=0, high=1)
+#: most subdomains that are numbered, by size of the numbers; those of more would cover
+#: each other
+_NUMBERED = {9.5: 16, 6.5: 100}
+_TORN = Look(colour="white", width=0.9)  #: borders of subdomains
+_APART = "#6b7480"  #: arrows of nodes with shear but without contact, by Tresca's law
 _OUTLINE = Look(colour=INK, width=0.7)
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
@@ -56,11 +64,33 @@ class _Loaded(NamedTuple):
     forces: Points  #: on them, N/m
     friction: NDArray[np.str_]  #: (k,) "stick", "slip" or "open"; "" without friction
 
+    @property
+    def closed(self) -> NDArray[np.bool_]:
+        """(k,) whether a node touches; of Tresca's law, open nodes carry shear."""
+        touching = np.isin(self.friction, ["", *FRICTION])
+        return touching if touching.any() else ~touching
 
-def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
+
+def automatic_scale(fields: Fields) -> float:
+    """Choose a factor 1, 2 or 5 times a power of ten that shows the displacement.
+
+    Displacements that can be seen are drawn as they are.
+    """
+    largest = float(np.abs(fields.displacement).max(initial=0.0))
+    span = float(np.ptp(fields.points, axis=0).max())
+    if largest == 0 or largest >= SEEN * span:
+        return SCALE
+    wanted = SHOWN * span / largest
+    power = 10.0 ** np.floor(np.log10(wanted))
+    if not np.isfinite(power):  # of displacements that are rounding
+        return SCALE
+    return float(max(step * power for step in (1, 2, 5) if step * power <= wanted))
+
+
+def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     """Show all bodies, and each contact that carries load enlarged.
 
-    scale : of the displacement, as drawn
+    scale : of the displacement, as drawn; None: `automatic_scale`
 
     Raises
     ------
@@ -73,6 +103,7 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
         raise InputError("displacement or stress holds NaN or inf: there is no picture")
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies of no width or no height: there is no picture")
+    scale = automatic_scale(fields) if scale is None else scale
     points = moved(fields, scale)
     loaded = _loaded(fields)
     low, high = _box(fields, points)
@@ -92,7 +123,9 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
     frames = [
         mark
         for letter, contact in zip(letters, loaded, strict=True)
-        for mark in _frame(letter, _window(points[contact.nodes], span), corners)
+        for mark in _frame(
+            letter, _window(points[contact.nodes[contact.closed]], span), corners
+        )
     ]
     there = moved(fields)  # enlarged by more, bodies in contact would overlap
     near = (
@@ -102,7 +135,7 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
     truly = "" if scale == SCALE else f"displacement × {SCALE:g}"
     overview = FieldPanel(
         low=_pair(corners[0]), high=_pair(corners[1]),
-        marks=(*bodies, *before, *after, *frames),
+        marks=(*bodies, *_subdomains(fields, points), *before, *after, *frames),
         title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {scale:g}; "
         "dashed: undeformed",
         **_axes(span),
@@ -123,6 +156,29 @@ def deformed_figure(fields: Fields, scale: float = SCALE) -> FieldFigure:
 def moved(fields: Fields, scale: float = SCALE) -> Points:
     """(n, 2) where `scale` times the displacement puts the nodes."""
     return cast(Points, fields.points + scale * fields.displacement)
+
+
+def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
+    """Outline the subdomains of torn bodies, and number them where that is legible."""
+    if fields.subdomains is None:
+        return []
+    numbers = np.unique(fields.subdomains)
+    size = next((s for s, most in _NUMBERED.items() if numbers.size <= most), None)
+    marks: list[FieldMark] = []
+    for number in numbers:
+        cells = fields.cells[fields.subdomains == number]
+        marks += [Path(points=points[loop], look=_TORN) for loop in outlines(cells)]
+        if size is not None:
+            centres = points[cells].mean(axis=1)
+            middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
+            place = _pair(centres[middle])  # in a cell: a centroid may lie outside
+            marks.append(
+                Label(
+                    text=f"{number}", place=place, align=("center", "center"),
+                    colour=_ARROW, cased=True, size=size,
+                )
+            )  # fmt: skip
+    return marks
 
 
 def _pair(point: Vector) -> tuple[float, float]:
@@ -265,22 +321,30 @@ def _enlarged(
     bodies: Sequence[FieldMark], title: str, contact: _Loaded, tips: Points, span: float
 ) -> FieldPanel:
     """Zoom to the loaded nodes of a contact and show the force on each as an arrow."""
-    forces, (low, high) = contact.forces, _window(tips, span)
+    forces, closed = contact.forces, contact.closed
+    low, high = _window(tips[closed], span)
+    shown = closed | ((tips >= low) & (tips <= high)).all(axis=1)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
+    thick = 0.0032 if closed.sum() < 25 else 0.002
     arrows = [
         Vectors(
             feet=(tips - drawn)[of], vectors=drawn[of],
-            width=0.0032 if len(tips) < 25 else 0.002, cased=True,
-            colour=FRICTION[state][0] if state in FRICTION else _ARROW,
+            width=thick if state in FRICTION or not state else 0.4 * thick,
+            cased=state in FRICTION or not state,
+            colour=FRICTION[state][0] if state in FRICTION
+            else _APART if state else _ARROW,
         )
-        for state in np.unique(contact.friction)
-        if (of := contact.friction == state).any()
+        for state in sorted(set(contact.friction), key=lambda s: (s in FRICTION, s))
+        if (of := shown & (contact.friction == state)).any()
     ]  # fmt: skip
     counts = [
         f"{state}: {name} ({int((contact.friction == state).sum())})"
         for state, (_, name) in FRICTION.items()
     ]
+    counts += [f"shear without contact: grey ({int((~closed).sum())})"] * bool(
+        (~closed).any()
+    )
     key = f"\n{', '.join(counts)}" if contact.friction.any() else ""
     factor, prefix = prefixed(largest)
     return FieldPanel(

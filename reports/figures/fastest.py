@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from harness.running.pairs import Ratio
+from reports.data.evidence import case_set
 from reports.data.fastest import Competitor, FastestSolver, Finding, time_of
 from reports.document.figure import (
     INK,
@@ -26,12 +27,12 @@ from reports.document.figure import (
     limits,
     numbers,
 )
-from reports.document.formatting import VERDICTS, clean, plural
+from reports.document.formatting import VERDICTS, clean
 from reports.figures.style import legible, look, run_ids
 
 PANELS = 4  #: forms that are drawn
 SOLVERS = 12  #: of a panel
-_NAME = 20  #: letters of a name beside an axis
+_NAME = 28  #: letters of a name beside an axis
 _ROW = 0.3  #: height of a solver, inches
 _BESIDE = 0.24  #: from a mean to the cases that it is of, rows
 _TALL = 0.38  #: where ratios and a verdict share one, inches
@@ -40,39 +41,44 @@ _ALIKE = Look(colour=INK, width=0.8)  #: the line where times are equal
 
 
 def fastest_figure(
-    found: Sequence[FastestSolver], solvers: Sequence[str]
+    found: Sequence[FastestSolver], solvers: Sequence[str], most: int = SOLVERS
 ) -> Figure | None:
     """Draw a panel per form and in it a row per solver; None without an answer.
 
     solvers : of the whole report, which their looks go by
+    most : rows of a panel
     """
     shown = [f for f in found if f.cases and (f.competitors or f.others)]
     if not shown:
         return None
     columns = min(len(shown), 2)
-    panels = _on_one_scale([_panel(f, solvers) for f in shown])
+    panels = _on_one_scale([_panel(f, solvers, most) for f in shown])
     rows = []
     for i in range(0, len(shown), columns):
-        height = 0.75 + max(map(_height, shown[i : i + columns]))
+        height = 0.75 + max(_height(f, most) for f in shown[i : i + columns])
         rows.append(Row(panels=tuple(panels[i : i + columns]), height=height))
     return Figure(rows=tuple(rows), height=sum(row.height for row in rows))
 
 
-def _rows(f: FastestSolver) -> tuple[Competitor, ...]:
-    return (*f.competitors, *f.others)[:SOLVERS]
+def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
+    """Choose the first competitors; the best of every form is among them."""
+    every = (*f.competitors, *f.others)
+    best = {c.form: c for c in reversed(every)}.values()
+    late = [c for c in every[most:] if any(c is one for one in best)]
+    return (*every[: most - len(late)], *late)
 
 
-def _height(f: FastestSolver) -> float:
+def _height(f: FastestSolver, most: int) -> float:
     """Height of all rows, inches."""
     shared = _has_reference(f) and any(c.compared for c in f.others)
-    return max(len(_rows(f)), 4) * (_TALL if shared else _ROW)
+    return max(len(_rows(f, most)), 4) * (_TALL if shared else _ROW)
 
 
-def _panel(f: FastestSolver, solvers: Sequence[str]) -> Panel:
+def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
     """Draw the first solver uppermost, at 1, and everybody's ratios to it."""
     marks: list[Mark] = []
     texts = []
-    for k, c in enumerate(_rows(f)):
+    for k, c in enumerate(_rows(f, most)):
         style = replace(look(solvers.index(c.solver)), dash=None)
         failed = c in f.others
         below = _BELOW if failed and c.compared else 0.0
@@ -85,20 +91,31 @@ def _panel(f: FastestSolver, solvers: Sequence[str]) -> Panel:
             )  # fmt: skip
     return Panel(
         x=_ratios(f),
-        y=categories([_short(c.solver) for c in _rows(f)]),
+        y=categories([_short(_name(c)) for c in _rows(f, most)]),
         marks=tuple(marks),
         rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if _has_reference(f) else (),
         texts=tuple(texts),
-        title=f"{legible(f.kind.title)}, {plural(len(f.cases), 'case')}",
+        title=f"{legible(f.kind.title)}, {legible(_cases(f), 44)}",
         grid="x",
     )
+
+
+def _cases(f: FastestSolver) -> str:
+    row = (*f.competitors, *f.others)[0].outcomes
+    noun = "problem" if any(c.form for c in f.competitors) else "case"
+    return case_set((row[case] for case in f.cases), noun)
 
 
 def _ratios(f: FastestSolver) -> Axis:
     if not _has_reference(f):
         return Axis(low=0.0, high=1.0, ticks=())
-    label = f"total time / that of {legible(f.first.solver)}"
-    return Axis(label=label, log=True, plain=True, shared="ratios")
+    what = "time from the mesh" if f.first.form else "time"
+    label = f"{what} / that of {legible(_name(f.first), 44)}"
+    return Axis(label=label, log=True, plain=True, span=2.0, shared="ratios")
+
+
+def _name(c: Competitor) -> str:
+    return f"{c.solver}, {c.form}" if c.form else c.solver
 
 
 def _short(name: str) -> str:
@@ -136,9 +153,9 @@ def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]
     small = replace(style, size=2.8, opacity=0.6) if f.over_cases else style
     marks: list[Mark] = []
     if count:
-        ratios = [_ratio(c, f.first, case) for case in c.compared]
+        ratios = [_ratio(c, f, case) for case in c.compared]
         runs = [_behind(c, [case]) for case in c.compared]
-        known = [c.by_case.get(case) for case in c.compared]
+        known = [None if f.over_cases else c.by_case.get(case) for case in c.compared]
         marks.append(_points(ratios, places, runs, c, small, known))
     if middle:
         runs = [_behind(c, c.compared)]
@@ -151,11 +168,11 @@ def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
     return run_ids(r for case in cases for r in c.outcomes[case].records)
 
 
-def _ratio(c: Competitor, first: Competitor, case: str) -> float:
-    """Ratio of a case: within blocks where there are some, else of the medians."""
-    if case in c.by_case:
+def _ratio(c: Competitor, f: FastestSolver, case: str) -> float:
+    """Ratio of a case: of medians where cases are averaged, else within blocks."""
+    if case in c.by_case and not f.over_cases:
         return c.by_case[case].value
-    mine, its = time_of(c.outcomes[case]), time_of(first.outcomes[case])
+    mine, its = time_of(c.outcomes[case]), time_of(f.first.outcomes[case])
     return mine / its if mine and its else np.nan
 
 

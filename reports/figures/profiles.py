@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -22,7 +23,8 @@ from reports.document.figure import (
     in_rows,
     numbers,
 )
-from reports.figures.style import LEGEND_LINE, below, legible, look
+from reports.document.formatting import plural
+from reports.figures.style import LEGEND_LINE, TITLE, below, legible, look
 from reports.statistics.profiles import Array, curve, performance_ratios
 
 ROW = 4  #: solvers that are told apart in one panel, with their bands
@@ -107,7 +109,11 @@ def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
         # the last row has the labels of the axes, too
         height = 1.9 + LEGEND_LINE * (2 if last else 1)
         rows.append(Row(panels=panels, height=height, legend=below(keys, ROW)))
-    return Figure(rows=tuple(rows), height=sum(row.height for row in rows))
+    return Figure(
+        rows=tuple(rows),
+        height=TITLE + sum(row.height for row in rows),
+        title=_title(ranking),
+    )
 
 
 def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
@@ -130,7 +136,17 @@ def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     rows = in_rows(panels, columns)
     height = 1.75 * len(rows) + LEGEND_LINE * (1 + -(-len(names) // ROW))
     keys = [_key(name, style) for name, style in zip(names, styles, strict=True)]
-    return Figure(rows=rows, height=height, legend=below(keys, ROW))
+    return Figure(
+        rows=rows, height=TITLE + height, legend=below(keys, ROW), title=_title(ranking)
+    )
+
+
+def _title(ranking: Ranking) -> str:
+    """Name form, accuracy and cases, families by the first part of their names."""
+    group = ranking.group
+    families = Counter(case.partition("/")[0] for case in group.cases)
+    of = f" of {next(iter(families))}" if len(families) == 1 else ""
+    return legible(f"{group.title}, {plural(len(group.cases), 'case')}{of}", 96)
 
 
 def _key(name: str, style: Look) -> Key:

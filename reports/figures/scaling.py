@@ -8,6 +8,7 @@ from math import sqrt
 
 from reports.data.size_series import SizeSeries
 from reports.document.figure import (
+    Axis,
     Figure,
     Intervals,
     Key,
@@ -20,8 +21,18 @@ from reports.document.figure import (
     limits,
 )
 from reports.document.formatting import exponent
-from reports.figures.style import GUIDE, LEGEND_LINE, below, legible, log, look, run_ids
+from reports.figures.style import (
+    GUIDE,
+    LEGEND_LINE,
+    TITLE,
+    below,
+    legible,
+    log,
+    look,
+    run_ids,
+)
 
+MOST_SERIES = 6  #: that are drawn; all are tabulated
 _SIZE = "degrees of freedom $n$"
 SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: of guides, the steepest last
 _FOOT = 0.04  #: part of the axis below the guides, and above them at least
@@ -52,8 +63,40 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
     lines = -(-len(series.solvers) // 2)  # of the legend
     return Figure(
         rows=(Row(panels=(left, right)),),
-        height=2.4 + LEGEND_LINE * max(lines, 3),
+        height=2.4 + TITLE + LEGEND_LINE * max(lines, 3),
         legend=below(keys, 2),
+        title=legible(series.title, 96),
+    )
+
+
+def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None:
+    """Draw the iterations of one solver in every series; None without any."""
+    curves: list[Series] = []
+    keys: list[Key] = []
+    for series in found[:MOST_SERIES]:
+        counted = [
+            (float(n), sum(o.iterations) / 2, run_ids(o.records))
+            for n, o in series.curve(solver)
+            if o.iterations is not None
+        ]
+        if counted:
+            n, its, runs = zip(*counted, strict=True)
+            style = look(len(keys))
+            keys.append(Key(label=legible(series.title, 64), look=style))
+            curves.append(Series(x=n, y=its, look=style, solver=solver, runs=runs))
+    if not curves:
+        return None
+    most = max(max(curve.y) for curve in curves)
+    panel = Panel(
+        x=log(_SIZE),
+        y=Axis(label="iterations", low=0.0, high=1.15 * most, most=6, integers=True),
+        marks=tuple(curves),
+        title=legible(f"{solver}, verified answers", 64),
+    )
+    return Figure(
+        rows=(Row(panels=(panel,)),),
+        height=2.6 + LEGEND_LINE * len(keys),
+        legend=below(keys, 1),
     )
 
 

@@ -27,6 +27,7 @@ from reports.figures.style import (
     DASHED,
     LEGEND_LINE,
     MARKERS,
+    TITLE,
     below,
     legible,
     log,
@@ -58,7 +59,8 @@ def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
     """Draw the counts of one solver against dofs with fits c·nᵖ; None without any."""
     points = [(float(n), o) for n, o in series.curve(solver)]
     laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
-    return _figure(points, log("degrees of freedom $n$"), laws, solver)
+    title = f"{solver}, {series.title}"
+    return _figure(points, log("degrees of freedom $n$"), laws, solver, title)
 
 
 def torn_figure(sweep: Sweep) -> Figure | None:
@@ -67,7 +69,7 @@ def torn_figure(sweep: Sweep) -> Figure | None:
     shown = tuple((x, f"{x:g}") for x, _ in points)
     low, high = points[0][0] / 1.15, points[-1][0] * 1.15
     axis = Axis(label="cells $H/h$", log=True, low=low, high=high, ticks=shown)
-    return _figure(points, axis, {}, sweep.solver)
+    return _figure(points, axis, {}, sweep.solver, f"{sweep.solver}, {sweep.title}")
 
 
 def _figure(
@@ -75,14 +77,15 @@ def _figure(
     x: Axis,
     laws: dict[str, PowerLaw | None],
     solver: str,
+    title: str,
 ) -> Figure | None:
     panels: list[Panel] = []
     keys: list[Key] = []
     groups = [
         *((title, [*_counts(points, names, laws)]) for title, names in PANELS),
-        ("condition number", [*_condition_numbers(points)]),
+        ("condition number", _condition_curves(points)),
     ]
-    for title, curves in groups:
+    for name, curves in groups:
         if not curves:
             continue
         marks: list[Mark] = []
@@ -107,7 +110,7 @@ def _figure(
         panels.append(
             Panel(
                 x=x, y=Axis(low=0.0, high=1.12 * most or 1.0, integers=True, most=6),
-                title=title, marks=tuple(marks),
+                title=name, marks=tuple(marks),
             )
         )  # fmt: skip
     if not panels:
@@ -117,8 +120,9 @@ def _figure(
         rows = (rows[0], Row(panels=(replace(panels[2], span=2),)))
     return Figure(
         rows=rows,
-        height=0.2 + 2.3 * len(rows) + LEGEND_LINE * -(-len(keys) // 2),
+        height=0.2 + TITLE + 2.3 * len(rows) + LEGEND_LINE * -(-len(keys) // 2),
         legend=below(keys, 2),
+        title=legible(title, 96),
     )
 
 
@@ -144,26 +148,34 @@ def _counts(
     return found
 
 
-def _condition_numbers(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
-    """Take what every answer has of κ, without its error bounds."""
+def condition_numbers(
+    points: Sequence[tuple[float, Outcome]],
+) -> dict[str, tuple[float, ...]]:
+    """Return each κ that every answer has, without error bounds, by its name."""
     names = [
         name
-        for name, value in points[0][1].quantities.items()
+        for name in (points[0][1].quantities if points else ())
         if (name == KAPPA or name.startswith(f"{KAPPA}_"))
         and not name.endswith("_error")
-        and isinstance(value, int | float)
     ]
+    found: dict[str, tuple[float, ...]] = {}
+    for name in names:
+        values = [o.quantities.get(name) for _, o in points]
+        known = tuple(float(v) for v in values if isinstance(v, int | float))
+        if len(known) == len(points):
+            found[" ".join(["κ", *name.removeprefix(KAPPA).split("_")[1:]])] = known
+    return found
+
+
+def _condition_curves(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
     return [
         _Curve(
-            label=" ".join(
-                [r"$\kappa$", *legible(name.removeprefix(KAPPA)).split("_")[1:]]
-            ),
+            label=" ".join([r"$\kappa$", *legible(name).split()[1:]]),
             x=tuple(x for x, _ in points),
-            y=tuple(float(o.quantities[name]) for _, o in points),
+            y=values,
             answers=tuple(o for _, o in points),
         )
-        for name in names
-        if all(isinstance(o.quantities.get(name), int | float) for _, o in points)
+        for name, values in condition_numbers(points).items()
     ]
 
 

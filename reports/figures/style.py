@@ -9,13 +9,23 @@ from harness import Record
 from reports.document.figure import INK, Axis, Key, Legend, Look
 from reports.document.formatting import clean
 
-#: Okabe & Ito's colours without yellow and black: distinct for colour-blind readers.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+#: One hue for each solver, at least 28° apart up to the eighth and 6° up to the last.
+#: The first four are Okabe and Ito's; each further one is the colour of OKLCH that is
+#: farthest from those before it, as seen with normal sight, deuteranopia and protanopia
+#: (Machado et al. 2009), with a contrast of 2.4 at least on a light and a dark page.
+COLOURS = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8b6bf7", "#b0a93b", "#e17ffe",
+    "#c9212e", "#216e45", "#4851d5", "#b02e9a", "#b775fe", "#698e2f", "#31a3b0",
+    "#f34e6c", "#ff72d1", "#ce5dd2", "#c32066", "#008a80", "#6a5ee7", "#77650e",
+    "#36b485", "#2c8240", "#889d37", "#859ff6", "#ee6f61", "#288de5", "#f47599",
+    "#2063bf", "#067094",
+)  # fmt: skip
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 DASHED, DOTTED = (3.7, 1.6), (1.0, 1.65)
 DASHES = ((), DASHED, (6.4, 1.6, 1.0, 1.6), (4, 1, 1, 1, 1, 1), (1, 1))
 GUIDE = Look(colour=INK, width=0.6)  #: lines to compare with
 LEGEND_LINE = 0.21  #: height of a line of a legend, inches
+TITLE = 0.24  #: height of the title of a figure, inches
 
 
 def legible(label: str, limit: int = 32) -> str:
@@ -32,7 +42,10 @@ def legible(label: str, limit: int = 32) -> str:
 
 
 def look(index: int) -> Look:
-    """Colour, marker and dashes of the index-th solver; distinct in grey print too."""
+    """Colour, marker and dashes of the index-th solver; distinct in grey print too.
+
+    Beyond as many solvers as there are colours hues recur, with other markers.
+    """
     rounds = index // lcm(len(COLOURS), len(MARKERS))  # of all pairs that come in turn
     return Look(
         colour=COLOURS[index % len(COLOURS)],

@@ -7,6 +7,7 @@ from pathlib import Path
 from harness.files.experiment import load_experiment
 from reports.data.evidence import read_evidence
 from reports.export.csv_tables import csv_tables as report_tables
+from reports.export.csv_tables import frame_csv
 from reports.paper.csv_tables import csv_tables
 from reports.paper.page import BEYOND, compose
 from reports.render.html_page import html
@@ -37,14 +38,16 @@ def write_paper(folder: Path) -> list[Path]:
     tables = folder / "tables"
     written = [write_text(folder / "index.html", html(page, drawings)), *figures]
     written += [
-        write_text(tables / f"{section.name}.tex", latex(section.tables))
+        write_text(
+            tables / f"{section.name}.tex", latex(section.tables, name=section.name)
+        )
         for section in page.sections
         if section.tables
     ]
     frames = csv_tables(experiment)
     frames |= {name: report_tables(e)["outcomes"] for name, e in suites.items()}
     written += [
-        write_text(tables / f"{name}.csv", frame.to_csv(index=False))
+        write_text(tables / f"{name}.csv", frame_csv(frame))
         for name, frame in frames.items()
     ]
     return written

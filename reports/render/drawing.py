@@ -72,6 +72,7 @@ STYLE: Any = {
     "pdf.fonttype": 42,
 }
 _VAST = 100.0  #: decades of an axis, which only answers out of all bounds need
+_GAP = 0.03  #: between a legend and the curves below it, of the height of the axes
 _FRONT = 2.0  #: height of the first mark; each next one lies a little higher
 _PLACES: dict[str, Any] = {
     "below": "outside lower center",
@@ -106,7 +107,35 @@ def draw_curves(figure: Figure) -> Canvas:
                 _legend(part, row.legend)
         if whole.legend:
             _legend(canvas, whole.legend)
+        if whole.title:
+            canvas.suptitle(whole.title, x=0.01, ha="left", size=9.5)
+        if any(panel.legend for panel in whole.panels):
+            _uncover(canvas)
     return canvas
+
+
+def _uncover(canvas: Canvas) -> None:
+    """Raise the upper ends of axes until no curve lies behind a legend within them."""
+    canvas.draw_without_rendering()
+    for axes in canvas.axes:
+        legend = axes.get_legend()
+        if legend is None:
+            continue
+        inside = axes.transAxes.inverted()
+        room = legend.get_window_extent().transformed(inside).y0 - _GAP
+        places = [
+            inside.transform(axes.transData.transform(line.get_xydata()))
+            for line in axes.lines
+        ]
+        heights = np.concatenate([p[np.isfinite(p).all(axis=1), 1] for p in places])
+        top = float(heights.max(initial=0.0))
+        if not 0 < room < top:
+            continue
+        low, high = axes.get_ylim()
+        if axes.get_yscale() == "log":
+            axes.set_ylim(low, low * (high / low) ** (top / room))
+        else:
+            axes.set_ylim(low, low + (high - low) * top / room)
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:

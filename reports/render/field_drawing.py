@@ -116,6 +116,7 @@ def _mark(axes: Axes, mark: FieldMark, height: float) -> None:
                 mark.text, mark.place, xytext=mark.offset, color=mark.colour,
                 textcoords="offset points", ha=mark.align[0], va=mark.align[1],
                 path_effects=_LETTER_CASING if mark.cased else [], zorder=height,
+                fontsize=mark.size,
             )  # fmt: skip
 
 

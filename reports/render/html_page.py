@@ -15,6 +15,7 @@ from markupsafe import Markup
 
 from reports.document.layout import Cell, Page, Picture, short
 from reports.render.embedded import Rows, data, details, plots, rows_of, runs_of
+from reports.render.formulas import mathml, split
 from reports.render.svg import Svg, inline
 
 FIRST = 50  #: rows of a table that are in the page as written; its script has all
@@ -80,13 +81,24 @@ def breakable(text: str) -> Markup:
 
 
 def told(text: str, rows: Rows) -> Markup:
-    """Break prose as names may be broken, and link the run_ids in it."""
+    """Typeset formulas of prose, break the rest as names may be, link its run_ids."""
 
     def linked(match: re.Match[str]) -> str:
         run_id = match[0]
         return f'<a href="#run-{run_id}">{run_id}</a>' if run_id in rows else run_id
 
-    return Markup(_RUN_ID.sub(linked, str(breakable(text))))
+    parts = split(text)
+    parts[::2] = [_RUN_ID.sub(linked, str(breakable(part))) for part in parts[::2]]
+    parts[1::2] = map(_formula, parts[1::2])
+    return Markup("".join(parts))
+
+
+def _formula(tex: str) -> str:
+    """Typeset a formula; a name of a foreign folder that is none stays as it is."""
+    try:
+        return mathml(tex)
+    except ValueError:
+        return str(breakable(rf"\({tex}\)"))
 
 
 def link(cell: Cell, page: Page, rows: Rows) -> Markup:

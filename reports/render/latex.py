@@ -25,14 +25,29 @@ _SPECIAL = {
 _PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
 
 
-def latex(tables: tuple[Table, ...], statements: tuple[Statement, ...] = ()) -> str:
-    r"""Render statements as a list, then tables; they need \usepackage{booktabs} only.
+#: rows of a float; a longer table is broken over pages, since a float cannot be
+ROWS = 36
 
+
+def latex(
+    tables: tuple[Table, ...], statements: tuple[Statement, ...] = (), name: str = ""
+) -> str:
+    r"""Render statements as a list, then tables; the first line names the packages.
+
+    Tables of more than `ROWS` rows need \usepackage{longtable}, all need booktabs.
     Times carry their unit and interval; all other numbers are plain (1.2e-09), as
     siunitx reads them.
+
+    name : of the section; the k-th table has the label tab:NAME-k, a single one
+        tab:NAME
     """
+    long = any(len(table.rows) > ROWS for table in tables)
+    packages = rf"% \usepackage{{booktabs{',longtable' * long}}}" + "\n"
     parts = [_statements(statements)] if statements else []
-    return "% \\usepackage{booktabs}\n" + "\n".join((*parts, *map(_table, tables)))
+    for k, table in enumerate(tables, 1):
+        number = f"-{k}" * (len(tables) > 1)
+        parts.append(_table(table, f"tab:{name}{number}" if name else ""))
+    return packages + "\n".join(parts)
 
 
 def _statements(statements: tuple[Statement, ...]) -> str:
@@ -44,24 +59,31 @@ def _statements(statements: tuple[Statement, ...]) -> str:
     return "\n".join((r"\begin{description}", *items, r"\end{description}", ""))
 
 
-def _table(table: Table) -> str:
+def _table(table: Table, label: str) -> str:
     columns = "".join("lr"[not table.wordy(i)] for i in range(len(table.columns)))
-    lines = [
-        r"\begin{table}",
-        r"  \centering",
-        rf"  \caption{{{escaped(table.legend)}}}",
-        rf"  \begin{{tabular}}{{{columns}}}",
-        r"    \toprule",
-        _row([escaped(c) for c in table.columns]),
-        r"    \midrule",
-    ]
+    marked = rf"\label{{{label}}}" * bool(label)
+    caption = rf"  \caption{{{escaped(table.legend)}}}{marked}"
+    head = [r"    \toprule", _row([escaped(c) for c in table.columns]), r"    \midrule"]
+    body = []
     before = ""
     for row in table.rows:
         if row[0].kind == "total" != before:
-            lines.append(r"    \midrule")
+            body.append(r"    \midrule")
         before = row[0].kind
-        lines.append(_row([_cell(c) for c in row]))
-    lines += [r"    \bottomrule", r"  \end{tabular}", r"\end{table}", ""]
+        body.append(_row([_cell(c) for c in row]))
+    end = r"    \bottomrule"
+    if len(table.rows) > ROWS:
+        lines = [
+            rf"\begin{{longtable}}{{{columns}}}", rf"{caption} \tabularnewline",
+            *head, r"  \endfirsthead", *head, r"  \endhead",
+            end, r"  \endfoot", *body, r"\end{longtable}", "",
+        ]  # fmt: skip
+    else:
+        lines = [
+            r"\begin{table}", r"  \centering", caption,
+            rf"  \begin{{tabular}}{{{columns}}}", *head, *body, end,
+            r"  \end{tabular}", r"\end{table}", "",
+        ]  # fmt: skip
     return "\n".join(lines)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from reports.document.layout import Cell, Page, Section, Statement, Table
+from reports.render.formulas import split
 
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
@@ -24,15 +25,23 @@ def markdown(page: Page) -> str:
 def _section(section: Section, page: Page) -> list[str]:
     parts = [f"## {escaped(section.title)}"]
     parts += [_statement(one, page) for one in section.statements]
-    parts += [escaped(p) for p in section.prose]
+    parts += [_prose(p) for p in section.prose]
     if section.points:
-        parts.append("\n".join(f"- {escaped(p)}" for p in section.points))
+        parts.append("\n".join(f"- {_prose(p)}" for p in section.points))
     for table in section.tables:
         parts += [_table(table), f"*{escaped(table.legend)}*"]
     for picture in section.pictures:
         caption = escaped(picture.caption)
         parts += [f"![{picture.name}](figures/{picture.name}.png)", f"*{caption}*"]
     return parts
+
+
+def _prose(text: str) -> str:
+    """Escape prose around its formulas, which Markdown has between dollars."""
+    parts = split(text)
+    parts[::2] = map(escaped, parts[::2])
+    parts[1::2] = [f"${tex}$" for tex in parts[1::2]]
+    return "".join(parts)
 
 
 def _statement(statement: Statement, page: Page) -> str:

@@ -55,6 +55,7 @@ def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
                 "columns": whole.columns,
             })  # fmt: skip
     made[0]["common"] = common
+    made[0]["heading"] = plain(whole.title)
     return made
 
 

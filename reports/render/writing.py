@@ -31,7 +31,8 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
     if "tex" in formats:
         written += [
             write_text(
-                target / "tables" / f"{s.name}.tex", latex(s.tables, s.statements)
+                target / "tables" / f"{s.name}.tex",
+                latex(s.tables, s.statements, s.name),
             )
             for s in page.sections
             if s.tables or s.statements

@@ -21,7 +21,13 @@ from reports.data.quantities import (
 )
 from reports.document.formatting import clean, plural, power, significant, tolerance
 from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.deformed import PERCENTILE, SCALE, clipped_at, deformed_figure
+from reports.figures.deformed import (
+    PERCENTILE,
+    SCALE,
+    automatic_scale,
+    clipped_at,
+    deformed_figure,
+)
 from reports.figures.tractions import traction_figure
 
 
@@ -242,11 +248,12 @@ def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
 
 
 def _deformed_caption(outcome: Outcome, fields: Fields) -> str:
+    scale = automatic_scale(fields)
     caption = (
         f"{clean(outcome.case)}: the largest verified case, as answered by "
         f"{clean(outcome.solver, 40)} at tol {tolerance(outcome.tol)} (run "
-        f"{clean(outcome.run_ids[0], 40)}). Displacements are drawn to scale "
-        f"(factor {SCALE:g})."
+        f"{clean(outcome.run_ids[0], 40)}). Displacements are drawn "
+        f"{'to scale ' if scale == SCALE else ''}(factor {scale:g})."
     )
     limits = clipped_at(fields)
     if limits is None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from harness import Verdict
 from reports.data.cells import case_cells, grid, source, verdict_cell
 from reports.data.evidence import RESIDUALS, Evidence, Outcome
-from reports.document.formatting import ABSENT, clean, power, span
+from reports.document.formatting import ABSENT, clean, plain_value, power, span
 from reports.document.layout import Cell, Section, Table, name_cell, sources
 from reports.statistics.profiles import share
 
@@ -26,14 +26,16 @@ def claim_counts(evidence: Evidence) -> Section:
     count: dict[str, Counter[tuple[bool, bool]]] = defaultdict(Counter)
     for o in evidence.flat:
         if o.verdict is not Verdict.DECLINED:
-            count[o.solver][o.claims == ("solved",), o.verified] += 1
+            claimed = o.claims == ("solved",) or all(r.claims_answer for r in o.records)
+            count[o.solver][claimed, o.verified] += 1
     return Section(
         name="tally",
         title="Claims and verdicts, counted",
         prose=(
             "Answers, one per case and tolerance, by what the solver said of them and "
             "what we found; of several repeats, all have to be claimed to be solved, "
-            "and all to be verified. Claims that hold: the share of such claims that "
+            "and all to be verified; a proven claim of infeasibility counts as such an "
+            "answer. Claims that hold: the share of such claims that "
             "were verified, with its 95 % interval (Clopper and Pearson).",
         ),
         tables=(
@@ -128,6 +130,8 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
     after = [power(outcome.worst)] if outcome.worst is not None else []
     refuted = outcome.verdict in (Verdict.INACCURATE, Verdict.WRONG)
     expected = "solved" if outcome.verified or refuted else outcome.verdict.value
+    if outcome.verdict is Verdict.VERIFIED_INFEASIBLE:
+        expected = "infeasible"
     claimed = [c for c in outcome.claims if c != expected]
     if claimed and outcome.verdict is not Verdict.DECLINED:
         after.append("claimed " + clean(", ".join(claimed).replace("_", " "), 40))
@@ -192,7 +196,7 @@ def _count(outcome: Outcome, name: str) -> Cell:
     if n is None:
         return Cell()
     return Cell(
-        text=clean(str(n), 24), value=_number(n), title=sources([outcome.first])
+        text=plain_value(n, 24), value=_number(n), title=sources([outcome.first])
     )
 
 

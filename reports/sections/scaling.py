@@ -1,17 +1,34 @@
-"""Time and iterations against size: fitted exponents, and whether iterations grow."""
+"""Time and iterations against size: fitted exponents, and growth of iterations.
+
+A suite of one solver opens with them, with condition numbers and speed-up on ranks.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from reports.data.cells import source
-from reports.data.evidence import Outcome
+from reports.data.evidence import Evidence, Outcome
+from reports.data.rank_series import strong_series
 from reports.data.size_series import SIZES as SERIES
-from reports.data.size_series import SizeSeries, Sweep
-from reports.document.formatting import ABSENT, TIMED, clean, exponent, seconds, span
-from reports.document.layout import Cell, Picture, Section, Table
-from reports.figures.steps import steps_figure, torn_figure
-from reports.statistics.growth import LEVEL, SIZES, Growth, growth_of
+from reports.data.size_series import SizeSeries, Sweep, sweeps
+from reports.document.formatting import (
+    ABSENT,
+    TIMED,
+    bracketed,
+    clean,
+    exponent,
+    plural,
+    seconds,
+    significant,
+    span,
+    tolerance,
+)
+from reports.document.layout import Cell, Picture, Section, Statement, Table
+from reports.figures.scaling import iterations_figure
+from reports.figures.steps import condition_numbers, steps_figure, torn_figure
+from reports.statistics.growth import PRACTICAL, SIZES, Growth, Trend, growth_of
 from reports.statistics.intervals import PowerLaw
 
 #: What the sizes of a series count, wherever they are shown.
@@ -113,11 +130,12 @@ def growth(found: Sequence[SizeSeries]) -> Section | None:
         title="Do iterations grow?",
         prose=(
             "Scalable methods need as many iterations on a large problem as on a small "
-            f"one. The hypothesis that they do not grow, p ≤ 0 in c·nᵖ, is tested at "
-            f"{LEVEL:.0%} by Student's one-sided test of the slope on logarithms. That "
-            "no growth is detected does not show that there is none: p may be as large "
-            "as its upper bound (95 %, one-sided). Fewer than four sizes on which a "
-            "solver is verified make no test.",
+            "one. The change per decade is 10ᵖ − 1 for iterations c·nᵖ, fitted by "
+            "least squares on logarithms, with Student's 95 % interval. Iterations "
+            f"grow where all of the interval lies above +{PRACTICAL:.0%}, fall where "
+            f"it lies below −{PRACTICAL:.0%}, and are flat where it lies between the "
+            "two; otherwise the sizes do not decide. Fewer than four sizes on which a "
+            "solver is verified are not judged.",
             "The time at the largest size is what the fit t = c·nᵖ says, with the 95 % "
             "interval of a further measurement; it is refused where the solver's own "
             "verified sizes end earlier, since nothing supports the law beyond them.",
@@ -131,7 +149,7 @@ def _growth_table(series: SizeSeries) -> Table:
     return Table(
         caption=f"Growth of iterations, and time at n = {largest}: {series.title}.",
         columns=(
-            "solver", "sizes", "p of iterations", "p at most", "p-value",
+            "solver", "sizes", "p of iterations [95 %]", "per decade [95 %]",
             "iterations", f"time at n = {largest}",
         ),
         rows=tuple(_growth_row(series, s, largest) for s in series.solvers),
@@ -140,14 +158,22 @@ def _growth_table(series: SizeSeries) -> Table:
 
 def _growth_row(series: SizeSeries, solver: str, largest: int) -> tuple[Cell, ...]:
     curve = series.curve(solver)
-    counted = [(n, sum(o.iterations) / 2) for n, o in curve if o.iterations]
+    fit = iteration_growth(series, solver)
+    p = Cell() if fit is None else Cell(text=_exponent_of(fit), value=fit.exponent)
     timed = [(n, t.value) for n, o in curve if (t := o.seconds("total"))]
     return (
         Cell(text=clean(solver, 40)),
         Cell(text=str(len(curve)), value=len(curve)),
-        *_tested(_fit(counted)),
+        p,
+        *_judged(fit),
         _predicted(_fit(timed), largest),
     )
+
+
+def iteration_growth(series: SizeSeries, solver: str) -> Growth | None:
+    """Fit the iterations of one solver; None with too few verified sizes."""
+    curve = series.curve(solver)
+    return _fit([(n, sum(o.iterations) / 2) for n, o in curve if o.iterations])
 
 
 def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
@@ -158,20 +184,27 @@ def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
     return growth_of(*zip(*kept, strict=True))
 
 
-def _tested(fit: Growth | None) -> tuple[Cell, ...]:
+def _judged(fit: Growth | None) -> tuple[Cell, Cell]:
+    """Show the change per decade, and what it allows to say."""
     if fit is None:
-        few = Cell(text="too few sizes", kind="quiet")
-        return (Cell(), Cell(), Cell(), few)
-    p = "< 0.001" if fit.p_value < 0.001 else f"{fit.p_value:.3f}"
+        return Cell(), Cell(text="too few sizes", kind="quiet")
+    trend = fit.trend
+    kind = {Trend.GROWS: "over", Trend.UNDECIDED: "quiet"}.get(trend, "")
     return (
-        Cell(text=f"{fit.exponent + 0.0:.3f}", value=fit.exponent),
-        Cell(text=f"{fit.most + 0.0:.3f}", value=fit.most),
-        Cell(text=p, value=fit.p_value),
-        Cell(
-            text="grow" if fit.grows else "no growth detected",
-            kind="over" if fit.grows else "",
-        ),
+        Cell(text=per_decade(fit), value=fit.per_decade[0]),
+        Cell(text=trend.value, kind=kind),
     )
+
+
+def _exponent_of(fit: Growth) -> str:
+    p, low, high = (v + 0.0 for v in (fit.exponent, fit.low, fit.high))
+    return f"{p:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def per_decade(fit: Growth) -> str:
+    """Print the change per decade and its interval: "+4 % [-1, +9]"."""
+    change, low, high = (f"{min(100 * v, 9999):+.0f}" for v in fit.per_decade)
+    return f"{change} % [{low}, {high}]"
 
 
 def _predicted(fit: Growth | None, n: int) -> Cell:
@@ -207,8 +240,8 @@ def steps(found: Sequence[SizeSeries], torn: Sequence[Sweep]) -> Section | None:
             "gradient (cg), expansion and proportioning steps apart. Conditioning "
             "shows in cg; the search for the active set shows in the other two. "
             "Verified answers only, the mean of the repeats. p is the exponent of "
-            "c·nᵖ with Student's 95 % interval, p at most its one-sided 95 % bound; "
-            "the test is that of iterations.",
+            "c·nᵖ with Student's 95 % interval, and growth is judged as that of "
+            "iterations.",
             "H/h is the largest number of cells along a side of a subdomain, m the "
             "number of multipliers.",
         ),
@@ -251,8 +284,8 @@ def _step_tables(series: SizeSeries) -> list[Table]:
         found.append(Table(
             caption=f"Counts of {clean(solver, 40)} against size: {series.title}.",
             columns=(
-                "count", *(f"n = {n}" for n, _ in curve), "p [95 %]", "p at most",
-                "p-value", "growth",
+                "count", *(f"n = {n}" for n, _ in curve), "p [95 %]",
+                "per decade [95 %]", "growth",
             ),
             rows=tuple(_step_row(series, solver, name) for name in ordered),
         ))  # fmt: skip
@@ -295,5 +328,134 @@ def _step_row(series: SizeSeries, solver: str, name: str) -> tuple[Cell, ...]:
         Cell(text=clean(name, 40)),
         *(_count(o, name) for _, o in curve),
         _exponent(series.count_law(solver, name), source(*(o for _, o in curve))),
-        *_tested(fit)[1:],
+        *_judged(fit),
     )
+
+
+MOST_TOLD = 4  #: series that have a sentence of their own
+_TRENDS = {
+    Trend.FLAT: "stay flat",
+    Trend.GROWS: "grow",
+    Trend.FALLS: "fall",
+    Trend.UNDECIDED: "are neither flat nor growing for sure",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnResults:
+    """Results of a suite of one solver; empty where solvers are compared."""
+
+    statements: tuple[Statement, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+
+
+def own_results(evidence: Evidence, sizes: Sequence[SizeSeries]) -> OwnResults:
+    """Open with the growth of iterations, condition numbers and speed-up on ranks."""
+    cold = {r.solver for r in evidence.records if not r.role and r.ranks == 1}
+    if len(cold) != 1:
+        return OwnResults()
+    (solver,) = cold
+    claims = [
+        *_growth(solver, sizes),
+        *_condition(solver, sizes),
+        *_against_subdomains(evidence),
+        *_speed_up(evidence),
+    ]
+    if not claims:
+        return OwnResults()
+    statement = Statement(
+        subject=clean(solver, 40),
+        claims=tuple(claims),
+        evidence=("growth", "scaling", "steps", "ranks", "verdicts"),
+    )
+    figure = iterations_figure(sizes, solver)
+    caption = (
+        "Iterations against size, from zero on, one line for each series of cases that "
+        "differ in size only."
+    )
+    pictures = () if figure is None else (
+        Picture(name="answer", caption=caption, figure=figure),
+    )  # fmt: skip
+    return OwnResults(statements=(statement,), pictures=pictures)
+
+
+def _growth(solver: str, sizes: Sequence[SizeSeries]) -> list[str]:
+    """Judge the growth of iterations in one sentence, then series by series."""
+    fits = [(s, fit) for s in sizes if (fit := iteration_growth(s, solver))]
+    if not fits:
+        return []
+    parts = []
+    for trend, words in _TRENDS.items():
+        those = [(s, fit) for s, fit in fits if fit.trend is trend]
+        if those:
+            where = f" in {len(those)} of {len(fits)} series" * (len(fits) > 1)
+            parts.append(f"{words}{where} ({_changes([fit for _, fit in those])})")
+    told = [
+        f"{clean(s.title)}: {_counts(s, solver)}, {per_decade(fit)} per decade."
+        for s, fit in fits[: MOST_TOLD * (len(fits) > 1)]
+    ]
+    curves = [point for s, _ in fits for point in s.curve(solver)]
+    its = [i for _, o in curves for i in o.iterations or ()]
+    reach = [n for n, _ in curves]
+    return [
+        f"From {significant(min(reach))} to {significant(max(reach))} degrees of "
+        f"freedom {clean(solver, 40)} takes {min(its)} to {max(its)} iterations, which "
+        f"{', and '.join(parts)}.",
+        *told,
+    ]
+
+
+def _changes(fits: Sequence[Growth]) -> str:
+    """Print the changes per decade of n, 95 %, from the least to the largest."""
+    ordered = sorted(fits, key=lambda fit: fit.exponent)
+    ends = dict.fromkeys(per_decade(fit) for fit in (ordered[0], ordered[-1]))
+    return f"{' to '.join(ends)} per decade"
+
+
+def _counts(series: SizeSeries, solver: str) -> str:
+    its = [i for _, o in series.curve(solver) if o.iterations for i in o.iterations]
+    if min(its) < max(its):
+        return f"{min(its)} to {max(its)} iterations"
+    return f"{its[0]} iterations on {plural(len(series.curve(solver)), 'size')}"
+
+
+def _condition(solver: str, sizes: Sequence[SizeSeries]) -> list[str]:
+    """Give the range of every condition number along a series."""
+    found = []
+    for series in sizes:
+        curve = [(float(n), o) for n, o in series.curve(solver)]
+        ranges = [
+            f"{name} {significant(min(values))} to {significant(max(values))}"
+            for name, values in condition_numbers(curve).items()
+        ]
+        if ranges:
+            found.append(f"{clean(series.title)}: {', '.join(ranges)}.")
+    return found
+
+
+def _against_subdomains(evidence: Evidence) -> list[str]:
+    """Give iterations at the ends of a sweep of H/h."""
+    found = []
+    for sweep in sweeps(evidence, "feti"):
+        (a, first), (b, last) = sweep.answers[0], sweep.answers[-1]
+        if first.iterations and last.iterations:
+            found.append(
+                f"{sweep.title}: H/h = {a} takes {first.iterations[1]} iterations, "
+                f"H/h = {b} takes {last.iterations[1]}."
+            )
+    return found
+
+
+def _speed_up(evidence: Evidence) -> list[str]:
+    """Give the speed-up of the solve on the most ranks that had a CPU each."""
+    found = []
+    for s in strong_series(evidence):
+        free = [n for n in s.several if not s.crowded(n)]
+        up = s.speed_up(free[-1], "solve") if free else None
+        if up is not None:
+            found.append(
+                f"{clean(s.case)}: {free[-1]} ranks solve "
+                f"{bracketed(up.value, up.low, up.high)} times as fast as one, at tol "
+                f"{tolerance(s.tol)}."
+            )
+    return found

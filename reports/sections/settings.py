@@ -11,7 +11,14 @@ from typing import Any
 from reports.data.cells import source
 from reports.data.environment import flatten
 from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import ABSENT, TIMED, clean, plural, tolerance
+from reports.document.formatting import (
+    ABSENT,
+    TIMED,
+    clean,
+    plain_value,
+    plural,
+    tolerance,
+)
 from reports.document.layout import Cell, Section, Table, name_cell
 
 _SIZES = ("variables", "equalities", "inequalities", "bounds")
@@ -73,7 +80,7 @@ def _table(family: str, outcomes: list[Outcome], runs: Mapping[str, str]) -> Tab
 
 def _value(outcome: Outcome, key: str) -> str:
     params = outcome.first.params
-    return clean(str(params[key]), 60) if key in params else ABSENT
+    return plain_value(params[key], 60) if key in params else ABSENT
 
 
 def _parameter(outcome: Outcome, key: str) -> Cell:
@@ -86,7 +93,7 @@ def _size(outcome: Outcome, name: str, runs: str) -> Cell:
     n = outcome.first.sizes.get(name)
     if n is None:
         return Cell()
-    return Cell(text=clean(str(n), 24), value=_number(n), title=runs)
+    return Cell(text=plain_value(n, 24), value=_number(n), title=runs)
 
 
 def _number(value: object) -> float | None:
@@ -152,7 +159,7 @@ def _plain(value: Any) -> str:
         case list() | tuple():
             return clean(", ".join(map(str, value)), 400) or "none"
         case _:
-            return clean(str(value), 400)
+            return plain_value(value, 400)
 
 
 def definitions(factor: float) -> Section:
@@ -161,32 +168,42 @@ def definitions(factor: float) -> Section:
         name="definitions",
         title="Definitions and limitations",
         prose=(
-            "Every problem is  min ½xᵀPx + qᵀx  subject to  Ax = b,  Gx ≤ h,  "
-            "lb ≤ x ≤ ub, with multipliers such that  Px + q + Aᵀy + Gᵀz + z_box = 0, "
-            "z ≥ 0, z_box ≤ 0 at an active lower and ≥ 0 at an active upper bound. "
+            r"Every problem is \(\min \tfrac12 x^{\mathsf T}Px + q^{\mathsf T}x\) "
+            r"subject to \(Ax = b\), \(Gx \le h\), \(\mathrm{lb} \le x \le "
+            r"\mathrm{ub}\), with multipliers such that \(Px + q + A^{\mathsf T}y + "
+            r"G^{\mathsf T}z + z_\mathrm{box} = 0\), \(z \ge 0\), \(z_\mathrm{box} \le "
+            r"0\) at an active lower and \(\ge 0\) at an active upper bound. "
             "Four residuals vanish exactly at a solution. None changes when the "
-            "objective, a row or the unit of a variable is scaled. E is the largest of "
-            "|xᵀPx|, |qᵀx| and |bᵀy + hᵀz + the bounds' term|, at most 10⁴ times the "
+            "objective, a row or the unit of a variable is scaled. "
+            r"\(E\) is the largest of \(|x^{\mathsf T}Px|\), \(|q^{\mathsf T}x|\) and "
+            r"\(|b^{\mathsf T}y + h^{\mathsf T}z + \text{the bounds' term}|\), at "
+            r"most \(10^4\) times the "
             "objective and at least a hundredth of what the least variable alone can "
-            "gain; Xⱼ is the larger of |xⱼ| and the length over which the energy "
-            "changes by E; S is the largest of ‖Px‖, ‖q‖ and ‖Aᵀy + Gᵀz + z_box‖ in "
+            r"gain; \(X_j\) is the larger of \(|x_j|\) and the length over which the "
+            r"energy changes by \(E\); \(S\) is the largest of \(\|Px\|\), \(\|q\|\) "
+            r"and \(\|A^{\mathsf T}y + G^{\mathsf T}z + z_\mathrm{box}\|\) in "
             "the maximum norm. What rounding explains is taken off first. (Records of "
             "schema 1 have other scales.)",
         ),
         points=(
-            "Primal: the worst violation of a row or bound, relative to |bᵢ| + "
-            "Σ|aᵢⱼ|Xⱼ.",
-            "Dual: ‖Px + q + Aᵀy + Gᵀz + z_box‖∞ / S, each component relative to its "
-            "own terms, unless the energy at stake is small against E; and every "
+            r"Primal: the worst violation of a row or bound, relative to \(|b_i| + "
+            r"\sum |a_{ij}|X_j\).",
+            r"Dual: \(\|Px + q + A^{\mathsf T}y + G^{\mathsf T}z + z_\mathrm{box}"
+            r"\|_\infty / S\), each component relative to its "
+            r"own terms, unless the energy at stake is small against \(E\); and every "
             "multiplier of the wrong sign; one on an absent bound has the wrong sign.",
-            "Complementarity: the largest |multiplier × slack| / E.",
-            "Gap: |primal objective − dual objective| / E.",
+            r"Complementarity: the largest \(|\text{multiplier} \times \text{slack}| / "
+            r"E\).",
+            r"Gap: \(|\text{primal objective} - \text{dual objective}| / E\).",
             f"Verified: every residual ≤ {factor:g} × tol (and ≤ 0.1), whatever was "
             "claimed. "
             "Where a QP is small enough to be solved once more, the difference to its "
             "proven optimum decides instead (decided_by is then reference). "
+            "Verified infeasible: a claim of infeasibility that a Farkas certificate, "
+            "evaluated without rounding, proves. "
             "Inaccurate: success was claimed and refuted, but at least half of the "
-            f"digits are there (worst residual ≤ √({factor:g} × tol)). Wrong: refuted "
+            rf"digits are there (worst residual \(\le \sqrt{{{factor:g} \, "
+            r"\mathrm{tol}}\)). Wrong: refuted "
             "beyond that.",
             "Failures keep the name of their cause: iteration, time or memory limit, "
             "crashed (the process died), failed (it raised or gave up), declined (it "

@@ -24,7 +24,7 @@ from reports.document.layout import Cell, Section, Table, name_cell, sources
 
 _LIMITS = (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
 _GROUPS: dict[str, tuple[Verdict, ...]] = {
-    "verified": (Verdict.VERIFIED,),
+    "verified": (Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE),
     "inaccurate": (Verdict.INACCURATE,),
     "wrong": (Verdict.WRONG,),
     "infeasible claim": (Verdict.INFEASIBLE_CLAIM,),
@@ -216,7 +216,8 @@ def _counts(evidence: Evidence) -> Table:
             )
         rows.append(tuple(row))
     return Table(
-        caption="Measurements by verdict. Inaccurate and wrong: the solver claimed "
+        caption="Measurements by verdict. Verified: optimal points, and proven claims "
+        "of infeasibility. Inaccurate and wrong: the solver claimed "
         "success and its point refutes the claim. Declined: cases that were not "
         "measured, at one tolerance each; they are not among the measurements.",
         columns=("solver", "measurements", *_GROUPS),
@@ -283,7 +284,7 @@ def _missed(tried: Sequence[Outcome], tol: float) -> list[str]:
 
 def _unclaimed(tried: Sequence[Outcome]) -> list[str]:
     """Count the verified answers that the solver itself did not call solved."""
-    n = sum(o.verified and "solved" not in o.claims for o in tried)
+    n = sum(o.verified and not any(r.claims_answer for r in o.records) for o in tried)
     return [f"{plural(n, 'verified answer')} not claimed to be solved"] if n else []
 
 

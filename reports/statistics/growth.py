@@ -1,4 +1,9 @@
-"""Power laws fitted to few sizes: whether values grow, and what they will be.
+"""Power laws fitted to few sizes: growth of practical size, and predictions.
+
+Growth is judged by its size: the 95 % interval of the factor 10ᵖ, by which values
+change where n becomes ten times as large, is compared with 1 ± `PRACTICAL`. A test of
+p ≤ 0 would call 19, 22, 22, 22, 22 growing, and would call growth without any
+importance detected as soon as the counts scatter little enough.
 
 References
 ----------
@@ -9,16 +14,26 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtr, stdtrit
+from scipy.special import stdtrit
 
 from reports.statistics.intervals import COVERAGE, Interval, power_law
 
-SIZES = 4  #: fewer different sizes make no test: two degrees of freedom at least
-LEVEL = 0.05  #: of the test
+SIZES = 4  #: fewer different sizes leave less than two degrees of freedom
+PRACTICAL = 0.10  #: relative change per decade of n that nobody need care about
 _ROUNDING = 1e-12  #: scatter of logarithms that is none
+
+
+class Trend(Enum):
+    """Conclusions that the interval of the change per decade allows."""
+
+    GROWS = "grow"  #: all of it above 1 + PRACTICAL
+    FLAT = "flat"  #: all of it within 1 ± PRACTICAL
+    FALLS = "fall"  #: all of it below 1 − PRACTICAL
+    UNDECIDED = "not decided"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,16 +41,31 @@ class Growth:
     """The fit v = c·nᵖ of positive values by least squares on logarithms."""
 
     exponent: float  #: p
-    most: float  #: one-sided 95 % bound: p is at most this
-    p_value: float  #: of p ≤ 0: how often as much growth would be seen without any
+    low: float  #: ends of its 95 % interval
+    high: float
     log_factor: float  #: log c
     scatter: float  #: standard deviation of log v about the line
     sizes: tuple[float, ...]  #: n, that were measured
 
     @property
-    def grows(self) -> bool:
-        """Whether p ≤ 0 is rejected."""
-        return self.p_value < LEVEL
+    def per_decade(self) -> tuple[float, float, float]:
+        """Relative change where n becomes ten times as large, and its interval."""
+        change, low, high = (
+            float(np.expm1(p * np.log(10)))
+            for p in (self.exponent, self.low, self.high)
+        )
+        return change, low, high
+
+    @property
+    def trend(self) -> Trend:
+        """Judge the interval of the change per decade against ±`PRACTICAL`."""
+        _, low, high = self.per_decade
+        if low > PRACTICAL:
+            return Trend.GROWS
+        if high < -PRACTICAL:
+            return Trend.FALLS
+        within = low >= -PRACTICAL and high <= PRACTICAL
+        return Trend.FLAT if within else Trend.UNDECIDED
 
     def at(self, n: float) -> Interval:
         """Predict v at a size within the measured range, with its 95 % interval.
@@ -65,9 +95,7 @@ class Growth:
 
 
 def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
-    """Test that values do not grow with n: p ≤ 0 in v = c·nᵖ, one-sided.
-
-    Student's test of the slope on logarithms with k − 2 degrees of freedom.
+    """Fit v = c·nᵖ, with Student's interval of p of k − 2 degrees of freedom.
 
     Parameters
     ----------
@@ -81,17 +109,18 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     """
     x, y = np.asarray(n, dtype=float), np.asarray(values, dtype=float)
     if np.unique(x).size < SIZES or not ((x > 0).all() and (y > 0).all()):
-        raise ValueError("a test of growth needs four different sizes, positive values")
+        raise ValueError("growth needs four different sizes, positive values")
     law = power_law(x, y)
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
-    error = (law.high - law.low) / 2 / float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2))
+    student = float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2))
+    error = (law.high - law.low) / 2 / student
     if error * spread <= _ROUNDING:  # as of counts that are all the same
         error = 0.0
     p = law.exponent if abs(law.exponent) * spread > _ROUNDING else 0.0
     return Growth(
         exponent=p,
-        most=p + float(stdtrit(x.size - 2, 1 - LEVEL)) * error,
-        p_value=float(stdtr(x.size - 2, -p / error)) if error else float(p <= 0),
+        low=p - student * error,
+        high=p + student * error,
         log_factor=law.log_factor,
         scatter=error * spread,
         sizes=tuple(map(float, x)),

@@ -34,23 +34,27 @@ _FOOTER = (
 _RULES = (
     "Every case was built again, and residuals, errors and distances computed from the "
     "stored points; nothing that the run concluded was taken over.",
-    "The truth u* of a problem comes from a reference solve that is none of the "
-    "solvers. Its own error is bounded by the identity of Prager and Synge: with û "
-    "admissible and u_λ the equilibrium under contact forces λ̂ ≥ 0, both are within "
-    "√(2(J(û) − D(λ̂))) of u* in the energy norm. No majority decides.",
-    "Error: the larger of ‖u − u*‖ and ‖u_λ − u*‖ over ‖u*‖ in the energy norm, plus "
-    "the bound of the reference. The second is the distance ‖Bᵀ(λ − λ*)‖ of the "
-    "contact forces in the dual norm; λ itself need not be unique.",
-    "A claim of success at tolerance t is refuted if a KKT residual exceeds 10t; or if "
-    "one of the two distances, less the bound of the reference, exceeds √(20t)‖u*‖, "
-    "which is what a gap of 10t allows; or if a multiplier pulls. A claim that there "
+    r"The truth \(u^*\) of a problem comes from a reference solve that is none of the "
+    r"solvers. Its own error is bounded by the identity of Prager and Synge: with "
+    r"\(\hat u\) admissible and \(u_\lambda\) the equilibrium under contact forces "
+    r"\(\hat\lambda \ge 0\), both are within \(\sqrt{2(J(\hat u) - D(\hat\lambda))}\) "
+    r"of \(u^*\) in the energy norm. No majority decides.",
+    r"Error: the larger of \(\|u - u^*\|\) and \(\|u_\lambda - u^*\|\) over "
+    r"\(\|u^*\|\) in the energy norm, plus the bound of the reference. The second is "
+    r"the distance \(\|B^{\mathsf T}(\lambda - \lambda^*)\|\) of the contact forces in "
+    r"the dual norm; \(\lambda\) itself need not be unique.",
+    r"A claim of success at tolerance \(t\) is refuted if a KKT residual exceeds "
+    r"\(10t\); or if one of the two distances, less the bound of the reference, is "
+    r"above \(\sqrt{20t}\,\|u^*\|\), which is what a gap of \(10t\) allows; or if a "
+    r"multiplier pulls. A claim that there "
     "is no solution is refuted by the certified one.",
     "Two answers at one tolerance disagree without a culprit if they are farther apart "
     "than both claims allow, and neither is refuted.",
     "Rows: contact rows where truth and answer contradict each other. A row is closed "
-    "where λᵢDᵢ > gapᵢ with its compliance Dᵢ; rows that are nearly neither are left "
-    "out (force or gap below √(20t Dᵢ)‖u*‖).",
-    "Penetration: largest max(Bu − c, 0) over the mesh size of the contact side. "
+    r"where \(\lambda_i D_i > \mathrm{gap}_i\) with its compliance \(D_i\); rows that "
+    r"are nearly neither are left out (force or gap below "
+    r"\(\sqrt{20t D_i}\,\|u^*\|\)).",
+    r"Penetration: largest \(\max(Bu - c, 0)\) over the mesh size of the contact side. "
     "Balance: largest force or moment left on a body by load, supports and contact, "
     "relative to what acts on it.",
     "What stands out is no disagreement: the error is within the claim, but more than "

@@ -3,13 +3,17 @@
 import csv
 import re
 import unicodedata
+from html import unescape
 
+import numpy as np
+import pandas as pd
 import pytest
 
 from harness import Record, Verdict
 from harness.results.journal import Journal
 from reports import write_report
 from reports.document.formatting import clean
+from reports.export.csv_tables import frame_csv
 from reports.render.latex import escaped as tex
 from reports.render.markdown import escaped as md
 
@@ -28,7 +32,8 @@ NAMES = (
     "lone \ud800 surrogate",
     "1. - + # not a list",
     "http://evil.example www.evil.example me@evil.example",
-    "", " ", "x" * 10_000,
+    "", " ", "x" * 10_000, "+1", "-1", "@SUM(1)", "\t=1+1", "\r=1", " =1", "\uff1d1",
+    "\u200b=1", "1;=1",
 )  # fmt: skip
 
 
@@ -72,7 +77,7 @@ def test_every_row_of_every_latex_table_has_its_columns(report):
     for path in (report / "tables").glob("*.tex"):
         columns = 0
         for line in path.read_text("utf-8").splitlines():
-            if begun := re.search(r"\\begin\{tabular\}\{([lr]+)\}", line):
+            if begun := re.search(r"\\begin\{(?:tabular|longtable)\}\{([lr]+)\}", line):
                 columns = len(begun[1])
             if line.endswith(r"\\"):
                 body = line.removesuffix(r"\\")
@@ -112,12 +117,63 @@ def test_markdown_leaves_numbers_alone():
     assert [md(n) for n in ("-1.5e-3", "1.25", "3")] == ["-1.5e-3", "1.25", "3"]
 
 
-def test_csv_holds_every_name_as_it_was(report):
+#: of those that are not written as they are
+IN_CSV = {
+    '=HYPERLINK("http://evil.example")': "'=HYPERLINK(\"http://evil.example\")",
+    "\u202ertl \u0645\u0631\u062d\u0628\u0627 \u2066\u2069":
+        "\\u202ertl \u0645\u0631\u062d\u0628\u0627 \\u2066\\u2069",
+    "bell\x07 null\x00 escape\x1b[31m return\r\nnew\u2028line\u0085":
+        r"bell\x07 null\x00 escape\x1b[31m return\r\nnew\u2028line\x85",
+    "lone \ud800 surrogate": r"lone \ud800 surrogate",
+    "+1": "'+1", "-1": "'-1", "@SUM(1)": "'@SUM(1)", "\t=1+1": r"'\t=1+1",
+    "\r=1": r"'\r=1", " =1": "' =1", "\uff1d1": "'\uff1d1", "\u200b=1": "'\u200b=1",
+    "1;=1": "1;=1",
+}  # fmt: skip
+
+
+def test_csv_holds_every_name_as_a_text_and_numbers_as_numbers(report):
     with (report / "tables" / "measurements.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    wanted = [n.replace("\ud800", r"\ud800") for n in NAMES]
     assert len(rows) == 3 * len(NAMES)
-    assert {row["solver"] for row in rows} == set(wanted)
+    wanted = {IN_CSV.get(name, name) for name in NAMES}
+    for column in ("solver", "claimed", "family", "message"):
+        assert {row[column] for row in rows} == wanted
+    assert {float(row["total_seconds"]) for row in rows} == {1e-3, 2e-3, 4e-3}
+    assert {row["tol"] for row in rows} == {"1e-06"}
+
+
+def is_formula(cell):
+    is_rule = set(cell) <= set("-:")  # of Markdown; LaTeX's dash for what is absent
+    is_number = re.fullmatch(r"-[0-9.]+(e-?[0-9]+)?", cell)
+    return cell[:1] in tuple("=+-@") and not (is_rule or is_number)
+
+
+def test_no_cell_of_any_table_is_a_formula(report):
+    cells = []
+    for path in (report / "tables").glob("*.csv"):
+        with path.open(newline="") as file:
+            cells += [cell for row in csv.reader(file) for cell in row]
+    text = (report / "report.md").read_text("utf-8")
+    for row in re.findall(r"^\| (.*) \|$", text, flags=re.MULTILINE):
+        cells += [c.replace("\\", "").strip("*~ ") for c in re.split(r" \| ", row)]
+    for path in (report / "tables").glob("*.tex"):
+        rows = re.findall(r"^ +(.*) \\\\$", path.read_text("utf-8"), flags=re.MULTILINE)
+        cells += [c.removeprefix(r"\textbf{") for row in rows for c in row.split(" & ")]
+    page = (report / "index.html").read_text("utf-8")
+    cells += [unescape(c) for c in re.findall(r"<t[dh][^>]*>(?:<[^>]*>)*([^<]*)", page)]
+
+    assert len(cells) > 1000
+    assert [cell for cell in cells if is_formula(cell)] == []
+
+
+def test_every_column_of_csv_tables_has_the_numbers_that_pandas_writes():
+    frame = pd.DataFrame({
+        "whole": [1, -2], "count": pd.array([3, None], "Int64"), "yes": [True, False],
+        "real": [-1e-300, np.nan], "large": [np.inf, -0.1], "text": ["-1", 'a "b", c'],
+    })  # fmt: skip
+    plain = frame.assign(text=["'-1", 'a "b", c']).to_csv(index=False)
+
+    assert frame_csv(frame) == plain
 
 
 def test_the_page_holds_no_character_that_hides(report):

@@ -99,7 +99,7 @@ def visit(tabs):
     asked.clear()
     visits = []
 
-    def open_(path, fragment="", width=1400, **options):
+    def open_(path, fragment="", width=1400, *, folded=False, **options):
         page = tab(**options)
         scripts = options.get("java_script_enabled", True)
         visits.append((page, scripts))
@@ -108,6 +108,9 @@ def visit(tabs):
         page.goto((path / "report" / "index.html").as_uri() + fragment)
         if scripts:
             page.add_style_tag(content=ALL_LAID_OUT)
+            if not folded:
+                page.evaluate("for (const one of [...document.querySelectorAll("
+                              "'#tools')]) one.open = true")  # fmt: skip
         return page
 
     yield open_
@@ -148,23 +151,57 @@ def toggle(page, solver):
     page.locator("#solvers button", has_text=solver).click()
 
 
+FIRST_SCREENS = [(1400, 900), (390, 844)]
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_first_screen_shows_who_was_fastest_and_the_beginning_of_the_figure(
-    visit, folder, scheme
+@pytest.mark.parametrize(("width", "height"), FIRST_SCREENS)
+def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
+    visit, folder, width, height, scheme
 ):
-    page = visit(folder, width=1280, color_scheme=scheme)
-    page.set_viewport_size({"width": 1280, "height": 800})
-    for statement in page.locator("dl.answer > div").all():
-        box = statement.bounding_box()
-        assert box["y"] + box["height"] < 800
-    plot = page.locator("#answer .plot svg").first
-    assert plot.bounding_box()["y"] < 750
-    assert page.locator("#answer dt").all_inner_texts() == ["dual", "primal"]
+    page = visit(folder, width=width, folded=True, color_scheme=scheme)
+    page.set_viewport_size({"width": width, "height": height})
+    claim = page.locator("main .claim").first
+    plot = page.locator("main .plot").first
+    assert claim.inner_text().startswith("From the mesh to a verified answer")
+    for shown in (claim, plot, plot.locator("svg").first):
+        box = shown.bounding_box()
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= width
+        assert 0 <= box["y"] < box["y"] + box["height"] <= height
+    assert page.evaluate("scrollY") == 0
+    subjects = page.locator("#forms .answer:not(.besides) dt").all_inner_texts()
+    assert subjects == ["dual", "primal"]
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_navigation_and_filters_are_folded_until_they_are_asked_for(
+    visit, folder, width
+):
+    page = visit(folder, width=width, folded=True)
+    link = page.get_by_role("link", name="Summary", exact=True).first
+    for summary, inside in (("Contents", link), ("Filter", page.locator("#words"))):
+        assert inside.is_hidden()
+        page.locator("summary", has_text=summary).first.click()
+        assert inside.is_visible()
+    link.click()
+    assert page.url.endswith("#summary")
+
+
+@pytest.mark.parametrize("width", [1400, 390])
+def test_no_text_of_the_first_figure_leaves_its_drawing(visit, folder, width):
+    drawing = visit(folder, width=width).locator("#answer .panel > svg").first
+    drawing.scroll_into_view_if_needed()
+    edges = drawing.bounding_box()
+    for text in drawing.locator("> text").all():
+        box = text.bounding_box()
+        assert box["x"] >= edges["x"] - 1
+        assert box["x"] + box["width"] <= edges["x"] + edges["width"] + 1
 
 
 def test_a_sentence_of_the_answer_leads_to_its_evidence_by_keyboard(visit, folder):
     page = visit(folder, reduced_motion="reduce")
-    link = page.locator("#answer dd a", has_text="Means over cases").first
+    link = page.locator("#forms dd a", has_text="Means over cases").first
     link.focus()
     page.keyboard.press("Enter")
     assert page.url.endswith("#means")

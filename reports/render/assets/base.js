@@ -122,5 +122,4 @@ function tools() {
     ].join(" · ");
   });
   bar.hidden = false;
-  bar.open = innerWidth > 900 && data.solvers.length <= 8;
 }

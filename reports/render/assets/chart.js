@@ -122,6 +122,12 @@ function chart(box, content, linked, name) {
       label(shown, { x: scale.left - 6, y, "text-anchor": "end", "dominant-baseline": "central" });
       if (shown !== text) parts.at(-1).append(svg("title", {}, text));
     };
+    const above = (text, y) => { // the axes, or below: in their middle, but within the drawing
+      const larger = 1.06, room = W / larger; // letters than those that are measured
+      const shown = shortened(text, room, drawing), half = (Math.min(breadth(shown, drawing), room) * larger) / 2;
+      label(shown, { x: Math.min(Math.max((scale.left + scale.right) / 2, half), W - half), y, "text-anchor": "middle", class: "axis" });
+      if (shown !== text) parts.at(-1).append(svg("title", {}, text));
+    };
     for (const [v, text] of labelled(axes.x, Math.max(3, Math.floor((scale.right - scale.left) / 80)))) {
       const p = scale.x(v).toFixed(1);
       if (!small) parts.push(svg("path", { d: `M${p} ${scale.top}V${scale.bottom}`, ...grid }));
@@ -132,11 +138,11 @@ function chart(box, content, linked, name) {
       beside(text, scale.y(v).toFixed(1));
     }
     parts.push(svg("path", { d: small ? `M${scale.left} ${scale.bottom}H${scale.right}` : `M${scale.left} ${scale.top}V${scale.bottom}H${scale.right}`, fill: "none", stroke: "currentColor", "stroke-width": 0.9 }));
-    label(axes.x.label, { x: (scale.left + scale.right) / 2, y: H - 6, "text-anchor": "middle", class: "axis" });
+    above(axes.x.label, H - 6);
     const middle = (scale.top + scale.bottom) / 2;
     if (small) beside(axes.y.label, middle);
     else label(axes.y.label, { transform: `translate(13 ${middle}) rotate(-90)`, "text-anchor": "middle", class: "axis" });
-    if (content.title) label(content.title, { x: (scale.left + scale.right) / 2, y: 14, "text-anchor": "middle", class: "axis" });
+    if (content.title) above(content.title, 14);
     return parts;
   }
   function* lines() {

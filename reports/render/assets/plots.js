@@ -16,6 +16,7 @@ function plot(box, panels) {
     grid.lastElementChild.append(legend(content.own));
     return one;
   });
+  if (panels[0].heading) box.append(make("p", { class: "heading" }, panels[0].heading));
   box.append(grid, legend(panels[0].common));
   const view = () => made.forEach((one) => one.draw());
   views.push(view);

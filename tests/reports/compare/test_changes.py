@@ -9,7 +9,10 @@ import pandas as pd
 import pytest
 
 from harness import InputError, Record, Verdict
+from harness.results.folder import times_compare
 from harness.results.journal import Journal
+from harness.results.merge import merge
+from mortarbench.reporting import report
 from reports import write_comparison
 from reports.compare.changes import (
     Mean,
@@ -21,7 +24,7 @@ from reports.compare.changes import (
 )
 from reports.compare.conclusions import change_word, verdict_lines
 from reports.compare.page import compose
-from reports.data.evidence import Evidence, arrange
+from reports.data.evidence import Evidence, arrange, read_evidence
 from reports.render.markdown import markdown
 
 SOLVERS = ("one", "two", "three")
@@ -507,3 +510,78 @@ def test_a_busy_machine_is_warned_of(folders):
     said, _ = write_comparison(*folders(HERE, busy), ["csv"])
     assert said[1].startswith("Warning: the machine was not idle")
     assert "3.00 after" in said[1]
+
+
+# campaigns
+
+
+def test_an_environment_with_a_plug_in_that_another_lacks_is_no_other(folders):
+    """A plug-in changes no time of a solver that is ours; its own content does."""
+    admm, other = (
+        HERE | {"digest": d, "plugins": {"admm.py": sha}}
+        for d, sha in (("e2", "aaa"), ("e3", "bbb"))
+    )
+    assert times_compare(HERE | {"plugins": {}}, admm)
+    assert not times_compare(admm, other)
+    assert not times_compare(HERE | {"machine": {"cpu": "slow"}}, admm)
+    assert not times_compare(HERE | {"versions": {"osqp": "1.1"}}, admm)
+
+
+def test_folders_with_and_without_a_plug_in_merge_into_one_comparison(
+    folders, tmp_path
+):
+    with_it = HERE | {"digest": "e2", "plugins": {"admm.py": "aaa"}}
+    before = suite(1, cases=2, repeats=3)
+    after = [r.but(session="s2") for r in suite(2, cases=2, repeats=3)]
+    a, b = folders(HERE | {"plugins": {}}, with_it, before=before, after=after)
+    merge([a, b], tmp_path / "both")
+    found = read_evidence(tmp_path / "both")
+    assert set(found.solvers) == set(SOLVERS)
+    assert found.marks == {}
+    assert {len(o.records) for o in found.flat} == {6}
+
+    slow = with_it | {"machine": {"cpu": "slow"}}
+    (b / "environment.json").write_text(json.dumps(slow))
+    merge([a, b], tmp_path / "apart")
+    assert len(read_evidence(tmp_path / "apart").marks) == 1
+
+
+def from_file(path, **changes):
+    return record(
+        case=0, family="file", params={"path": path}, form="primal",
+        run_id=f"{path}-{changes.get('repeat', 0)}", qp="d1g35t", **changes,
+    ).but(case=f"file:{path}")  # fmt: skip
+
+
+def test_a_qp_in_two_files_is_one_case(folders, changed):
+    c = changed([from_file("a/x.npz")], [from_file("b/y.npz")])
+    assert len(c.pairs) == 1
+    assert c.only_before == c.only_after == ()
+    a, _ = folders(HERE, HERE, before=[from_file("a/x.npz"), from_file("b/y.npz")])
+    (outcome,) = read_evidence(a).flat
+    assert outcome.case == "file:a/x.npz"
+    assert len(outcome.records) == 2
+    other = changed([from_file("a/x.npz")], [from_file("b/y.npz").but(qp="0th3r")])
+    assert other.pairs == ()
+
+
+def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
+    slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
+    worse = [
+        r.but(verdict=Verdict.WRONG) if r.solver == "two" else r
+        for r in suite(2, cases=4, repeats=3)
+    ]
+    a, b = folders(HERE, slow, after=worse)
+    found = report(a, b, formats=["csv"], fail_on=["worse", "slower"])
+    assert found.failed_on == ("worse",)
+    assert len(found.changes[0]["worse"]) == 4
+    assert any(line.startswith("fail-on slower: ") for line in found.said)
+    assert any("two on box/n=1/dual" in line for line in found.said)
+
+
+def test_a_gate_that_cannot_judge_times_and_finds_nothing_worse_says_so(folders):
+    slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
+    a, b = folders(HERE, slow)
+    with pytest.raises(InputError, match=r"fail-on slower: .* no cell was measured on"):
+        report(a, b, formats=["csv"], fail_on=["worse", "slower"])
+    assert report(a, b, formats=["csv"], fail_on=["worse"]).failed_on == ()

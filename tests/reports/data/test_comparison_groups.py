@@ -448,7 +448,8 @@ def test_growth_is_told_from_none_and_predictions_end_with_the_sizes(record, evi
     records += sized("short", 0.5, range(4)) + sized("few", 0.5, range(3))
     found = rows(section(compose(evidence(records)), "growth").tables[0])
     at = "time at n = 600"
-    assert found["flat"]["iterations"].text == "no growth detected"
+    assert found["flat"]["iterations"].text == "flat"
+    assert found["flat"]["per decade [95 %]"].text == "+0 % [+0, +0]"
     assert found["grows"]["iterations"].text == "grow"
     assert found["short"]["iterations"].text == "grow"
     assert found["few"]["iterations"].text == "too few sizes"
@@ -481,7 +482,7 @@ def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
     exponents = [row["p [95 %]"].value for row in found.values()]
     assert exponents == pytest.approx([0, 0.5, 1, 0], abs=1e-9)
     grown = [row["growth"].text for row in found.values()]
-    assert grown == ["no growth detected", "grow", "grow", "no growth detected"]
+    assert grown == ["flat", "grow", "grow", "flat"]
     assert found["cg"]["n = 6400"].value == 72
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from harness import Verdict
 from reports.data.evidence import Evidence, arrange
 from reports.data.rank_series import (
     rank_counts,
@@ -172,7 +173,7 @@ def test_cases_of_other_sizes_are_no_weak_scaling():
 
 def test_answers_that_were_not_verified_are_left_out():
     wrong = (
-        r.but(verdict="wrong") if r.ranks == 2 and not r.role else r
+        r.but(verdict=Verdict.WRONG) if r.ranks == 2 and not r.role else r
         for r in rank_records(sizes=[DOFS])
     )
     (series,) = strong_series(evidence(wrong))

@@ -10,6 +10,8 @@ import pytest
 
 from harness import ContactSide, Fields, InputError
 from harness.files.qpfile import save_qp
+from harness.files.store import load_fields, save_fields
+from harness.names import parse
 from mortarbench.cli.main import main
 from mortarbench.registries import Registries
 from problems import PROBLEMS
@@ -49,6 +51,43 @@ def test_cells_know_their_body(grid):
     assert block.type == "quad"
     np.testing.assert_array_equal(block.data, FIELDS.cells)
     np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
+
+
+def test_cells_of_torn_bodies_know_their_subdomain_and_others_have_none(grid, tmp_path):
+    assert set(grid.cell_data) == {"body"}
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
+    torn = replace(
+        FIELDS, cells=cells, bodies=np.array([0, 1, 1]), subdomains=np.array([2, 0, 1])
+    )
+    write_vtu(torn, tmp_path / "a.vtu")
+    found = meshio.read(tmp_path / "a.vtu")
+    by_kind = {b.type: i for i, b in enumerate(found.cells)}
+    of_cells = found.cell_data["subdomain"]
+    assert of_cells[by_kind["quad"]].tolist() == [2]
+    assert of_cells[by_kind["triangle"]].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "is_torn"),
+    [("beam-ring/Nr=4/Nh=3/steps=1/feti=3/dual", True),
+     ("beam-ring/Nr=4/Nh=3/steps=1/dual", False)],
+)  # fmt: skip
+def test_a_family_states_the_subdomain_of_every_cell(name, is_torn, tmp_path):
+    case = parse(name, PROBLEMS).build(reference_solution)
+    answer = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
+    fields = case.fields(answer)
+    stored = load_fields(tmp_path, save_fields(tmp_path, fields))
+    if not is_torn:
+        assert fields.subdomains is None
+        assert stored.subdomains is None
+        return
+    subdomains = case.quantities(answer)["subdomains"]
+    assert np.unique(fields.subdomains).size == subdomains
+    assert fields.subdomains.shape == (len(fields.cells),)
+    np.testing.assert_array_equal(stored.subdomains, fields.subdomains)
+    for number in np.unique(fields.subdomains):  # none reaches over two bodies
+        assert np.unique(fields.bodies[fields.subdomains == number]).size == 1
+        assert np.bincount(fields.subdomains)[number] <= 9  # 3 cells a side
 
 
 def test_triangles_are_triangles_with_their_bodies(tmp_path):

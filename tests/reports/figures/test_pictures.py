@@ -17,10 +17,17 @@ from reports.document.fields import (
     FieldPanel,
     Label,
     Polygons,
+    Vectors,
 )
 from reports.document.figure import Axis, Figure, Panel, Row, Series
 from reports.document.layout import Page, Picture, Section
-from reports.figures.deformed import deformed_figure, edges, outlines, triangles
+from reports.figures.deformed import (
+    automatic_scale,
+    deformed_figure,
+    edges,
+    outlines,
+    triangles,
+)
 from reports.figures.style import look
 from reports.render.saving import ENDINGS, draw, save, save_all
 from reports.render.svg import inline
@@ -199,6 +206,75 @@ def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
     assert zoom.title.endswith("\nstick: blue (1), slip: red (2)")
     assert (len(stick.feet), len(slip.feet)) == (1, 2)
     assert stick.colour != slip.colour
+
+
+def test_open_nodes_with_tresca_s_shear_neither_widen_the_window_nor_hide_contact(
+    bodies,
+):
+    pair = side("up on low", [4, 5, 0, 1], [[1, -3], [1, -2], [1, 0], [1, 0]])
+    states = np.array(["slip", "stick", "open", "open"])
+    rough = replace(pair, shear=pair.gap, friction=states)
+    closed = replace(
+        pair, nodes=pair.nodes[:2], force=pair.force[:2], gap=pair.gap[:2],
+        pressure=pair.pressure[:2], length=pair.length[:2], shear=pair.gap[:2],
+        friction=states[:2],
+    )  # fmt: skip
+    one, other = (
+        deformed_figure(replace(bodies, contacts=(side,))).panels[1]
+        for side in (rough, closed)
+    )
+    assert (one.low, one.high) == (other.low, other.high)
+    assert one.title.endswith("slip: red (1), shear without contact: grey (2)")
+    wide = [m.width for m in one.marks if isinstance(m, Vectors) and m.cased]
+    thin = [m.width for m in one.marks if isinstance(m, Vectors) and not m.cased]
+    assert len(wide) == 2
+    assert all(width < min(wide) for width in thin)
+
+
+@pytest.mark.parametrize("factor", [1e-7, 3e-4, 1e-2, 1.0])
+def test_displacements_too_small_to_see_are_drawn_larger_by_a_round_factor(
+    bodies, factor
+):
+    small = replace(bodies, displacement=factor * bodies.displacement)
+    span = np.ptp(bodies.points, axis=0).max()
+    scale = automatic_scale(small)
+    part = scale * np.abs(small.displacement).max() / span
+    assert part >= 0.01
+    if scale != 1:
+        assert 0.02 <= part <= 0.05
+        assert f"{scale:e}"[0] in "125"
+        assert f"{scale:.0e}" == f"{scale:e}".replace(".000000", "")
+    assert f"displacement × {scale:g};" in deformed_figure(small).panels[0].title
+
+
+@pytest.mark.parametrize(("parts", "numbered"), [(3, True), (9, True), (None, False)])
+def test_subdomains_are_outlined_and_numbered_in_their_own_cells(
+    bodies, parts, numbered
+):
+    number = None if parts is None else np.arange(LOWER + UPPER) * parts // 9
+    (panel, *_) = deformed_figure(replace(bodies, subdomains=number)).panels
+    labels = [m for m in panel.marks if isinstance(m, Label) and m.text.isdigit()]
+    assert {int(m.text) for m in labels} == (set(range(parts)) if numbered else set())
+    points = bodies.points + bodies.displacement
+    for label in labels:
+        own = points[bodies.cells[number == int(label.text)]].reshape(-1, 2)
+        assert (own.min(axis=0) < label.place).all()
+        assert (label.place < own.max(axis=0)).all()
+
+
+def test_numbers_of_very_many_subdomains_are_left_out(bodies):
+    many = replace(
+        bodies, cells=np.repeat(bodies.cells, 20, axis=0),
+        bodies=np.repeat(bodies.bodies, 20), subdomains=np.arange(9 * 20),
+    )  # fmt: skip
+    (panel, *_) = deformed_figure(many).panels
+    assert not [m for m in panel.marks if isinstance(m, Label) and m.text.isdigit()]
+
+
+def test_bodies_that_do_not_move_are_drawn_as_they_are(bodies):
+    still = replace(bodies, displacement=np.zeros_like(bodies.displacement))
+    assert automatic_scale(still) == 1
+    assert automatic_scale(bodies) == 1
 
 
 def test_the_scale_is_that_of_the_displacement(bodies):

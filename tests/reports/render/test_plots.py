@@ -120,11 +120,16 @@ def test_error_bars_along_x_lie_along_x():
 
 
 def test_axes_hold_all_points_and_the_ends_of_their_error_bars_with_a_margin():
-    """On a logarithmic axis from 0.5 to 4 a margin is a twentieth of that."""
+    """A margin is a twentieth of a logarithmic axis that spans a decade or more.
+
+    From 0.5 to 4 there is less: the axis spans one decade, and the points its middle.
+    """
     (panel,) = fitted(figure(TIMES, x=LOG, y=LOG)).panels
 
-    assert panel.y.low == pytest.approx(0.5 * 8**-0.05)
-    assert panel.y.high == pytest.approx(4 * 8**0.05)
+    assert panel.x.low == pytest.approx(100**-0.05)
+    assert panel.x.high == pytest.approx(100**1.05)
+    assert panel.y.low == pytest.approx(2**0.5 / 10**0.5)
+    assert panel.y.high == pytest.approx(2**0.5 * 10**0.5)
     (panel,) = fitted(figure(TIMES)).panels
     assert (panel.x.low, panel.x.high) == pytest.approx((1 - 4.95, 100 + 4.95))
 

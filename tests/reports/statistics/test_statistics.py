@@ -17,9 +17,15 @@ from reports.data.aggregation import (
 )
 from reports.data.comparison_groups import ComparisonGroup, Kind
 from reports.statistics.censoring import restricted_mean
-from reports.statistics.growth import growth_of
+from reports.statistics.growth import Trend, growth_of
 from reports.statistics.profiles import curve, performance_ratios, share, solved_within
-from reports.statistics.resampling import firsts, limits, told_apart, weights
+from reports.statistics.resampling import (
+    firsts,
+    limits,
+    symmetric_interval,
+    told_apart,
+    weights,
+)
 
 INF = np.inf
 
@@ -375,44 +381,87 @@ def test_the_restricted_mean_covers_the_truth_under_early_censoring():
     assert np.mean(hits) == pytest.approx(0.95, abs=0.03)
 
 
+@pytest.mark.parametrize("cases", [6, 9, 30])
+def test_the_interval_of_flipped_signs_covers_whatever_the_tails(cases):
+    rng = np.random.default_rng(29)
+    names = [str(i) for i in range(cases)]
+    drawn = 3 + rng.standard_cauchy((400, cases))
+    ends = [symmetric_interval(values, names) for values in drawn]
+    assert np.mean([low <= 3 <= high for low, high in ends]) > 0.93  # 95 % − 2 σ
+
+
+def test_six_values_have_the_interval_from_the_least_to_the_largest():
+    """All signs agree in 2 of 64 patterns, five of six in 12 more: above 5 %."""
+    names = [str(i) for i in range(6)]
+    values = np.array([0.3, -0.01, 5.0, 1.0, 2.0, 4.0])
+    assert symmetric_interval(values, names) == (-0.01, 5.0)
+    assert symmetric_interval(np.full(6, 0.7), names) == pytest.approx((0.7, 0.7))
+
+
 # ---- growth
 
 
-def test_growth_is_detected_once_in_twenty_where_there_is_none():
+def test_growth_at_the_practical_limit_is_called_growing_once_in_forty():
+    """The interval covers 95 %; where p is at the limit, 2.5 % of it lie above."""
     rng = np.random.default_rng(23)
     n = np.geomspace(100, 1e5, 6)
-    found = [growth_of(n, 30 * rng.lognormal(0, 0.1, 6)).grows for _ in range(2000)]
-    assert np.mean(found) == pytest.approx(0.05, abs=0.015)  # 3 σ
+    for limit, called in ((1.1, Trend.GROWS), (0.9, Trend.FALLS)):
+        v = 30 * n ** np.log10(limit)
+        found = [growth_of(n, v * rng.lognormal(0, 0.1, 6)).trend for _ in range(2000)]
+        assert np.mean([t is called for t in found]) == pytest.approx(0.025, abs=0.0105)
+        assert not any(t in {Trend.GROWS, Trend.FALLS} - {called} for t in found)
+
+
+@pytest.mark.parametrize(
+    ("counts", "trend"),
+    [
+        (
+            [19, 22, 22, 22, 22],
+            Trend.UNDECIDED,
+        ),  # the smallest size is a little cheaper
+        ([19, 22, 22, 22, 22, 22, 22, 22, 22, 22], Trend.FLAT),
+        ([22, 22, 22, 22, 22], Trend.FLAT),
+        ([1000, 1010, 1020, 1030, 1040], Trend.FLAT),  # growth for sure, but of 2 %
+        ([20, 24, 29, 35, 42], Trend.GROWS),
+        ([42, 35, 29, 24, 20], Trend.FALLS),
+        ([20, 40, 20, 40, 20], Trend.UNDECIDED),
+    ],
+)
+def test_growth_is_judged_by_its_size_per_decade_and_its_interval(counts, trend):
+    sizes = 1000 * 4.0 ** np.arange(len(counts))
+    assert growth_of(sizes, counts).trend is trend
 
 
 def test_planted_growth_is_detected_and_bounded():
     n = np.array([100, 400, 1600, 6400])
     found = growth_of(n, 5 * n**0.25)
-    assert found.grows
-    assert (found.exponent, found.most) == pytest.approx((0.25, 0.25))
+    assert found.trend is Trend.GROWS
+    assert (found.low, found.exponent, found.high) == pytest.approx((0.25, 0.25, 0.25))
+    assert found.per_decade == pytest.approx((10**0.25 - 1,) * 3)
 
 
-def test_the_bound_of_growth_is_students_of_two_degrees_of_freedom():
+def test_the_interval_of_growth_is_students_of_two_degrees_of_freedom():
     """Logarithms of n: −3, −1, 1, 3; those of v are off a line of slope ½ by ±s."""
     n, s = np.exp([-3.0, -1.0, 1.0, 3.0]), 0.1
     found = growth_of(n, np.sqrt(n) * np.exp([s, -s, -s, s]))
 
     error = np.sqrt(4 * s**2 / 2 / 20)
     assert found.exponent == pytest.approx(0.5)
-    assert found.most == pytest.approx(0.5 + 2.919985580 * error)  # t of 95 %
+    assert found.high == pytest.approx(0.5 + 4.302652730 * error)  # t of 97.5 %
+    assert found.low == pytest.approx(0.5 - 4.302652730 * error)
     assert found.scatter == pytest.approx(np.sqrt(2) * s)
 
 
 def test_constant_counts_do_not_grow_for_sure():
     found = growth_of([100, 400, 1600, 6400], [13, 13, 13, 13])
-    assert (found.exponent, found.most, found.p_value) == (0, 0, 1)
+    assert (found.low, found.exponent, found.high) == (0, 0, 0)
     assert found.at(1000) == (pytest.approx(13),) * 3 + (0.95, 4)
 
 
 def test_falling_counts_do_not_grow():
     found = growth_of([100, 400, 1600, 6400], [40, 30, 25, 20])
-    assert found.p_value > 0.99
-    assert found.exponent < found.most < 0
+    assert found.trend is Trend.FALLS
+    assert found.low < found.exponent < found.high < 0
 
 
 def test_three_sizes_make_no_test():
