@@ -109,6 +109,14 @@ def names():
                     yield path, "function", name
 
 
+def test_every_package_is_pinned_once():
+    lines = (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+    pins = [line.partition("==")[0].strip() for line in lines if "==" in line]
+    names = Counter(re.sub("[-_.]+", "-", pin).lower() for pin in pins)
+    assert len(names) > 100
+    assert {name for name, count in names.items() if count > 1} == set()
+
+
 def test_names_are_words_of_the_field():
     found = [
         f"{path}: {kind} {name}"

@@ -15,11 +15,18 @@ import griffe
 #: one or more arguments and what they are, further lines indented
 _ENTRY = r"\w+(?:, \w+)* : .*\n(?: +.*\n)*"
 _ENTRIES = re.compile(rf"(?:\A|(?<=\n\n))(?:{_ENTRY})+(?=\n|\Z)")
+#: a star behind a letter (u*), which Markdown would take for emphasis
+_STAR = re.compile(r"(?<=\w)\*(?!\*)")
 _SECTION = re.compile(rf"(?<=\nParameters\n----------\n)(?:{_ENTRY})+")
 
 
 class Docstrings(griffe.Extension):
     """Rewrites docstrings of functions, and finds those of attributes."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        """Keep the stars of formulas."""
+        if obj.docstring is not None:
+            obj.docstring.value = starred(obj.docstring.value)
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
         """Write arguments as numpydoc has them."""
@@ -36,6 +43,13 @@ class Docstrings(griffe.Extension):
                 sources[attr.filepath], attr.lineno - 1, attr.endlineno - 1
             ):
                 attr.docstring = griffe.Docstring(text, parent=attr)
+
+
+def starred(text: str) -> str:
+    """Escape stars behind letters, which Markdown would take for emphasis."""
+    parts = re.split(r"(`[^`]*`|^ {4,}.*$)", text, flags=re.MULTILINE)
+    parts[::2] = [_STAR.sub(r"\\*", part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def as_numpydoc(text: str) -> str:

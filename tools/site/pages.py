@@ -1,11 +1,13 @@
 """The pages of the site that are made of something else, for mkdocs (a hook).
 
 README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; a notebook of
-docs/gallery is run and becomes a page; `commands.md` gets the help of each command.
+docs/gallery is run and becomes a page; `commands.md` gets the help of each command;
+formulas, LaTeX between dollars in the sources, become MathML.
 """
 
 from __future__ import annotations
 
+import html
 import os
 import re
 import subprocess
@@ -13,6 +15,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from reports.render.formulas import mathml
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -25,6 +29,12 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }  #: file of the root → page of the site
+#: a formula as pymdownx.arithmatex leaves it, displayed or in a line
+FORMULA = re.compile(
+    r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
+)
+#: an asterisk of a formula, u*, that Markdown took for the begin of emphasis
+SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
 HELP = "<!-- help of every command -->"  #: is replaced in commands.md
 #: one thread in every library, as in the processes of a run
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
@@ -54,6 +64,44 @@ def on_page_markdown(
     if not page.file.src_uri.startswith("gallery/"):
         markdown = re.sub(r"\]\((gallery/[\w-]+)\.ipynb", r"](\1.md", markdown)
     return markdown.replace(HELP, help_texts()) if HELP in markdown else markdown
+
+
+def on_page_content(
+    content: str, *, page: Page, config: MkDocsConfig, files: Files
+) -> str:
+    """Convert the formulas of a page.
+
+    Raises
+    ------
+    PluginError
+        When a formula cannot be converted, or Markdown has read one as emphasis.
+
+    """
+    from mkdocs.exceptions import PluginError
+
+    try:
+        return typeset(content)
+    except ValueError as e:
+        raise PluginError(f"{page.file.src_uri}: {e}") from e
+
+
+def typeset(content: str) -> str:
+    """Replace the formulas of HTML by MathML; a displayed one may scroll.
+
+    Raises
+    ------
+    ValueError
+        When a formula cannot be converted, or Markdown has read one as emphasis.
+
+    """
+    if swallowed := SWALLOWED.search(content):
+        raise ValueError(f"emphasis within a word: {swallowed[0]}")
+
+    def converted(formula: re.Match[str]) -> str:
+        tag, tex = formula[1], html.unescape(formula[2]).strip()
+        return f'<{tag} class="formula">{mathml(tex, display=tag == "div")}</{tag}>'
+
+    return FORMULA.sub(converted, content)
 
 
 def from_root(text: str) -> str:
