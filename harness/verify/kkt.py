@@ -28,7 +28,11 @@ EXCUSED = 2e-4  #: of its scale: more of a residual is never called rounding
 CANCELLED = 1e4  #: terms may exceed their sum by so much before the sum counts alone
 SHARE = 1e-2  #: of a natural energy: the least scale of energy
 NOISE = 1e-26  #: of the largest natural energy: smaller ones come of rounding in q
-SMALL = 1e-9  #: of a row's scale: a right-hand side below is no size of its own
+OWN = 10.0  #: times its own terms: the size of a row
+ROUNDED = 1e-9  #: of a row's scale: more of a violation is never called rounding
+TOLD = 1e-12  #: of a row's own terms: a right-hand side below may be rounding
+SMALL = 1e-9  #: of the energies that are known: a point's energy below tells nothing
+GAINING = 1e-4  #: relative residual: a step along less gains about its square
 INFLATED = 1e3  #: lengths that the energy knows of: x counts for no more
 
 
@@ -105,7 +109,7 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     t, excused = _terms(qp, s), np.inf if generous else EXCUSED
     E, X = _scales(qp, s.x, _energy(qp, t, generous), t.curvature, told=t.told)
     return Residuals(
-        _violation(t.constraints, X),
+        _violation(t.constraints, X, OWN * (t.x + _pushed(s.x, t.Px, t.curvature))),
         _dual(qp, s, t, E, X),
         _complementarity(qp, s, t.constraints, E, excused),
         _excess(t.energies.sum(keepdims=True), t.energies_size, E, excused),
@@ -170,24 +174,22 @@ def _constraints(
     return found
 
 
-def violation(qp: QP, x: Vector, X: Vector, small: float = SMALL) -> float:
+def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     """Measure the worst violation of a row or bound, as `kkt_residuals` says.
 
-    X : (n,) sizes of the variables
-    small : of a row's scale: a right-hand side below is no size of its own
+    X : (n,) sizes of the variables that the energy knows of
+    own : (n,) sizes of the variables themselves (`own_sizes`)
     """
-    return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, small)
+    return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
 
 
-def _violation(
-    constraints: dict[str, _Constraints], X: Vector, small: float = SMALL
-) -> float:
+def _violation(constraints: dict[str, _Constraints], X: Vector, own: Vector) -> float:
     return _largest(
         0.0,
         *(
             _violated(
                 c.slack if name == "A" else np.minimum(c.slack, 0),
-                c.rhs, c.terms, c.sized(X), small,
+                c.rhs, c.terms, c.sized(X), c.sized(own),
             )
             for name, c in constraints.items()
         ),
@@ -195,15 +197,31 @@ def _violation(
 
 
 def _violated(
-    error: Vector, rhs: Vector, terms: Vector, known: Vector, small: float
+    error: Vector, rhs: Vector, terms: Vector, known: Vector, own: Vector
 ) -> float:
     """Compare with |bᵢ| + Σ|aᵢⱼ|Xⱼ, and where bᵢ is a size of its own with its row."""
-    told = rhs > small * (rhs + known)
-    felt = _excess(error, rhs + terms, rhs + known)
+    felt = _excess(error, rhs + terms, rhs + known, ROUNDED)
+    size = OWN * rhs + own
+    told = rhs > TOLD * size
     if not told.any():
         return felt
-    alone = (rhs + terms)[told]
-    return _largest(felt, _excess(error[told], alone, alone) / CANCELLED)
+    return _largest(
+        felt, _excess(error[told], (rhs + terms)[told], size[told], ROUNDED)
+    )
+
+
+def own_sizes(qp: QP, x: Vector) -> Vector:
+    """Give the sizes of variables at a solution x (n,), without any scale of energy.
+
+    Ten times |xⱼ|, or as far as the others push variable j, |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j,
+    if that is further.
+    """
+    return np.maximum(OWN * np.abs(x), _pushed(x, qp.P @ x, _curvature(qp)[0]))
+
+
+def _pushed(x: Vector, Px: Vector, d: Vector) -> Vector:
+    bends = d > 0
+    return np.where(bends, np.abs(Px - d * x) / np.where(bends, d, 1), 0)
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
@@ -214,9 +232,15 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
     own_r = np.maximum(r - ROUNDING * size, 0)
-    # an operator may not tell Pᵢᵢ; what neither bends nor costs is as long as it is
+    # what neither bends nor costs is as long as it is
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    step = _over(r, t.curvature) if t.told else t.x
+    relative = _ratios(own_r, own)
+    if t.told:
+        step = _over(r, t.curvature)
+    elif _sup(relative) > GAINING:
+        step = r * _flexibility(qp, s.x, t, own_r)
+    else:
+        step = t.x
     step = np.where(is_idle, np.maximum(t.x, X), step)
     way = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
@@ -226,11 +250,23 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
-        _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
+        _sup(np.minimum(relative, _ratios(gain, E))),
         pulling,
         _ratio(np.minimum(s.z_box, 0)[~lower], S),
         _ratio(np.maximum(s.z_box, 0)[~upper], S),
     )
+
+
+def _flexibility(qp: QP, x: Vector, t: _Terms, r: Vector) -> float:
+    """Give rᵀr/rᵀPr of an operator, along a residual of sizes r (n,).
+
+    Of its components that no bound stops: so far is the minimum along it.
+    """
+    way = np.where(t.residual > 0, x - qp.lb, qp.ub - x)  # downhill
+    along = np.where(way > 0, np.where(t.residual > 0, r, -r), 0.0)
+    squared = float(along @ along)
+    bent = float(along @ (qp.P @ along)) if squared > 0 else 0.0
+    return squared / bent if bent > 0 else np.inf
 
 
 def _complementarity(
@@ -264,7 +300,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     their own sum, the objective, or than 1e-4 of itself where the objective vanishes.
     At least a hundredth of the smallest natural energy of a variable (`_alone`).
 
-    generous : cancellation is forgiven, and the median of natural energies counts
+    generous : cancellation is forgiven, and the median of natural energies counts whole
     """
     terms = _sup(t.energies)
     value = abs(float(t.energies[0] / 2 + t.energies[1]))
@@ -274,10 +310,13 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         return terms
     known = _sup(qp.b), _sup(qp.h), _finite_sup(qp.lb), _finite_sup(qp.ub)
     is_tiny = E <= SMALL * _sup(t.curvature) * np.square(max(known))
-    alone = pick(_alone(qp, t.curvature, by_length=is_tiny or not qp.q.any()))
-    if E < SHARE * alone < np.inf:  # seldom, and tightening costs more
-        alone = pick(_alone(qp, t.curvature, widths(qp), by_length=True))
-    return max(E, SHARE * alone) if alone < np.inf else E
+    by_length = is_tiny or not qp.q.any()
+    alone = pick(_alone(qp, t.curvature, (qp.lb, qp.ub), by_length=by_length))
+    if E < SHARE * alone:  # seldom, and tightening costs more
+        alone = pick(_alone(qp, t.curvature, tightened(qp), by_length=True))
+    if not alone < np.inf:
+        return E
+    return max(E, alone if generous else SHARE * alone)
 
 
 def _least(values: Vector) -> float:
@@ -290,23 +329,23 @@ def _middle(values: Vector) -> float:
 
 
 def _alone(
-    qp: QP, d: Vector, width: Vector | float = np.inf, *, by_length: bool
+    qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
     """List natural energies: what a variable alone can gain, of each that tells one.
 
     Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
     at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ over its feasible width, if that is less.
 
+    bounds : lower and upper (n,) each, tightened by rows or not
     by_length : without curvature at most |qᵢ|lᵢ, and where q is rounding Pᵢᵢlᵢ², of the
         least length lᵢ that a row or bound knows, 1 if none does
     """
-    q = np.abs(qp.q)
-    gain = np.where(q > 0, np.minimum(_over(q**2, d), q * width), 0)
-    least = np.clip(-np.sign(qp.q) * _over(q, d), qp.lb, qp.ub)
+    q, (lb, ub) = np.abs(qp.q), bounds
+    gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)
+    least = np.clip(-np.sign(qp.q) * _over(q, d), lb, ub)
     own = np.abs(d / 2 * least**2 + qp.q * least)
-    gain = np.where(
-        (q > 0) & (least != 0) & np.isfinite(own), np.minimum(own, gain), gain
-    )
+    told = (q > 0) & (least != 0) & np.isfinite(own)
+    gain = np.where(told, np.where(gain > 0, np.minimum(own, gain), own), gain)
     lengths = _lengths(qp) if by_length else np.full(q.size, np.inf)
     if by_length and not np.isfinite(lengths).any():
         lengths = np.ones(q.size)
@@ -333,8 +372,8 @@ def _lengths(qp: QP) -> Vector:
     return least
 
 
-def widths(qp: QP) -> Vector:
-    """Bound each variable's feasible width by its bounds, tightened by single rows."""
+def tightened(qp: QP) -> tuple[Vector, Vector]:
+    """Give lower and upper bounds (n,) each, tightened by what single rows allow."""
     lb, ub = qp.lb.copy(), qp.ub.copy()
     for k, (i, j, a, rhs) in enumerate(_entries(qp)):
         for sign in (1, -1) if k == 0 else (1,):  # aᵢx = bᵢ is also −aᵢx ≤ −bᵢ
@@ -349,7 +388,7 @@ def widths(qp: QP) -> Vector:
             up, down = known & (c > 0), known & (c < 0)
             np.minimum.at(ub, j[up], room[up])
             np.maximum.at(lb, j[down], room[down])
-    return np.asarray(np.maximum(ub - lb, 0))
+    return lb, ub
 
 
 def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:

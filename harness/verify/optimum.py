@@ -23,10 +23,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from math import copysign, inf, isinf
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
 
+from harness.operators import assembled
 from harness.plugin import Reference
 from harness.qp import QP, Vector
 from harness.solution import Solution
@@ -37,13 +41,16 @@ from harness.verify.kkt import (
     allowed,
     energy_at,
     kkt_residuals,
+    own_sizes,
     scales_at,
+    tightened,
     violation,
-    widths,
 )
 from harness.verify.rational import rational, solutions
 
-LARGEST = 400  #: variables and rows of a QP that is cheap to solve once more
+LARGEST = 400  #: coupled variables, and rows, of a QP that is cheap to solve once more
+MOST_APART = 4000  #: variables, the others coupled to none
+MULTIPLIED = 800  #: variables and rows of a QP whose operator P is multiplied out
 CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optimum
 FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
 EPS = float(np.finfo(float).eps)
@@ -51,7 +58,6 @@ SPARED = 10.0  #: the objective adds up what residuals say of single rows
 MOST = 0.5  #: of the terms of f*: a larger error is not verified at any tolerance
 SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
 NEEDLESS = 1e4  #: an optimum whose terms exceed another's by so much tells no rounding
-OWN = 1e-12  #: of a row's scale: a right-hand side below may be rounding
 RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
 
 
@@ -59,11 +65,13 @@ RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
 class Optimum:
     """The optimal value of a QP, and what errors against it are compared with."""
 
+    qp: QP  #: what it is the optimum of, with P as a matrix
     value: float  #: f*
     doubt: float  #: by how much f* may be off, with the rounding of a right answer
     energy: float  #: scale of errors of the objective
     terms: float  #: of f* itself, and what the least variable alone is worth
     x: Vector  #: (n,) sizes of the variables
+    own: Vector  #: (n,) the same without any energy, see `own_sizes`
 
 
 Proves = Callable[[QP], Optimum | None]
@@ -98,26 +106,50 @@ def decided(
     ):
         return None
     found = prove(qp)
-    return None if found is None else error_at(qp, s, found)
+    return None if found is None else error_at(s, found)
 
 
 def is_small(qp: QP) -> bool:
-    """Whether a QP is cheap to solve once more."""
-    return qp.is_explicit and qp.q.size + qp.b.size + qp.h.size <= LARGEST
+    """Whether a QP is cheap to solve once more; an operator P, to multiply out."""
+    n, rows = qp.q.size, qp.b.size + qp.h.size
+    if not qp.is_explicit:
+        return n + rows <= MULTIPLIED
+    if n > MOST_APART:
+        return False
+    return n + rows <= LARGEST or int(coupled(qp).sum()) + rows <= LARGEST
+
+
+def coupled(qp: QP) -> NDArray[np.bool_]:
+    """Tell which variables (n,) P, a matrix, couples to others, or a row holds."""
+    found = np.zeros(qp.q.size, dtype=bool)
+    P = coo_array(qp.P)
+    for j in (P.row, P.col):
+        found[j[(P.row != P.col) & (P.data != 0)]] = True
+    for M in (qp.A, qp.G):
+        rows = coo_array(M)
+        found[rows.col[rows.data != 0]] = True
+    return found
 
 
 @np.errstate(all="ignore")
-def error_at(qp: QP, s: Solution, optimum: Optimum) -> float:
+def error_at(s: Solution, optimum: Optimum) -> float:
     """Compare a point with the optimum; see `decided`."""
-    x = s.x.astype(np.longdouble)
+    qp, x = optimum.qp, s.x.astype(np.longdouble)
     off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
     scale = optimum.energy if off <= MOST * optimum.terms else optimum.terms
-    return max(max(off, 0.0) / scale, violation(qp, s.x, optimum.x, OWN))
+    return max(
+        max(off, 0.0) / scale,
+        violation(qp, s.x, optimum.x, np.minimum(own_sizes(qp, s.x), optimum.own)),
+    )
 
 
 @np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
 def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     """Solve a QP by the reference, and prove its optimal value; None if that fails."""
+    if not qp.is_explicit:
+        qp = replace(qp, P=assembled(qp.P))
+    if not is_small(qp):  # what an operator tells only now
+        return None
     try:
         found = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -139,7 +171,8 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     r = np.abs(qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box)
     terms = energy_at(qp, s, generous=True)
     X = scales_at(qp, s.x.astype(float), terms).x
-    doubt = float(r @ np.minimum(widths(qp), FAR * X))
+    lb, ub = tightened(qp)
+    doubt = float(r @ np.minimum(np.maximum(ub - lb, 0), FAR * X))
     size = _size(qp, s)
     if not EPS * size <= EXCUSED * abs(value):
         size = min(size, _size(qp, _least_multipliers(qp, s)))
@@ -160,9 +193,10 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     if not (known > 0 and doubt <= EXCUSED * known):  # f* = 0 of nothing has no scale
         return None
     return Optimum(
-        value=float(value), doubt=doubt + rounding, energy=SPARED * known,
+        qp=qp, value=float(value), doubt=doubt + rounding, energy=SPARED * known,
         terms=float(max(energy_at(qp, s), abs(s.x @ (qp.P @ s.x)), abs(qp.q @ s.x))),
         x=scales_at(qp, s.x.astype(float), known).x,
+        own=own_sizes(qp, s.x.astype(float)),
     )  # fmt: skip
 
 
@@ -181,6 +215,8 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
     (`_least_multipliers`), and where that is none, all is as in `s`. The point that
     solves them has to satisfy the KKT conditions of all rows exactly.
     """
+    if qp.q.size > RATIONAL and not (held := coupled(qp)).all():
+        return _with_others(qp, s, held)
     below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
     lower, upper = (s.z_box < 0) & below, (s.z_box > 0) & above
     n, pressed, held = qp.q.size, s.z > 0, lower | upper
@@ -220,6 +256,33 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
             rounded.z[pressed], rounded.z_box[held] = z, z_box
             return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
     return None
+
+
+def _with_others(qp: QP, s: Solution, held: NDArray[np.bool_]) -> ExactOptimum | None:
+    """Find the exact optimum of the coupled variables, and of each other one alone."""
+    P = csr_array(qp.P)
+    part = replace(
+        qp, P=P[held][:, held], q=qp.q[held], A=csr_array(qp.A)[:, held],
+        G=csr_array(qp.G)[:, held], lb=qp.lb[held], ub=qp.ub[held],
+    )  # fmt: skip
+    found = exact_optimum(part, replace(s, x=s.x[held], z_box=s.z_box[held]))
+    if found is None:
+        return None
+    value, x, z_box = found.value, 0.0 * qp.q, 0.0 * qp.q
+    x[held], z_box[held] = found.solution.x, found.solution.z_box
+    bends = P.diagonal()
+    for j in np.flatnonzero(~held):
+        d, q = Fraction(bends[j]), Fraction(qp.q[j])
+        free: Fraction | float = Fraction(0)
+        if q != 0:
+            free = -q / d if d > 0 else -copysign(inf, q)
+        least = min(max(free, qp.lb[j]), qp.ub[j])
+        if isinf(least):
+            return None
+        best = Fraction(least)
+        value += d / 2 * best**2 + q * best
+        x[j], z_box[j] = float(best), -float(d * best + q)
+    return ExactOptimum(value, replace(found.solution, x=x, z_box=z_box))
 
 
 def _dense(M: Any) -> Any:

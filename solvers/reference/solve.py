@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from harness import QP, Solution, Status, kkt_residuals
+from harness.operators import assembled
 from harness.verify.optimum import is_small
 from solvers.reference.equilibrate import equilibrated
 from solvers.reference.interior import interior_point
@@ -46,13 +47,15 @@ def reference_solution(qp: QP) -> Solution:
     Raises
     ------
     ValueError
-        When P is an operator, or a matrix holds NaN or inf.
+        When P is an operator that is not small, or a matrix holds NaN or inf.
     ArithmeticError
         When no point with KKT residuals up to 1e-9 is found: constraints contradict
         each other, or the cost is unbounded. (That P is positive semidefinite is taken
         on trust.)
 
     """
+    if not qp.is_explicit and is_small(qp):
+        qp = replace(qp, P=assembled(qp.P))
     if not qp.is_explicit:
         raise ValueError("the reference solve needs P as a matrix, got an operator")
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):

@@ -9,7 +9,7 @@ import pytest
 from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdict
 from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
-from harness.verify.kkt import Residuals, rejudged, widths
+from harness.verify.kkt import Residuals, rejudged, tightened
 from harness.verify.optimum import (
     decided,
     exact_optimum,
@@ -126,14 +126,17 @@ def test_rows_tighten_the_widths_of_variables():
         [1, 1, 1], [0] * 3, G=[[2, 0, -1]], h=[4], lb=[-1, 0, -INF], ub=[INF, INF, 6]
     )
 
-    assert widths(simplex) == pytest.approx([1, 1])
-    assert widths(open_ended) == pytest.approx([6, INF, 12])
+    for qp, widths in ((simplex, [1, 1]), (open_ended, [6, INF, 12])):
+        lb, ub = tightened(qp)
+        assert ub - lb == pytest.approx(widths)
 
 
-#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 1.5δ hold x at (1.5, 0): f* = −0.375
+#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 0 hold x at (0, 0): f* = 0
 DELTA = 2.0**-34
-NEARLY = qp_of([1, 1], [-1, 0], G=[[0, 1], [-DELTA, -1]], h=[0, -1.5 * DELTA])
-BETWEEN = at([1, DELTA / 4], z=[0, 0])  # violates both by δ/4; f = −0.5
+NEARLY = qp_of([1, 1], [0.5, 0], G=[[0, 1], [-DELTA, -1]], h=[0, 0])
+BETWEEN = at([-0.5, DELTA / 4], z=[0, 0])  # violates both by δ/4; f = −0.125
+#: the same moved by (1.5, 0): the second row's right-hand side tells its size
+MOVED = qp_of([1, 1], [-1, 0], G=[[0, 1], [-DELTA, -1]], h=[0, -1.5 * DELTA])
 
 #: curvature 4ε along (1, −1), where the slope at (½, ½) is 2γ: f* = −½ − γ²/2ε = −1
 EPSILON, GAMMA = 2.0**-50, 2.0**-25
@@ -147,6 +150,12 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
     """Nor does a reference that is only as good as that prove anything."""
     assert kkt_residuals(NEARLY, BETWEEN).worst <= 1e-9
     assert proven_optimum(NEARLY, lambda _: BETWEEN) is None
+
+
+def test_a_row_is_judged_by_its_own_terms_where_it_has_a_right_hand_side():
+    moved = replace(BETWEEN, x=BETWEEN.x + np.array([1.5, 0]))
+
+    assert judge(MOVED, moved, 1e-4) is not Verdict.VERIFIED
 
 
 def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
@@ -433,17 +442,53 @@ def test_planted_points_are_solutions_to_the_last_digit(kind):
 # --- the search: points near and far from planted solutions ---------------------------
 
 
+class Products:
+    """An operator P that tells products alone."""
+
+    def __init__(self, P):
+        self.P, self.shape, self.dtype = P, P.shape, P.dtype
+
+    def __matmul__(self, x):
+        return self.P @ x
+
+
+def with_idle(qp, rng, count):
+    """Append variables that cost nothing at zero: idle, or with curvature; bounded."""
+    n = qp.q.size
+    bends = np.ldexp(1.0, rng.integers(-30, 31, rng.choice([1, count])))
+    P = np.pad(qp.P, (0, count))
+    P[range(n, n + count), range(n, n + count)] = bends * rng.integers(0, 2)
+    A, G = (np.pad(M, ((0, 0), (0, count))) for M in (qp.A, qp.G))
+    far = np.full(count, rng.choice([1.0, INF]))
+    return replace(
+        qp, P=P, q=np.pad(qp.q, (0, count)), A=A, G=G,
+        lb=np.append(qp.lb, -far), ub=np.append(qp.ub, far),
+    )  # fmt: skip
+
+
+#: how a planted QP is handed in: further variables, and P as an operator
+WAYS = {"as it is": (0, False), "400 idle": (400, False), "operator": (0, True),
+        "operator, 400 idle": (400, True)}  # fmt: skip
+
+
 class Attack:
     """Points of one planted QP that somebody may want to pass off as its solution."""
 
-    def __init__(self, planted, rng):
+    def __init__(self, planted, rng, way="as it is"):
         self.qp, self.s, self.value = planted.qp, planted.solution, planted.value
         self.rng = rng
         self.prove = proves(reference_solution)
+        self.idle, is_operator = WAYS[way]
+        self.stated = with_idle(self.qp, rng, self.idle) if self.idle else self.qp
+        if is_operator:
+            self.stated = replace(self.stated, P=Products(self.stated.P))
 
     def verified(self, s):
-        residuals = kkt_residuals(self.qp, s)
-        error = decided(self.qp, s, residuals, TOL, self.prove)
+        s = replace(
+            s, x=np.pad(s.x, (0, self.idle)), z_box=np.pad(s.z_box, (0, self.idle))
+        )
+        residuals = kkt_residuals(self.stated, s)
+        error = decided(self.stated, s, residuals, TOL, self.prove)
         found = verdict(Status.SOLVED, residuals, TOL, error=error)
         return found is Verdict.VERIFIED
 
@@ -462,19 +507,26 @@ class Attack:
         size = abs(self.value) if abs(self.value) > 1e-10 * terms else terms
         return abs(self.objective(s.x) - self.value) / size
 
-    def violation(self, x):
-        """The worst row or bound, relative to its terms, of those with b ≠ 0."""
+    def violation(self, x, at):
+        """The worst row or bound, relative to its terms at sizes `at` of x, if any."""
         qp, worst = self.qp, 0.0
         for off, b, terms in (
-            (abs(qp.A @ x - qp.b), qp.b, abs(qp.A) @ abs(x)),
-            (qp.G @ x - qp.h, qp.h, abs(qp.G) @ abs(x)),
-            (qp.lb - x, qp.lb, abs(x)),
-            (x - qp.ub, qp.ub, abs(x)),
+            (abs(qp.A @ x - qp.b), qp.b, abs(qp.A) @ at),
+            (qp.G @ x - qp.h, qp.h, abs(qp.G) @ at),
+            (qp.lb - x, qp.lb, at),
+            (x - qp.ub, qp.ub, at),
         ):
-            told = np.isfinite(b) & (b != 0)
-            size = (abs(b) + terms)[told]
-            worst = max(worst, (off[told] / size).max(initial=0.0))
+            size = abs(b) + terms
+            told = np.isfinite(b) & (size > 0)
+            worst = max(worst, (off[told] / size[told]).max(initial=0.0))
         return worst
+
+    def is_wrong(self, s):
+        """By more than 100·tol of its terms at the planted solution."""
+        x, at = self.s.x, abs(self.s.x)
+        terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q) @ at)
+        off = abs(self.objective(s.x) - self.value) / (terms or np.inf)
+        return max(off, self.violation(s.x, at)) > 100 * TOL
 
     def rounded(self):
         """The solution, its numbers off by one or two units in the last place."""
@@ -570,7 +622,7 @@ class Attack:
         return np.where(v != 0, abs(v), abs(v).max(initial=0.0) or 1.0)
 
 
-def search(seed, tries, each=40):
+def search(seed, tries, way, each=40):
     """Attack QPs of up to three kinds each; give what was wrongly judged."""
     rng = np.random.default_rng(seed)
     wrong, refuted, verified = [], [], 0
@@ -580,34 +632,105 @@ def search(seed, tries, each=40):
                 map(str, rng.choice([*KINDS], rng.integers(0, 4), replace=False))
             )
             number = int(rng.integers(2**30))
-            attack = Attack(hard(kinds, number), rng)
+            attack = Attack(hard(kinds, number), rng, way)
             for _ in range(3):
                 s = attack.rounded()
                 if attack.error(s) < 1e-9 and not attack.verified(s):
                     refuted.append((sorted(kinds), number))
             for s in attack.points(each - 3):
-                if not attack.verified(s):
-                    continue
-                verified += 1
-                off = attack.error(s), attack.violation(s.x)
-                if max(off) > 1e-3:
-                    wrong.append((sorted(kinds), number, off))
+                if attack.verified(s):
+                    verified += 1
+                    if attack.error(s) > 1e-3 or attack.is_wrong(s):
+                        wrong.append((sorted(kinds), number, s.x))
     return wrong, refuted, verified
 
 
-def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted():
-    wrong, refuted, verified = search(271828, 120)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(way):
+    wrong, refuted, verified = search(271828, 120, way)
 
     assert (wrong, refuted) == ([], [])
     assert verified > 5
 
 
 @pytest.mark.slow
-def test_a_search_of_a_hundred_thousand_points_finds_none_either():
+@pytest.mark.parametrize("way", WAYS)
+def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
     """Of 7500 right points one is refuted, as docs/verdicts.md says: big-M."""
-    wrong, refuted, verified = search(314159, 100_000)
+    wrong, refuted, verified = search(314159, 100_000, way)
 
     assert wrong == []
     assert len({number for _, number in refuted}) <= 1
     assert all({"big-M", "cancelled"} <= set(kinds) for kinds, _ in refuted)
     assert verified > 10_000
+
+
+def idle_beside(*values, count=400):
+    """Lengthen vectors that begin with values by as many zeros."""
+    return [np.pad(np.array(v, dtype=float), (0, count)) for v in values]
+
+
+@pytest.mark.parametrize("count", [0, 400])
+@pytest.mark.parametrize(
+    ("cost", "bend", "tol"),
+    [(1e7, 1e-6, 1e-8), (1e3, 1e-6, 1e-4), (1e12, 1e-6, 1e-8), (1e5, 1e-3, 1e-6)],
+)
+def test_a_row_violated_wholly_is_not_excused_by_costs_beside_it(
+    cost, bend, tol, count
+):
+    """min Cx₁ + x₂ + ½s‖x‖², x₂ = 1, x₁ ≥ 0: x* = (0, 1)."""
+    q, row, pulls, right = idle_beside(
+        [cost, 1], [0, 1], [-cost, 0], [0, 1], count=count
+    )
+    lb = np.where(q == cost, 0, -INF)
+    qp = qp_of([bend] * q.size, q, A=[row], b=[1], lb=lb)
+
+    for y in (-1.0, 0.0, -2.0):
+        assert judge(qp, at(0 * q, [y], z_box=pulls), tol) is Verdict.WRONG
+    assert judge(qp, at(right, [-1 - bend], z_box=pulls), tol) is Verdict.VERIFIED
+    nearly = at((1 + tol) * right, [-1 - bend], z_box=pulls)
+    assert judge(qp, nearly, tol) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize("count", [0, 400])
+@pytest.mark.parametrize("tol", [1e-8, 1e-4])
+def test_an_operator_that_tells_no_diagonal_excuses_no_force(tol, count):
+    """min ½x₂² + 3e5x₁ + x₂, x₁ = 0: x* = (0, −1)."""
+    q, row, bends, right = idle_beside([3e5, 1], [1, 0], [1, 1], [0, -1], count=count)
+    qp = replace(qp_of(bends, q, A=[row], b=[0]), P=Products(np.diag(bends)))
+
+    assert judge(qp, at(0 * q, [-3e5]), tol) is Verdict.WRONG
+    assert judge(qp, at(right, [-3e5]), tol) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize("count", [0, 400])
+def test_a_narrow_box_lends_no_length_to_a_row(count):
+    """A stiffness of 1e18 between bounds 2e-9 apart, and x₂ = 1 of stiffness 1."""
+    bends, q, row, wrong = idle_beside(
+        [1e18, 1], [-1e18, 0], [0, 1], [1, 0], count=count
+    )
+    near = 1e-9 * (q != 0)
+    lb = np.where(q != 0, 1 - near, -INF)
+    qp = qp_of(bends, q, A=[row], b=[1], lb=lb, ub=np.where(q != 0, 1 + near, INF))
+
+    assert judge(qp, at(wrong, [0]), 1e-4) is Verdict.WRONG
+    assert judge(qp, at(wrong + row, [-1]), TOL) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize(
+    ("n", "with_row"), [(1, False), (3, False), (403, False), (1, True), (3, True)]
+)
+def test_a_point_at_rounding_of_zero_is_right_where_all_data_are_of_order_one(
+    n, with_row
+):
+    """min Σxⱼ, x ≥ 0 or Σxⱼ ≥ 0 as well: x* = 0; sizes of 1e-11 are no error."""
+    G, h = ([-np.ones(n)], [0]) if with_row else (None, ())
+    qp = qp_of([0] * n, [1] * n, G=G, h=h, lb=0)
+    s = at([1e-11] * n, z=[0.5] * with_row, z_box=[-0.5 if with_row else -1.0] * n)
+
+    for point, expected in (
+        (s, Verdict.VERIFIED), (replace(s, x=s.x + 1e-2), Verdict.WRONG),
+    ):  # fmt: skip
+        residuals = kkt_residuals(qp, point)
+        error = decided(qp, point, residuals, TOL, proves(reference_solution))
+        assert verdict(Status.SOLVED, residuals, TOL, error=error) is expected
