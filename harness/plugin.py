@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from harness.distributed.vectors import Emitted, Ranks
@@ -163,6 +165,15 @@ class Case:
     unsettled: float = 0.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class SourceFile:
+    """A file that a case is read from, with the content that it had when named."""
+
+    path: str  #: as the case names it
+    sha256: str  #: first 12 hexadecimal digits
+    suffix: str  #: of its format, for the name of a copy; never taken from the path
+
+
 class Family(ABC):
     """A parametrised family of problems; in practice a frozen dataclass.
 
@@ -194,6 +205,21 @@ class Family(ABC):
         The mechanics of both have a grid, for `harness.crossval.discretisation`.
         """
         return None
+
+    def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
+        """Return the file that a case is read from, to be copied with its results."""
+        return None
+
+    def with_copies(self, folder: Path) -> Family:
+        """Return the family that takes the copies of a result folder.
+
+        They stand for files that are missing here, or have another content.
+        """
+        return self
+
+    def copied_paths(self) -> list[str]:
+        """List the paths of files that the result folder knows; see `with_copies`."""
+        return []
 
     def emission(
         self, form: str, params: Mapping[str, Value]
