@@ -94,6 +94,10 @@ class About:
         return f"not installed: {module} (pip install {self.package})"
 
 
+#: state of a node whose bound of Tresca's law carries shear where nothing presses
+SLIDING = "sliding without contact"
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSide:
     """What a contact does along its slave side, node by node; SI units."""
@@ -105,7 +109,8 @@ class ContactSide:
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
-    friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
+    #: (s,) "open", "stick", "slip" or `SLIDING`; files of old say "open" for the last
+    friction: NDArray[Any] | None = None
     #: (k, 3) of the exact solution, where it is known: distance along the side from its
     #: middle, m, pressure and shear, Pa
     exact: NDArray[Any] | None = None
@@ -113,12 +118,13 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Tell which nodes (s,) press on the other side.
 
-        Those whose force is more than `least`, N/m. With friction it is those that are
-        not open: Tresca's law lets friction act on open nodes, too.
+        Those whose force is more than `least`, N/m. With friction it is those that
+        stick or slip: Tresca's law lets friction act where nothing presses, too.
         """
         told: NDArray[Any] = (
             (self.force**2).sum(axis=1) > least**2
-            if self.friction is None else self.friction != "open"
+            if self.friction is None
+            else (self.friction == "stick") | (self.friction == "slip")
         )  # fmt: skip
         return told
 
