@@ -22,7 +22,7 @@ from harness.files.reading import MOST_TOML, read_text
 from harness.record import Record, Verdict
 from harness.registry import resolve
 from harness.results.faults import in_words
-from harness.results.folder import keep_environment
+from harness.results.folder import keep_environment, refuse_links
 from harness.results.journal import read_journal
 from harness.results.merge import merge as merge_folders
 from harness.running.executor import one_by_one
@@ -286,6 +286,8 @@ def run(
         text = read_text(registries.suite_path(suite), "a TOML file", MOST_TOML)
     folder = folder or Path("out") / name_in(text)
     fresh = checked.flag("fresh", fresh)  # which forgets copies of files, too
+    if folder.is_dir():
+        refuse_links(folder)  # before copies of files are read
     families = registries.families_with_copies(None if fresh else folder)
     known_solvers = registries.solvers
     if isinstance(suite, Mapping):
