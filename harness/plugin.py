@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from harness.distributed.vectors import Emitted, Ranks
@@ -92,6 +94,10 @@ class About:
         return f"not installed: {module} (pip install {self.package})"
 
 
+#: state of a node whose bound of Tresca's law carries shear where nothing presses
+SLIDING = "sliding without contact"
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSide:
     """What a contact does along its slave side, node by node; SI units."""
@@ -103,7 +109,8 @@ class ContactSide:
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
-    friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
+    #: (s,) "open", "stick", "slip" or `SLIDING`; files of old say "open" for the last
+    friction: NDArray[Any] | None = None
     #: (k, 3) of the exact solution, where it is known: distance along the side from its
     #: middle, m, pressure and shear, Pa
     exact: NDArray[Any] | None = None
@@ -111,12 +118,13 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Tell which nodes (s,) press on the other side.
 
-        Those whose force is more than `least`, N/m. With friction it is those that are
-        not open: Tresca's law lets friction act on open nodes, too.
+        Those whose force is more than `least`, N/m. With friction it is those that
+        stick or slip: Tresca's law lets friction act where nothing presses, too.
         """
         told: NDArray[Any] = (
             (self.force**2).sum(axis=1) > least**2
-            if self.friction is None else self.friction != "open"
+            if self.friction is None
+            else (self.friction == "stick") | (self.friction == "slip")
         )  # fmt: skip
         return told
 
@@ -163,6 +171,15 @@ class Case:
     unsettled: float = 0.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class SourceFile:
+    """A file that a case is read from, with the content that it had when named."""
+
+    path: str  #: as the case names it
+    sha256: str  #: first 12 hexadecimal digits
+    suffix: str  #: of its format, for the name of a copy; never taken from the path
+
+
 class Family(ABC):
     """A parametrised family of problems; in practice a frozen dataclass.
 
@@ -194,6 +211,21 @@ class Family(ABC):
         The mechanics of both have a grid, for `harness.crossval.discretisation`.
         """
         return None
+
+    def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
+        """Return the file that a case is read from, to be copied with its results."""
+        return None
+
+    def with_copies(self, folder: Path) -> Family:
+        """Return the family that takes the copies of a result folder.
+
+        They stand for files that are missing here, or have another content.
+        """
+        return self
+
+    def copied_paths(self) -> list[str]:
+        """List the paths of files that the result folder knows; see `with_copies`."""
+        return []
 
     def emission(
         self, form: str, params: Mapping[str, Value]

@@ -57,9 +57,13 @@ def ranks(registries: Registries, arguments: Sequence[str]) -> int:
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Be the case worker that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
-    registries = registries.with_files(json.loads(text)["plugins"])
+    request = json.loads(text)
+    registries = registries.with_files(request["plugins"])
+    families = registries.families
+    if "folder" in request:
+        families = registries.families_with_copies(Path(request["folder"]))
     serve_cases(
-        CaseWorker(registries.families, registries.reference, registries.operators),
+        CaseWorker(families, registries.reference, registries.operators),
         int(request_fd),
         int(reply_fd),
     )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 from harness import checked
 from harness.errors import InputError, shown, unknown
 from harness.limits import ONE_THREAD
-from harness.plugin import Family, Reference, Solver
+from harness.plugin import Family, Reference, Solver, as_family
 from harness.processes.turns import Turn
 from harness.registry import (
     COPIES,
@@ -128,6 +128,27 @@ def _validation_page(
     return write_validation(folder, data, meshes)
 
 
+class _WithCopies(Mapping[str, Family]):
+    """Families that take the copies of files which a result folder holds."""
+
+    def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
+        self._families = families
+        self._folder = folder
+
+    def __getitem__(self, name: str) -> Family:
+        family = as_family(self._families[name])
+        return family if self._folder is None else family.with_copies(self._folder)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._families
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._families)
+
+    def __len__(self) -> int:
+        return len(self._families)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Registries:
     """What can be measured, and how the processes are started that measure it."""
@@ -239,11 +260,25 @@ class Registries:
                 "texts, true or false, or lists and dicts of these"
             ) from None
 
-    def commands(self, specs: Iterable[SolverSpec]) -> Commands:
-        """Make the commands that start the processes of a run."""
+    def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
+        """Return the families, which take copies of files from a result folder.
+
+        folder : which `refuse_links` has let pass; None: there are no copies
+        """
+        return _WithCopies(self.families, folder)
+
+    def commands(
+        self, specs: Iterable[SolverSpec], folder: Path | None = None
+    ) -> Commands:
+        """Make the commands that start the processes of a run.
+
+        folder : the result folder, whose copies of files cases may be built from
+        """
         from harness.results.work_unit import Commands
 
-        request = {"plugins": self._absolute_files()}
+        request: dict[str, Any] = {"plugins": self._absolute_files()}
+        if folder is not None:
+            request["folder"] = str(folder.absolute())
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "generator", json.dumps(request)],

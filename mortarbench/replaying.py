@@ -96,13 +96,12 @@ def replay(
 
     """
     registries = known(plugins, registries)
-    families, solvers = registries.families, registries.solvers
-    stored = open_stored_run(
-        checked.path("folder", folder), text("run_id", run_id), families, solvers
-    )
+    path, solvers = checked.path("folder", folder), registries.solvers
+    families = registries.families_with_copies(path)
+    stored = open_stored_run(path, text("run_id", run_id), families, solvers)
     environment = registries.environment()
     unit = work_unit_of(stored, solvers, digest(environment))
-    commands = registries.commands([stored.spec])
+    commands = registries.commands([stored.spec], path)
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
         one_by_one(
@@ -117,7 +116,7 @@ def replay(
         raise InputError(f"{stored.record.run_id}: {result.reason}")
     if isinstance(result, Unmade):
         raise FaultError(f"{stored.record.run_id}: {result.reason}")
-    return compared(Path(folder), stored, result, environment)
+    return compared(path, stored, result, environment)
 
 
 def compared(

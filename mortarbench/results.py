@@ -18,10 +18,11 @@ from harness.environment.doctor import load_advice
 from harness.environment.environment import digest
 from harness.errors import InputError, some, unknown
 from harness.errors import shown as given
+from harness.files.reading import MOST_TOML, read_text
 from harness.record import Record, Verdict
 from harness.registry import resolve
 from harness.results.faults import in_words
-from harness.results.folder import keep_environment
+from harness.results.folder import keep_environment, refuse_links
 from harness.results.journal import read_journal
 from harness.results.merge import merge as merge_folders
 from harness.running.executor import one_by_one
@@ -30,7 +31,7 @@ from harness.running.run import Missing
 from harness.running.run import run as run_suite
 from harness.suite.overrides import with_overrides
 from harness.suite.solver_options import as_given
-from harness.suite.suite import load_suite, parse_suite, suite_text
+from harness.suite.suite import load_suite, name_in, parse_suite, suite_text
 from mortarbench.arguments import PICTURES, writable
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, known
@@ -278,16 +279,24 @@ def run(
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):
         raise InputError(f"dask = {given(dask)}; expected the address of a scheduler")
-    families, known_solvers = registries.families, registries.solvers
     if isinstance(suite, Mapping):
         with located("suite"):
             text = suite_text(suite)
+    else:
+        text = read_text(registries.suite_path(suite), "a TOML file", MOST_TOML)
+    folder = folder or Path("out") / name_in(text)
+    fresh = checked.flag("fresh", fresh)  # which forgets copies of files, too
+    if folder.is_dir():
+        refuse_links(folder)  # before copies of files are read
+    families = registries.families_with_copies(None if fresh else folder)
+    known_solvers = registries.solvers
+    if isinstance(suite, Mapping):
         loaded = parse_suite(text, "suite", Path(), families, known_solvers)
     else:
         loaded = load_suite(registries.suite_path(suite), families, known_solvers)
     asked = with_overrides(
         loaded,
-        registries.families,
+        families,
         registries.solvers,
         solvers=checked.texts("solvers", solvers),
         cases=checked.texts("cases", cases),
@@ -296,7 +305,6 @@ def run(
         memory_limit=memory_limit,
         options=as_given({} if options is None else options),
     )
-    folder = folder or Path("out") / asked.name
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
         if load_advice(busy := os.getloadavg()[0]):
@@ -323,12 +331,12 @@ def run(
         missing = run_suite(
             asked,
             out=folder,
-            commands=registries.commands(asked.solvers),
+            commands=registries.commands(asked.solvers, folder),
             resolve=lambda spec: resolve(spec, registries.solvers),
             environment=environment,
             digest=digest(environment),
             progress=display,
-            fresh=checked.flag("fresh", fresh),
+            fresh=fresh,
             engine=engine,
         )
         records = read_journal(folder, display.warn)

@@ -20,7 +20,7 @@ from harness.crossval.validation import validated
 from harness.errors import InputError, unknown
 from harness.files.durable import full_disk_told, replace_file
 from harness.names import CaseId, assemble
-from harness.plugin import Solver
+from harness.plugin import Family, Reference, Solver
 from harness.processes.measurement import scratch_folder
 from harness.processes.solver_file import write_solver
 from harness.processes.supervisor import WorkerProcess
@@ -97,7 +97,8 @@ def _validated(
     progress: Callable[[str], None],
     registries: Registries,
 ) -> Validation:
-    found = validated(path, registries.families, registries.reference, progress)
+    families = registries.families_with_copies(path)
+    found = validated(path, families, registries.reference, progress)
     data = as_data(found, path.resolve().name, ours=OURS)
     if not (data["counts"]["answers"] or found.false_claims or found.proven):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
@@ -106,7 +107,7 @@ def _validated(
     with full_disk_told(path):
         replace_file(path / "validation.json", text.encode())
     pages = registries.validation_page(path, data, ())
-    meshes = _meshes(registries, path, budget, progress)
+    meshes = _meshes(families, registries.reference, path, budget, progress)
     if meshes:  # the page was there while they were solved; now it tells of them, too
         pages = registries.validation_page(path, data, meshes)
     return Validation(
@@ -115,13 +116,13 @@ def _validated(
 
 
 def _meshes(
-    registries: Registries,
+    families: Mapping[str, Family],
+    reference: Reference,
     folder: Path,
     seconds: float,
     progress: Callable[[str], None],
 ) -> list[Discretisation]:
     """Solve the folder's elastic cases on finer meshes, or say why there are none."""
-    families = registries.families
     records = {r.case: r for r in read_journal(folder, progress)}
     cases = []
     for r in records.values():
@@ -130,7 +131,7 @@ def _meshes(
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
                     cases.append(case)
-    return discretisation_errors(cases, registries.reference, folder, seconds, progress)
+    return discretisation_errors(cases, reference, folder, seconds, progress)
 
 
 def _refines(case: CaseId) -> bool:

@@ -84,12 +84,16 @@ def _sync(file: IO[bytes]) -> None:
     os.fsync(file.fileno())
 
 
-def remove_unfinished(folder: Path, own: Iterable[Path]) -> None:
+def remove_unfinished(
+    folder: Path, own: Iterable[Path], shared: Iterable[Path] = ()
+) -> None:
     """Delete what killed writers left in a result folder that nobody writes now.
 
     own : its folders, in which every file is ours
+    shared : its folders that may hold files of the user, too
     """
     found = [*folder.glob(_UNFINISHED), *(folder / name for name in _OLD)]
+    found += [path for one in shared for path in one.glob(_UNFINISHED)]
     for one in own:
         found += [*one.rglob(_UNFINISHED)]
         found += [path for pattern in _OTHERS for path in one.glob(pattern)]

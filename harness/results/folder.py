@@ -15,6 +15,8 @@ from typing import Any
 from harness.environment.environment import VOLATILE
 from harness.environment.labels import in_words
 from harness.errors import InputError, shortened, some
+from harness.files.copies import FOLDER as COPIES
+from harness.files.copies import is_copy, remove_copies
 from harness.files.durable import full_disk_told, remove_unfinished, replace_file
 from harness.files.reading import MOST_TOML, opened, read_json, read_text, toml
 from harness.results.faults import FAULTS
@@ -57,6 +59,8 @@ def refuse_links(folder: Path) -> None:
                         raise _not_plain(entry.path, "a folder of its own")
                     if entry.is_dir(follow_symlinks=False):
                         _only_plain(entry.path)
+                elif entry.name == COPIES:
+                    _only_plain_copies(entry)
                 elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
                     raise _not_plain(entry.path, "a file of its own")
     except OSError as e:
@@ -83,6 +87,24 @@ def _only_plain(folder: str) -> None:
             f"{folder}: folders nested deeper than {MOST_LEVELS} levels; expected "
             "those that a run writes; move the deep ones away"
         )
+
+
+def _only_plain_copies(folder: os.DirEntry[str]) -> None:
+    """Refuse links, pipes and devices among copies of files.
+
+    A folder of that name may be a user's own: what has no name of ours is left alone.
+    """
+    if folder.is_symlink():
+        raise _not_plain(folder.path, "a folder of its own")
+    if not folder.is_dir():
+        return
+    with os.scandir(folder.path) as entries:
+        for entry in entries:
+            if is_copy(entry.name) and not entry.is_file(follow_symlinks=False):
+                raise InputError(
+                    f"{entry.path} is not a regular file; expected the copy of a file, "
+                    "as in every result folder"
+                )
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
@@ -197,7 +219,8 @@ def locked(folder: Path) -> Iterator[Held]:
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        remove_unfinished(folder, [folder / name for name in _FOLDERS])
+        own = [folder / name for name in _FOLDERS]
+        remove_unfinished(folder, own, shared=[folder / COPIES])
         yield held
     finally:
         held.close()
@@ -264,6 +287,7 @@ def claim(
             shutil.rmtree(out / name, ignore_errors=True)
         for name in _CONCLUDED:
             (out / name).unlink(missing_ok=True)
+        remove_copies(out)
     describe(out, suite, environment)
 
 

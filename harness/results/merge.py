@@ -19,6 +19,7 @@ from typing import Any
 
 from harness.digest import hex_digest
 from harness.errors import InputError
+from harness.files.copies import check_copies, merge_copies
 from harness.files.durable import full_disk_told, replace_file
 from harness.files.store import copy_stored
 from harness.record import Record
@@ -92,6 +93,8 @@ def merge(
     before = [out] if _journal(out).exists() else []
     folders = [*before, *read]
     suite = _united_suite(folders)
+    for folder in folders:
+        check_copies(folder)
     with full_disk_told(out), locked(out):
         union = _Union()
         for folder in before:
@@ -102,6 +105,7 @@ def merge(
                 tell(f"{source}: {again} of {len(records)} {_AGAIN}")
         for source, records in read.items():
             _copy_solutions(source, out, records, tell)
+        merge_copies(list(read), out, tell)
         _copy_environments(folders, out, union.records.values(), tell)
         _merge_faults(folders, out)
         replace_file(out / "suite.toml", suite.encode())

@@ -16,6 +16,7 @@ from secrets import token_hex
 from typing import Any
 
 from harness.errors import InputError, shown
+from harness.files.copies import keep_copies, refuse_own_copies
 from harness.files.durable import full_disk_told
 from harness.files.lines import Lines
 from harness.files.store import save
@@ -98,7 +99,11 @@ def run(
             _check_same(out, past, suite, options)
             if grown:
                 _check_steps(out, past, suite)
+        sources = [s for c in suite.names if (s := c.family.source_file(c.params))]
+        if fresh:
+            refuse_own_copies(out, sources)
         claim(out, suite, environment, fresh=fresh)
+        keep_copies(out, sources, progress.warn)
         with (
             scratch_in(out) as scratch,
             Journal(out, digest, progress.warn) as journal,

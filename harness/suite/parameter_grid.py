@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from glob import escape, glob
 from itertools import product
 from math import prod
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from harness import checked
@@ -73,7 +73,7 @@ def _blocks(
             over = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
             if family.path_suffix is not None and "path" in params:
-                params = {**params, "path": _expanded(params["path"], folder)}
+                params = {**params, "path": _expanded(params["path"], folder, family)}
             axes = _axes(params, table.get("zip", []))
             along = next((tuple(axis[0]) for axis in axes if over in axis[0]), ())
             spanned += prod(map(len, axes)) * len(forms)
@@ -83,34 +83,47 @@ def _blocks(
                     f"take fewer values, or set max_cases = {spanned} in the suite"
                 )
             cases = [
-                assemble(family, _located(point, folder), checked.text("forms", form))
+                assemble(
+                    family,
+                    _located(point, folder, family),
+                    checked.text("forms", form),
+                )
                 for point in _points(axes)
                 for form in forms
             ]
             yield _Block(cases=cases, along=along)
 
 
-def _expanded(paths: object, folder: Path) -> object:
+def _expanded(paths: object, folder: Path, family: Family) -> object:
     """Write out the shell patterns among paths: the files that match, sorted."""
     listed = paths if isinstance(paths, list) else [paths]
-    if not any(_is_pattern(path, folder) for path in listed):
+    if not any(_is_pattern(path, folder, family) for path in listed):
         return paths
     found: list[object] = []
     for path in listed:
-        found += _matching(str(path), folder) if _is_pattern(path, folder) else [path]
+        if _is_pattern(path, folder, family):
+            found += _matching(str(path), folder, family)
+        else:
+            found.append(path)
     return found
 
 
-def _is_pattern(path: object, folder: Path) -> bool:
+def _is_pattern(path: object, folder: Path, family: Family) -> bool:
     """Whether a path has the signs of a pattern, and is no file's name as it is."""
     if not isinstance(path, str) or not set("*?[") & set(path):
         return False
-    return not os.path.exists(path) and not (folder / path).exists()
+    if os.path.exists(path) or (folder / path).exists():
+        return False
+    return not _copied(escape(path), family)
 
 
-def _matching(pattern: str, folder: Path) -> list[str]:
-    """List the files that match from here, or else from the folder of the suite."""
-    if found := sorted(filter(os.path.isfile, glob(pattern))):
+def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
+    """List the files that match from here, or else from the folder of the suite.
+
+    Files that are missing here count where the result folder knows of them.
+    """
+    missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
+    if found := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
         return found
     beside = glob(os.path.join(escape(str(folder)), pattern))
     if found := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
@@ -121,12 +134,28 @@ def _matching(pattern: str, folder: Path) -> list[str]:
     )
 
 
-def _located(point: dict[str, object], folder: Path) -> dict[str, object]:
-    """Take a path that leads nowhere from here to be relative to the suite."""
+def _copied(pattern: str, family: Family) -> list[str]:
+    """List paths that the result folder knows and whose last parts match a pattern."""
+    if not PurePath(pattern).parts:
+        return []
+    return [path for path in family.copied_paths() if PurePath(path).match(pattern)]
+
+
+def _located(
+    point: dict[str, object], folder: Path, family: Family
+) -> dict[str, object]:
+    """Take a path that leads nowhere from here to be relative to the suite.
+
+    A file that is at neither place may have travelled with the results, under the path
+    that the suite had led to then.
+    """
     match point:
-        case {"path": str(text)} if (beside := folder / text).is_file():
-            if not Path(text).is_file():
+        case {"path": str(text)} if text and not Path(text).is_file():
+            if (beside := folder / text).is_file():
                 return {**point, "path": os.path.relpath(beside)}
+            copied = _copied(escape(text), family)
+            if text not in copied and len(copied) == 1:
+                return {**point, "path": copied[0]}
     return point
 
 

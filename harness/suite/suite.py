@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +41,7 @@ _NUMBERS = tuple(
     if not isinstance(value, bool | list) and key != "null_arm"
 )  # fmt: skip
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
+_NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
 NULL = " (A/A)"  #: after the label of a solver that is measured once more
 
@@ -130,7 +132,7 @@ def parse_suite(
         for key in ("name", "solvers", "problems"):
             if key not in table:
                 raise InputError(f"{key} is missing")
-        if not re.fullmatch(r"[\w.-]*\w[\w.-]*", checked.text("name", table["name"])):
+        if not _NAME.fullmatch(checked.text("name", table["name"])):
             raise InputError(
                 f"name = {shown(table['name'])} is no name of a folder; "
                 "expected letters, digits, '.', '-' and '_'"
@@ -165,6 +167,15 @@ def parse_suite(
             tighten=_tightening(table, sequences),
             text=text,
         )
+
+
+def name_in(text: str) -> str:
+    """Return the name in the TOML of a suite; empty where `parse_suite` refuses it."""
+    with suppress(InputError):
+        name = toml(text).get("name")
+        if isinstance(name, str) and _NAME.fullmatch(name):
+            return name
+    return ""
 
 
 def read_stored(path: Path) -> dict[str, Any]:

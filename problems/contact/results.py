@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from harness import QP, Fields, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION, contact_rows
+from harness.plugin import SLIDING
 from problems.contact.bodies import Bodies, ContactSides
 from problems.contact.sides import ACTIVE, active, bodies_of, contact_sides, states
 from problems.fem.mesh import as_vectors
@@ -110,8 +111,7 @@ def frictional(
     """
     state = states(primal, s, friction)
     shear = np.abs(s.z[primal.h.size :])
-    unpressed = (state == "open") & (shear > ACTIVE * np.abs(s.z).max(initial=0.0))
-    state = np.where(unpressed, "", state)
+    unpressed = state == SLIDING
     slip = friction.T @ s.x - friction.start
     return {
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},

@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 
 from harness import QP, ContactSide, Friction, Solution, Vector
 from harness.mechanics import NO_FRICTION
+from harness.plugin import SLIDING
 from problems.contact.bodies import Bodies, ContactPair, ContactSides
 from problems.contact.node_to_segment import tangent
 from problems.contact.polyline import current_polyline
@@ -21,6 +22,7 @@ from problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 
 RIGID = "rigid"  #: name of a master that is no body
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
+_STATE = f"U{len(SLIDING)}"  #: type of arrays of states
 
 
 def contact_sides(
@@ -36,7 +38,7 @@ def contact_sides(
     node, ∫N_j ds; the normal is that of the deformed side. The gap is the slack of the
     node's row, c − Bu: with mortar contact the mean of the gap around the node,
     weighted as its row is. Where there is friction, the shear is that of its force
-    along the tangent (−n_y, n_x), and a node is open, sticks or slips.
+    along the tangent (−n_y, n_x), and a node has one of the `states`.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
@@ -60,7 +62,7 @@ def contact_sides(
         place = slave_places(B[rows], pair.slave)
         gap[place] = slack[rows]
         t = tangent(side.node_normal)
-        told = np.full(len(pair.slave), "open", dtype="U5")
+        told = np.full(len(pair.slave), "open", dtype=state.dtype)
         told[place[friction.row[rough] - rows.start]] = state[rough]
         found.append(
             ContactSide(
@@ -75,20 +77,24 @@ def contact_sides(
 
 
 def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
-    """Tell of each friction row (k,) whether its contact is open, sticks or slips.
+    """Classify friction rows (k,): "open", "stick", "slip" or `SLIDING`.
 
-    An active row sticks up to the slip that the rest of its bound would bring about on
-    the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
+    Rows that are not active are open unless they carry shear, which Tresca's law allows
+    and Coulomb's does not. An active row sticks up to the slip that the rest of its
+    bound would bring about on the nodes of the row alone, (g − |λ_t|) T diag(K)⁻¹Tᵀ.
     """
     if not friction.bound.size:
-        return np.zeros(0, dtype=np.str_)
+        return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
     slip = np.abs(friction.T @ s.x - friction.start)
     sticks = (friction.bound - np.abs(tangential)) * softness >= slip
     closed = active(normal)[friction.row]
-    return np.where(closed, np.where(sticks, "stick", "slip"), "open")
+    sheared = np.abs(tangential) > ACTIVE * np.abs(s.z).max(initial=0.0)
+    apart = np.where(sheared, SLIDING, "open")
+    touching = np.where(sticks, "stick", "slip")
+    return np.where(closed, touching, apart).astype(_STATE)
 
 
 def active(normal: Vector) -> NDArray[np.bool_]:

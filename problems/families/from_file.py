@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from harness import Family, InputError
-from problems.files.file_digest import check_digest, digest, format_of
+from harness.files.copies import Copies, content_digest
+from harness.plugin import SourceFile
+from problems.files.file_digest import check_digest, format_of
 
 if TYPE_CHECKING:
     from harness import Case, Reference, Solution, Value
@@ -30,21 +32,50 @@ class FromFile(Family):
         default_factory=lambda: MappingProxyType({"path": "", "sha256": ""}), hash=False
     )
     forms: tuple[str, ...] = ("qp",)
+    #: of a result folder; None: files are read where the path leads
+    copies: Copies | None = field(default=None, compare=False)
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in the digest of the file's content."""
         params = {**self.defaults, **given}
         if params["path"] and "sha256" not in given:
-            params["sha256"] = digest(Path(str(params["path"])))
+            path = str(params["path"])
+            if self.copies is None:
+                params["sha256"] = content_digest(Path(path))
+            else:
+                params["sha256"] = self.copies.digest(path)
         return params
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless there is such a file of a known format."""
-        path = Path(str(params["path"]))
         if not params["path"]:
             raise InputError("file: path is missing; expected file:PATH")
-        format_of(path)
-        check_digest(params["path"], params["sha256"], digest(path))
+        self._located(params)
+
+    def source_file(self, params: Mapping[str, Value]) -> SourceFile:
+        """Return the file, named by the digest of its content and its format."""
+        path, sha256 = str(params["path"]), str(params["sha256"])
+        suffix = format_of(Path(path))
+        if path.lower().endswith(".gz"):
+            suffix += ".gz"
+        return SourceFile(path=path, sha256=sha256, suffix=suffix)
+
+    def with_copies(self, folder: Path) -> FromFile:
+        """Return the family that takes the copies of a result folder."""
+        return replace(self, copies=Copies(folder))
+
+    def copied_paths(self) -> list[str]:
+        """List the paths of files of which the result folder knows."""
+        return [] if self.copies is None else self.copies.paths()
+
+    def _located(self, params: Mapping[str, Value]) -> Path:
+        """Return the file with the content of the digest: the original, or a copy."""
+        source = self.source_file(params)
+        if self.copies is not None:
+            return self.copies.locate(source)
+        path = Path(source.path)
+        check_digest(source.path, source.sha256, content_digest(path))
+        return path
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -53,8 +84,7 @@ class FromFile(Family):
         from harness import Case
         from problems.files.readers import read
 
-        self.check(params)
-        qp, scale, constant = read(Path(str(params["path"])))
+        qp, scale, constant = read(self._located(params))
 
         def quantities(s: Solution) -> dict[str, float]:
             return {"value": scale * qp.objective(s.x) + constant}

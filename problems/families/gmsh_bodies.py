@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from harness import InputError
 from harness.checked import located
+from harness.files.copies import content_digest
 from problems.families.in_subdomains import InSubdomains
-from problems.files.file_digest import check_digest, digest
+from problems.files.file_digest import check_digest
 from problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
@@ -68,7 +69,7 @@ class GmshBodies(InSubdomains):
                 **given,
             }
             if "sha256" not in given:
-                params["sha256"] = digest(path, path.parent / table["mesh"])
+                params["sha256"] = content_digest(path, path.parent / table["mesh"])
         return params if "step" in given else params | {"step": params["steps"]}
 
     def check(self, params: Mapping[str, Value]) -> None:
@@ -96,7 +97,7 @@ class GmshBodies(InSubdomains):
         with located(str(path)):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
-        check_digest(p["path"], p["sha256"], digest(path, mesh))
+        check_digest(p["path"], p["sha256"], content_digest(path, mesh))
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every edge of the mesh halved."""

@@ -5,13 +5,10 @@ Text and .mat files may be compressed by gzip; npz and Parquet are compressed as
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 from harness import InputError, Value
-from harness.digest import hex_digest, pieces
 from harness.errors import unknown
-from harness.files.datafile import opened
 
 COMPRESSIBLE = (".qps", ".mps", ".sif", ".mat")
 FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files
@@ -36,25 +33,6 @@ def format_of(path: Path) -> str:
         known = " or ".join(f"{s}.gz" for s in COMPRESSIBLE)
         raise InputError(f"{path}: {inner}.gz is not read; expected {known}")
     raise unknown("format", path.suffix, (*FORMATS, ".gz"), where=str(path))
-
-
-def digest(*paths: Path) -> str:
-    """Digest the bytes of files, 12 hexadecimal digits of SHA-256.
-
-    Raises
-    ------
-    InputError
-        When one cannot be read, is no regular file, or is larger than
-        `harness.files.datafile` allows.
-
-    """
-
-    def parts() -> Iterator[bytes]:
-        for path in paths:
-            with opened(path, "a file that can be read") as file:
-                yield from pieces(file)
-
-    return hex_digest(parts())
 
 
 def check_digest(path: Value, asked: Value, found: str) -> None:

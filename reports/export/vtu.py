@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 from harness import ContactSide, Fields, InputError, Vector
 from harness.files.csvfile import csv_text
 from harness.files.durable import replacing
+from harness.plugin import SLIDING
 
 #: a node is in contact where its force exceeds this · the largest; of pairs with
-#: friction, where it is not open
+#: friction, where it sticks or slips
 IN_CONTACT = 1e-6
-STATES = ("open", "stick", "slip")  #: of friction, as VTU files number them
+STATES = ("open", "stick", "slip", SLIDING)  #: of friction, as VTU files number them
+#: of several sides at a node, the last of these states is written
+_BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
 
 def write_vtu(fields: Fields, path: Path) -> list[Path]:
@@ -93,7 +96,7 @@ def _in_contact(fields: Fields, forces: NDArray[np.float64]) -> NDArray[np.bool_
 def _along_sides(fields: Fields) -> dict[str, Vector]:
     """Put pressures and gaps at the nodes (N,); of several, the tightest.
 
-    With friction the shear, too, and 0, 1, 2 where a node is open, sticks or slips.
+    With friction the shear, too, and the place of a node's state in `STATES`.
     """
     if not fields.contacts:
         return {}
@@ -104,12 +107,14 @@ def _along_sides(fields: Fields) -> dict[str, Vector]:
     rough = [side for side in fields.contacts if side.friction is not None]
     if not rough:
         return {"pressure": pressure, "gap": gap}
-    shear, state = np.zeros(len(fields.points)), np.zeros(len(fields.points))
+    shear = np.zeros(len(fields.points))
+    weight = np.zeros(len(fields.points), dtype=np.int64)
     for side in rough:
         assert side.shear is not None
         shear[side.nodes] += side.shear
-        codes = [STATES.index(str(told)) for told in np.asarray(side.friction)]
-        np.maximum.at(state, side.nodes, codes)
+        weights = [_BY_WEIGHT.index(str(told)) for told in np.asarray(side.friction)]
+        np.maximum.at(weight, side.nodes, weights)
+    state = np.array([float(STATES.index(told)) for told in _BY_WEIGHT])[weight]
     return {"pressure": pressure, "gap": gap, "shear": shear, "friction": state}
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from harness import Fields, InputError, Vector
+from harness.plugin import SLIDING
 from reports.document.fields import (
     ColourField,
     ColourScale,
@@ -34,7 +35,13 @@ _ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the 
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
 #: arrows of nodes by what friction does; of pairs without it they are dark
-FRICTION = {"stick": ("#0b5fa5", "blue"), "slip": ("#b3261e", "red")}
+FRICTION = {
+    "stick": ("#0b5fa5", "blue"),
+    "slip": ("#b3261e", "red"),
+    SLIDING: ("#e08a00", "orange"),
+}
+_TOUCHING = ("", "stick", "slip")  #: states of nodes that press
+_BAND = 2.2  #: points, of the line along nodes that slide without contact
 _WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
 _TALLEST = 7.5  #: inches, of the panel of tall bodies
 _FLAT = 0.34  #: height over width of the enlargement
@@ -43,7 +50,7 @@ _PLAIN = ColourScale(colours="Greys", low=0, high=1)
 #: each other
 _NUMBERED = {9.5: 16, 6.5: 100}
 _TORN = Look(colour="white", width=0.9)  #: borders of subdomains
-_APART = "#6b7480"  #: arrows of nodes with shear but without contact, by Tresca's law
+_OPEN = "#6b7480"  #: arrows of open nodes that take a part of their neighbours' forces
 _OUTLINE = Look(colour=INK, width=0.7)
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
@@ -57,17 +64,19 @@ def clipped_at(fields: Fields) -> tuple[float, float] | None:
 
 
 class _Loaded(NamedTuple):
-    """The slave nodes of one contact that carry load."""
+    """The slave nodes of one contact that carry load, or slide without contact."""
 
     name: str  #: of the pair; empty where the fields tell of no pairs
     nodes: NDArray[np.int64]  #: (k,)
     forces: Points  #: on them, N/m
-    friction: NDArray[np.str_]  #: (k,) "stick", "slip" or "open"; "" without friction
+    friction: NDArray[np.str_]  #: (k,) of `ContactSide`; "" without friction
+    #: (j, 2) neighbours along the side; the first slides without contact
+    sliding: NDArray[np.int64]
 
     @property
     def closed(self) -> NDArray[np.bool_]:
-        """(k,) whether a node touches; of Tresca's law, open nodes carry shear."""
-        touching = np.isin(self.friction, ["", *FRICTION])
+        """(k,) whether a node presses; others carry shear by Tresca's law alone."""
+        touching = np.isin(self.friction, _TOUCHING)
         return touching if touching.any() else ~touching
 
 
@@ -127,6 +136,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
             letter, _window(points[contact.nodes[contact.closed]], span), corners
         )
     ]
+    bands = [mark for contact in loaded for mark in _bands(contact, points)]
     there = moved(fields)  # enlarged by more, bodies in contact would overlap
     near = (
         *_bodies(fields, there, colours),
@@ -135,13 +145,14 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     truly = "" if scale == SCALE else f"displacement × {SCALE:g}"
     overview = FieldPanel(
         low=_pair(corners[0]), high=_pair(corners[1]),
-        marks=(*bodies, *_subdomains(fields, points), *before, *after, *frames),
+        marks=(*bodies, *_subdomains(fields, points), *before, *after, *bands, *frames),
         title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {scale:g}; "
         "dashed: undeformed",
         **_axes(span),
     )  # fmt: skip
     windows = [
-        _enlarged(near, f"{letter} {_listed(contact.name, truly)}", contact,
+        _enlarged((*near, *_bands(contact, there)),
+                  f"{letter} {_listed(contact.name, truly)}", contact,
                   there[contact.nodes], span)
         for letter, contact in zip(letters, loaded, strict=True)
     ]  # fmt: skip
@@ -303,10 +314,31 @@ def _loaded(fields: Fields) -> list[_Loaded]:
     found = []
     for name, nodes, forces, friction in told:
         states = np.full(len(nodes), "") if friction is None else friction
-        size = np.hypot(*forces.T)
+        size, apart = np.hypot(*forces.T), states == SLIDING
         if (active := size > _ACTIVE * size.max(initial=0.0)).any():
-            found.append(_Loaded(name, nodes[active], forces[active], states[active]))
+            active |= apart
+            found.append(
+                _Loaded(name, nodes[active], forces[active], states[active],
+                        _neighbours(np.asarray(nodes), apart))
+            )  # fmt: skip
     return found
+
+
+def _neighbours(
+    nodes: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Pair chosen nodes of a side with the one before and the one after (j, 2)."""
+    pairs = np.column_stack([nodes[:-1], nodes[1:]])
+    return np.vstack([pairs[chosen[:-1]], pairs[chosen[1:]][:, ::-1]])
+
+
+def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
+    """Colour a side where it slides without contact: arrows of shear are short."""
+    if not len(contact.sliding):
+        return []
+    at, beside = points[contact.sliding[:, 0]], points[contact.sliding[:, 1]]
+    ends = np.stack([at, (at + beside) / 2], axis=1)
+    return [Strokes(ends=ends, colour=FRICTION[SLIDING][0], width=_BAND)]
 
 
 def _window(places: Points, span: float) -> tuple[Vector, Vector]:
@@ -326,25 +358,24 @@ def _enlarged(
     shown = closed | ((tips >= low) & (tips <= high)).all(axis=1)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
+    colours = FRICTION | {"open": (_OPEN, "grey"), "": (_ARROW, "dark")}
     thick = 0.0032 if closed.sum() < 25 else 0.002
     arrows = [
         Vectors(
             feet=(tips - drawn)[of], vectors=drawn[of],
-            width=thick if state in FRICTION or not state else 0.4 * thick,
-            cased=state in FRICTION or not state,
-            colour=FRICTION[state][0] if state in FRICTION
-            else _APART if state else _ARROW,
+            width=thick if state in _TOUCHING else 0.4 * thick,
+            cased=state in _TOUCHING,
+            colour=colours[state][0],
         )
-        for state in sorted(set(contact.friction), key=lambda s: (s in FRICTION, s))
+        for state in sorted(set(contact.friction), key=lambda s: (s in _TOUCHING, s))
         if (of := shown & (contact.friction == state)).any()
     ]  # fmt: skip
     counts = [
-        f"{state}: {name} ({int((contact.friction == state).sum())})"
-        for state, (_, name) in FRICTION.items()
+        f"{state}: {name} ({count})"
+        for state, (_, name) in colours.items()
+        if (count := int((contact.friction == state).sum())) or state in _TOUCHING
+        if state
     ]
-    counts += [f"shear without contact: grey ({int((~closed).sum())})"] * bool(
-        (~closed).any()
-    )
     key = f"\n{', '.join(counts)}" if contact.friction.any() else ""
     factor, prefix = prefixed(largest)
     return FieldPanel(

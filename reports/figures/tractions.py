@@ -28,7 +28,7 @@ _NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)
 #: of nodes by what friction does; of pairs without it all are as open ones
 LOOKS = {"open": _NODE} | {
     state: replace(_NODE, colour=colour, marker=marker)
-    for (state, (colour, _)), marker in zip(FRICTION.items(), "so", strict=True)
+    for (state, (colour, _)), marker in zip(FRICTION.items(), "so^", strict=True)
 }
 
 

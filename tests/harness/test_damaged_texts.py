@@ -391,6 +391,9 @@ ENTRIES = (
         "memory_limit": 4096, "options": None, "fresh": False, "dask": None,
         "plugins": (), "progress": False, "registries": None,
     }),
+    (mb.solve, ["obstacle/dim=1/n=4/primal", "clarabel"], {
+        "tol": 1e-6, "options": None, "plugins": (), "ranks": 1, "max_iter": 50,
+    }),
     (mb.solvers, [], {"plugins": (), "registries": None}),
     (mb.suites, [], {"registries": None}),
     (mb.validate, ["nowhere"], {

@@ -426,6 +426,57 @@ def test_folders_are_merged_from_the_command_line(cli, stored):
     assert "nowhere: no such folder; expected a result folder of `run`" in err
 
 
+def contents(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("b", "is one of the folders to merge"),
+        ("./a/", "is one of the folders to merge"),
+        ("a/../b", "is one of the folders to merge"),
+        ("link", "is one of the folders to merge"),
+        ("a/journal", "lies inside of"),
+        ("b/vectors/new", "lies inside of"),
+        ("link/journal", "lies inside of"),
+        (".", "lies inside of"),
+    ],
+)
+def test_a_merge_into_one_of_its_sources_is_refused_in_one_line(
+    cli, stored, tmp_path, out, said
+):
+    a, b = stored
+    (tmp_path / "link").symlink_to(a)
+    before = contents(a), contents(b)
+
+    code, printed, err = cli("merge", "a", "b", "--out", out)
+
+    assert (code, printed) == (2, "")
+    assert len(err.splitlines()) == 1
+    assert said in err
+    assert (contents(a), contents(b)) == before
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b", "link"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("merge", "a", "b"), ("run", "toy.toml"), ("paper",), ("run", "demo", "--fresh")],
+)
+def test_a_value_of_two_dashes_is_refused_in_one_line(cli, stored, tmp_path, command):
+    there = sorted(tmp_path.iterdir())
+
+    code, printed, err = cli(*command, "--out=--")
+
+    assert (code, printed) == (2, "")
+    assert err == "mortarbench: --out=--: -- is no value; expected --out=VALUE\n"
+    assert sorted(tmp_path.iterdir()) == there
+
+
 def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
     campaign, measure, tmp_path, monkeypatch
 ):

@@ -15,6 +15,7 @@ import pytest
 
 from harness import InputError
 from harness.errors import FaultError
+from harness.files import durable
 from harness.files.durable import (
     full_disk_told,
     keep_private,
@@ -386,3 +387,32 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
 
     assert e.value.code == 143
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat", ".parquet", ".qps"])
+@pytest.mark.parametrize("before", [None, b"of an earlier export"])
+def test_an_export_that_is_asked_to_end_while_it_writes_leaves_no_part(
+    monkeypatch, tmp_path, suffix, before
+):
+    """All bytes are written by then, under another name than that of the file."""
+    path, sync, part = tmp_path / f"qp{suffix}", durable._sync, []
+    if before is not None:
+        path.write_bytes(before)
+
+    def end(file):
+        sync(file)
+        part.extend(p.stat().st_size for p in tmp_path.iterdir() if p != path)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(durable, "_sync", end)
+    with pytest.raises(SystemExit) as e:
+        main(Registries(), ["export", "obstacle/dim=1/n=4/primal", str(path)])
+
+    assert e.value.code == 143
+    (size,) = part
+    assert size > 0
+    if before is None:
+        assert not list(tmp_path.iterdir())
+    else:
+        assert list(tmp_path.iterdir()) == [path]
+        assert path.read_bytes() == before

@@ -4,7 +4,9 @@ import os
 import shutil
 import subprocess
 from contextlib import suppress
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mortarbench as mb
@@ -22,10 +24,13 @@ pytestmark = pytest.mark.together  # one result folder for all of them
 SUITE = """
 name = "s"
 repeats = 1
-solvers = [{ name = "smalbe", options = { history = true } }, "clarabel"]
+solvers = [{{ name = "smalbe", options = {{ history = true }} }}, "clarabel"]
 [[problems]]
 family = "contact-patch"
 forms = ["dual"]
+[[problems]]
+family = "file"
+params = {{ path = "{}" }}
 """
 SPARSE = 3 * 2**30  #: bytes that a file declares, of which none is on the disk
 
@@ -35,20 +40,22 @@ def whole(tmp_path_factory, svg_only):
     """A folder that has every kind of file, and lacks one measurement of its suite."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     suite = folder.with_name("s.toml")
-    suite.write_text(SUITE)
+    np.savez(folder.with_name("qp.npz"), P=np.eye(2), q=-np.ones(2), lb=np.zeros(2))
+    suite.write_text(SUITE.format(folder.with_name("qp.npz")))
     results = mb.run(suite, out=folder)
     fault = Fault(
         time="", run_id="x", case="c", solver="s", what="w", tried_again=False
     )
     with Lines(folder / FAULTS, print) as lines:
         lines.append(fault.to_json())
-    (record,) = (r for r in results.records if r.solver == "smalbe")
+    mine = [r for r in results.records if r.solver == "smalbe"]
+    (record,) = (r for r in mine if r.family == "contact-patch")
     keep_environment(folder, record.environment, {"machine": {}})
     with svg_only():
         mb.validate(folder, budget=1)
         mb.report(folder)
     (journal,) = (folder / "journal").iterdir()
-    journal.write_text(record.to_json() + "\n")
+    journal.write_text("".join(f"{r.to_json()}\n" for r in mine))
     return folder
 
 
@@ -113,16 +120,17 @@ KINDS = (sparse, grown, lesser, pipe, a_folder, dangling, foreign, endless, empt
 
 
 @pytest.fixture
-def read_by_every_command(tmp_path, capsys, monkeypatch, only_svg):
+def read_by_every_command(whole, tmp_path, capsys, monkeypatch, only_svg):
     """Run every command that reads a folder, within bounds; none may raise."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     suite = tmp_path / "s.toml"
-    suite.write_text(SUITE)
+    shutil.copy(whole.with_name("s.toml"), suite)
 
-    def read(folder, run_id):
+    def read(folder, run_ids):
         for arguments in (
-            ("report", folder), ("report", folder, folder), ("replay", folder, run_id),
+            ("report", folder), ("report", folder, folder),
+            *(("replay", folder, run_id) for run_id in run_ids),
             ("merge", folder, "--out", tmp_path / "merged"),
             ("validate", folder, "--budget", "0"), ("run", suite, "--out", folder),
         ):  # fmt: skip
@@ -145,10 +153,10 @@ def tried(whole, tmp_path, name, kind, read):
     shutil.copytree(whole, folder)
     outside.mkdir()
     (outside / "precious").write_text("precious")
-    (record,) = read_journal(folder)
+    run_ids = [record.run_id for record in read_journal(folder)]
     kind(folder / name, outside)
 
-    read(folder, record.run_id)
+    read(folder, run_ids)
 
     assert [path.name for path in outside.iterdir()] == ["precious"]
     assert (outside / "precious").read_text() == "precious"
@@ -161,6 +169,21 @@ def test_faults_of_any_kind_are_read_or_refused_by_every_command(
     tried(whole, tmp_path, FAULTS, kind, read_by_every_command)
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_copies_of_files_are_read_or_refused_where_the_original_is_missing(
+    whole, tmp_path, kind, read_by_every_command
+):
+    original = whole.with_name("qp.npz")
+    original.rename(tmp_path / "away.npz")
+    names = [name for name in kinds_of_files(whole) if name.startswith("files/")]
+    try:
+        assert len(names) == 2
+        for name in names:
+            tried(whole, tmp_path / Path(name).stem, name, kind, read_by_every_command)
+    finally:
+        (tmp_path / "away.npz").rename(original)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
@@ -169,7 +192,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
     names = kinds_of_files(whole)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
         "journal", "vectors", "cases", "references", "report", "environments",
-        "environment", "suite", "faults", "validation", "discretisation", "",
+        "environment", "suite", "faults", "validation", "discretisation", "", "files",
     }  # fmt: skip
     for i, name in enumerate(names):
         tried(whole, tmp_path / str(i), name, kind, read_by_every_command)

@@ -268,7 +268,9 @@ def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
     assert "--plugin empty.py" in err
 
 
-def test_a_case_whose_file_has_changed_is_refused(cli, manufactured, tmp_path):
+def test_a_case_whose_file_has_changed_is_that_of_the_copy_or_refused(
+    cli, manufactured, tmp_path
+):
     qp, _ = manufactured("box")
     save_qp(tmp_path / "a.npz", qp, {})
     (tmp_path / "a.toml").write_text(
@@ -283,6 +285,11 @@ def test_a_case_whose_file_has_changed_is_refused(cli, manufactured, tmp_path):
     assert (code, "Reproduced" in out) == (0, True)
 
     save_qp(tmp_path / "a.npz", replace(qp, q=2 * qp.q), {})
+    code, out, _ = cli("replay", "done", record.run_id, registries=ours)
+    assert (code, "Reproduced" in out) == (0, True)
+
+    (copy,) = (tmp_path / "done" / "files").glob("*.npz")
+    copy.unlink()
     code, _, err = cli("replay", "done", record.run_id, registries=ours)
     assert (code, err.count("\n")) == (2, 1)
     assert record.run_id in err

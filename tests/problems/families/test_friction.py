@@ -83,6 +83,11 @@ def test_shear_that_tresca_grants_without_contact_is_counted_apart():
     assert found["shear_without_contact"] == pytest.approx(share)
     assert 0 < share < 1
 
+    (side,) = case.fields(s).contacts
+    drawn = [name.replace("_", " ") for name in states]
+    counts = [(side.friction == name).sum() for name in drawn]
+    assert counts == [found[name] for name in states]
+
 
 def test_coulomb_grants_no_shear_without_contact():
     _, _, found = solved("beam-ring/steps=1/friction=coulomb/mu=0.3/dual")

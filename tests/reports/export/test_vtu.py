@@ -201,6 +201,24 @@ def test_of_friction_grid_and_table_tell_shear_and_what_sticks(tmp_path):
     assert "friction" not in meshio.read(tmp_path / "b.vtu").point_data
 
 
+def test_sliding_without_contact_is_a_state_of_its_own_that_contact_overrules(tmp_path):
+    def rough(*states):
+        return replace(SIDE, shear=np.ones(3), friction=np.array(states))
+
+    apart = "sliding without contact"
+    sides = rough(apart, apart, apart), rough("open", "stick", "slip")
+    write_vtu(replace(FIELDS, contacts=sides[:1]), tmp_path / "a.vtu")
+    write_vtu(replace(FIELDS, contacts=sides), tmp_path / "b.vtu")
+    one, both = (meshio.read(tmp_path / f"{n}.vtu").point_data for n in "ab")
+    table = pd.read_csv(tmp_path / "a-disc-on-a-b-2.csv")
+
+    assert one["friction"][SIDE.nodes].tolist() == [3, 3, 3]
+    assert one["in_contact"].sum() == 0
+    assert table.friction.tolist() == [apart] * 3
+    assert both["friction"][SIDE.nodes].tolist() == [3, 1, 2]
+    assert both["in_contact"][SIDE.nodes].tolist() == [0, 1, 1]
+
+
 def test_friction_on_open_nodes_is_no_contact(tmp_path):
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8))
@@ -211,10 +229,12 @@ def test_friction_on_open_nodes_is_no_contact(tmp_path):
     found = case.quantities(s)
     pressed = data["in_contact"] == 1
 
-    assert pressed.sum() == found["active"] == (data["friction"] > 0).sum()
+    touching = np.isin(data["friction"], [1, 2])
+    assert pressed.sum() == found["active"] == touching.sum()
+    assert (data["friction"] == 3).sum() == found["sliding_without_contact"] > 0
     assert np.linalg.norm(data["contact_force"], axis=1)[~pressed].max() > 1e4
     (side,) = case.fields(s).contacts
-    half = side.length[side.friction != "open"].sum() / 2
+    half = side.length[np.isin(side.friction, ["stick", "slip"])].sum() / 2
     assert found["contacts"]["ring on beam"]["half_width"] == half
 
 

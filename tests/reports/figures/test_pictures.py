@@ -17,11 +17,13 @@ from reports.document.fields import (
     FieldPanel,
     Label,
     Polygons,
+    Strokes,
     Vectors,
 )
 from reports.document.figure import Axis, Figure, Panel, Row, Series
 from reports.document.layout import Page, Picture, Section
 from reports.figures.deformed import (
+    FRICTION,
     automatic_scale,
     deformed_figure,
     edges,
@@ -208,11 +210,18 @@ def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
     assert stick.colour != slip.colour
 
 
-def test_open_nodes_with_tresca_s_shear_neither_widen_the_window_nor_hide_contact(
-    bodies,
+@pytest.mark.parametrize(
+    ("state", "key"),
+    [
+        ("sliding without contact", "sliding without contact: orange (2)"),
+        ("open", "open: grey (2)"),  # their neighbours' forces; results of old say so
+    ],
+)
+def test_nodes_with_shear_alone_neither_widen_the_window_nor_hide_contact(
+    bodies, state, key
 ):
     pair = side("up on low", [4, 5, 0, 1], [[1, -3], [1, -2], [1, 0], [1, 0]])
-    states = np.array(["slip", "stick", "open", "open"])
+    states = np.array(["slip", "stick", state, state])
     rough = replace(pair, shear=pair.gap, friction=states)
     closed = replace(
         pair, nodes=pair.nodes[:2], force=pair.force[:2], gap=pair.gap[:2],
@@ -224,11 +233,30 @@ def test_open_nodes_with_tresca_s_shear_neither_widen_the_window_nor_hide_contac
         for side in (rough, closed)
     )
     assert (one.low, one.high) == (other.low, other.high)
-    assert one.title.endswith("slip: red (1), shear without contact: grey (2)")
+    assert one.title.endswith(f"slip: red (1), {key}")
     wide = [m.width for m in one.marks if isinstance(m, Vectors) and m.cased]
     thin = [m.width for m in one.marks if isinstance(m, Vectors) and not m.cased]
     assert len(wide) == 2
     assert all(width < min(wide) for width in thin)
+
+
+def test_a_side_that_slides_without_contact_is_coloured_to_the_middle_of_its_nodes(
+    bodies,
+):
+    """Two of four nodes, in the overview and in the enlargement."""
+    pair = side("up on low", [4, 5, 0, 1], [[0, -3], [0, -2], [1, 0], [0, 0]])
+    states = np.array(["slip", "stick"] + 2 * ["sliding without contact"])
+    rough = replace(pair, shear=pair.gap, friction=states)
+    whole, zoom = deformed_figure(replace(bodies, contacts=(rough,)), 1).panels
+    there = bodies.points + bodies.displacement
+    a, b, c = there[[5, 0, 1]]
+    expected = [(b, (b + c) / 2), (b, (a + b) / 2), (c, (b + c) / 2)]
+
+    for panel in (whole, zoom):
+        (band,) = [m for m in panel.marks if isinstance(m, Strokes) and m.width > 1]
+        assert band.colour == FRICTION["sliding without contact"][0]
+        np.testing.assert_allclose(band.ends, expected)
+    assert "orange (2)" in zoom.title
 
 
 @pytest.mark.parametrize("factor", [1e-7, 3e-4, 1e-2, 1.0])

@@ -1,0 +1,372 @@
+"""Copies of the files that cases are read from: ``FOLDER/files/DIGEST.SUFFIX``.
+
+A result folder is complete without the machine where it was measured: files of QPs
+travel with it, each content once, as far as their sizes permit. ``files/copies.json``
+lists the paths by which cases name them, with those that were too large. Its texts are
+compared with names of cases; none of them is ever opened as a path.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from harness.checked import has_control
+from harness.digest import hex_digest, pieces, running_digest
+from harness.errors import InputError, shortened, some
+from harness.files.datafile import MIB, opened
+from harness.files.durable import replace_file, replacing
+from harness.files.reading import read_json
+from harness.plugin import SourceFile
+
+FOLDER = "files"
+LIST = "copies.json"
+MOST_FILE_MIB = 64  #: largest file that is copied: results stay small enough to send
+MOST_FOLDER_MIB = 256  #: all copies of a result folder
+
+_DIGITS = 12  #: of the SHA-256 of a file, as in the parameters of cases
+_COPY = re.compile(rf"([0-9a-f]{{{_DIGITS}}})((?:\.[a-z0-9]{{1,8}}){{1,2}})")
+
+
+def content_digest(*paths: Path) -> str:
+    """Digest the bytes of files, 12 hexadecimal digits of SHA-256.
+
+    Raises
+    ------
+    InputError
+        When one cannot be read, is no regular file, or is larger than
+        `harness.files.datafile` allows.
+
+    """
+
+    def parts() -> Iterator[bytes]:
+        for path in paths:
+            with opened(path, "a file that can be read") as file:
+                yield from pieces(file)
+
+    return hex_digest(parts(), _DIGITS)
+
+
+def is_copy(name: str) -> bool:
+    """Return whether a file in ``files/`` is named like one that we write."""
+    return name == LIST or _COPY.fullmatch(name) is not None
+
+
+class _Entry(NamedTuple):
+    """A file as the list describes it."""
+
+    path: str  #: as cases name it
+    sha256: str
+    size: int  #: bytes
+
+
+class Copies:
+    """Files of cases, beside the copies of a result folder.
+
+    The folder is looked at when a file is missing, not before.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / FOLDER
+
+    def locate(self, source: SourceFile) -> Path:
+        """Return the original if its content is that of the digest, else the copy.
+
+        Raises
+        ------
+        InputError
+            When there is neither, or the copy has another content.
+
+        """
+        here = _digest_if_there(Path(source.path))
+        if here == source.sha256:
+            return Path(source.path)
+        copy = self._copy_of(source)
+        if not os.path.lexists(copy):
+            raise self._missing(source.path, source.sha256, here)
+        check_copy(copy, source.sha256, f"put the file back at {source.path}")
+        return copy
+
+    def digest(self, path: str) -> str:
+        """Return the digest of a file; of one that is missing, that of its copy.
+
+        Raises
+        ------
+        InputError
+            When it is neither here nor in the list, or the list has several contents.
+
+        """
+        if os.path.lexists(path):
+            return content_digest(Path(path))
+        known = {e.sha256 for e in self._entries() if e.path == path}
+        if not known:
+            return content_digest(Path(path))  # which says that there is no such file
+        if len(known) > 1:
+            raise InputError(
+                f"{path} is not here, and {self._folder} has {len(known)} contents of "
+                f"that name (sha256 {some(sorted(known))}); put the right one at {path}"
+            )
+        return known.pop()
+
+    def paths(self) -> list[str]:
+        """List the paths by which cases name the files."""
+        return sorted({entry.path for entry in self._entries()})
+
+    def _entries(self) -> list[_Entry]:
+        return _entries(self._folder)
+
+    def _copy_of(self, source: SourceFile) -> Path:
+        name = f"{source.sha256}{source.suffix}"
+        if not _COPY.fullmatch(name):  # it could lead out of the folder
+            raise InputError(
+                f"{shortened(source.path)}: {shortened(source.sha256)!r} is no digest; "
+                f"expected {_DIGITS} hex digits"
+            )
+        return self._folder / name
+
+    def _missing(self, path: str, digest: str, here: str | None) -> InputError:
+        """Name a file that is neither here nor among the copies."""
+        sizes = {e.size for e in self._entries() if e.sha256 == digest}
+        why = f"has no copy in {self._folder}"
+        if sizes and (size := max(sizes)) > MOST_FILE_MIB * MIB:
+            why = f"was too large to travel with the results ({_mib(size)})"
+        other = f" (the file changed: it has {here})" if here is not None else ""
+        return InputError(
+            f"{Path(path).name} (sha256 {digest}) is not here{other} and {why}: put it "
+            f"at {path}"
+        )
+
+
+def check_copy(copy: Path, digest: str, remedy: str) -> None:
+    """Refuse a copy whose content is not that of its name.
+
+    Raises
+    ------
+    InputError
+        With the file, both digests, and the remedy.
+
+    """
+    with opened(copy, "the copy of a file") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MOST_FILE_MIB * MIB:
+            raise InputError(
+                f"{copy}: {_mib(size)}, where copies have {MOST_FILE_MIB} MiB at most; "
+                f"{remedy}"
+            )
+        found = hex_digest(pieces(file), _DIGITS)
+    if found != digest:
+        raise InputError(
+            f"{copy}: its content has the digest {found}, not {digest}: it was damaged "
+            f"or exchanged; {remedy}"
+        )
+
+
+def check_copies(folder: Path) -> None:
+    """Refuse a result folder with a copy whose content is not that of its name.
+
+    Raises
+    ------
+    InputError
+        With the first of them.
+
+    """
+    for copy, digest, _ in copies_in(folder):
+        check_copy(copy, digest, "restore it, or delete it")
+
+
+def keep_copies(
+    folder: Path, sources: Iterable[SourceFile], tell: Callable[[str], None]
+) -> None:
+    """Copy the files of cases into a result folder, each content once.
+
+    tell : is told, in a line each, of files that are too large to travel
+
+    Raises
+    ------
+    InputError
+        When a file has changed since its case was named, or cannot be read.
+
+    """
+    distinct = {(s.path, s.sha256): s for s in sources}.values()
+    if not distinct:
+        return
+    kept = _Kept(folder, tell)
+    for source in distinct:
+        kept.keep(Path(source.path), source.sha256, source.suffix, source.path)
+    kept.write_list()
+
+
+def merge_copies(
+    sources: Sequence[Path], out: Path, tell: Callable[[str], None]
+) -> None:
+    """Copy the files that result folders hold to another one, each content once."""
+    kept = _Kept(out, tell)
+    for source in sources:
+        paths: dict[str, str] = {}
+        for entry in _entries(source / FOLDER):
+            paths.setdefault(entry.sha256, entry.path)
+            kept.add(entry)
+        for copy, digest, suffix in copies_in(source):
+            kept.keep(copy, digest, suffix, paths.get(digest))
+    kept.write_list()
+
+
+def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
+    """List the copies of a result folder: path, digest, suffix."""
+    found = []
+    for name in _names(folder / FOLDER):
+        if match := _COPY.fullmatch(name):
+            found.append((folder / FOLDER / name, match[1], match[2]))
+    return found
+
+
+def remove_copies(folder: Path) -> None:
+    """Delete the copies of a result folder; what else lies beside them stays."""
+    for name in filter(is_copy, _names(folder / FOLDER)):
+        (folder / FOLDER / name).unlink(missing_ok=True)
+
+
+def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
+    """Refuse cases that are read from copies which are about to be deleted.
+
+    Raises
+    ------
+    InputError
+        With the first of them.
+
+    """
+    own = (folder / FOLDER).resolve()
+    for path in {s.path for s in sources}:
+        there = Path(path).resolve()
+        if there.parent == own and is_copy(there.name):
+            raise InputError(
+                f"{path} is a copy that --fresh deletes; put the file elsewhere, or "
+                "choose another --out"
+            )
+
+
+class _Kept:
+    """The copies of a folder, while files are added."""
+
+    def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
+        self._folder = folder / FOLDER
+        self._tell = tell
+        self._before = _entries(self._folder)
+        self._entries = dict.fromkeys(self._before)
+        self._size = sum(p.stat().st_size for p, *_ in copies_in(folder))
+
+    def add(self, entry: _Entry) -> None:
+        """List a file, whether or not there is a copy of it."""
+        self._entries[entry] = None
+
+    def keep(self, original: Path, digest: str, suffix: str, name: str | None) -> None:
+        """Copy one file, unless a sound copy is there or it is too large.
+
+        name : by which cases know it, to be listed; None where that is not known
+        """
+        copy = self._folder / f"{digest}{suffix}"
+        if os.path.lexists(copy) and _digest_if_there(copy) == digest:
+            if name is not None:
+                self.add(_Entry(name, digest, copy.stat().st_size))
+            return
+        with opened(original, "a file that can be read") as file:
+            size = os.fstat(file.fileno()).st_size
+            if name is not None:
+                self.add(_Entry(name, digest, size))
+            if not self._has_room(name or copy.name, size):
+                return
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with replacing(copy) as new:
+                content = running_digest(())
+                for piece in pieces(file):
+                    content.update(piece)
+                    new.write(piece)
+                if (found := content.hexdigest()[:_DIGITS]) != digest:
+                    raise InputError(
+                        f"{original}: its content has the digest {found}, not "
+                        f"{digest}; it changed while it was read; start again"
+                    )
+        self._size += size
+
+    def _has_room(self, name: str, size: int) -> bool:
+        if size > MOST_FILE_MIB * MIB:
+            self._tell(
+                f"{name} ({_mib(size)}) is larger than {MOST_FILE_MIB} MiB, and does "
+                "not travel with the results"
+            )
+            return False
+        if self._size + size > MOST_FOLDER_MIB * MIB:
+            self._tell(
+                f"{name} ({_mib(size)}) does not travel with the results: their copies "
+                f"of files would take more than {MOST_FOLDER_MIB} MiB"
+            )
+            return False
+        return True
+
+    def write_list(self) -> None:
+        """Write the list, where it has changed."""
+        if list(self._entries) == self._before:
+            return
+        data = {"files": [entry._asdict() for entry in self._entries]}
+        text = json.dumps(data, indent=1) + "\n"
+        replace_file(self._folder / LIST, text.encode())
+
+
+def _digest_if_there(path: Path) -> str | None:
+    """Digest a file; return None where it cannot be read."""
+    try:
+        return content_digest(path)
+    except InputError:
+        return None
+
+
+def _names(folder: Path) -> list[str]:
+    if not folder.is_dir():
+        return []
+    with os.scandir(folder) as entries:
+        return sorted(entry.name for entry in entries)
+
+
+def _entries(folder: Path) -> list[_Entry]:
+    """Read the list of a folder of copies; empty where there is none.
+
+    Raises
+    ------
+    InputError
+        When it is no list that a run writes.
+
+    """
+    path = folder / LIST
+    if not os.path.lexists(path):
+        return []
+    try:
+        data = read_json(path, "the list of copied files")
+        entries = [_Entry(**entry) for entry in data["files"]]
+    except (TypeError, KeyError):
+        entries = [_Entry("", "", -1)]
+    if not all(map(_is_sound, entries)):
+        raise InputError(
+            f"{path}: not the list of copied files that a run writes; restore it, or "
+            "delete it: copies are found without it by cases that were measured"
+        )
+    return entries
+
+
+def _is_sound(entry: _Entry) -> bool:
+    texts = isinstance(entry.path, str) and isinstance(entry.sha256, str)
+    return (
+        texts
+        and 0 < len(entry.path) <= 4096
+        and not has_control(entry.path)
+        and re.fullmatch(f"[0-9a-f]{{{_DIGITS}}}", entry.sha256) is not None
+        and type(entry.size) is int
+        and 0 <= entry.size < 2**63
+    )
+
+
+def _mib(size: int) -> str:
+    return f"{size / MIB:.3g} MiB"
