@@ -1,11 +1,31 @@
-"""Who forms the blocks of which kind."""
+"""Duals of torn bodies on ranks that are threads, and who forms which blocks."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import csr_array
 
-from problems.feti.distributed import AFTER_FACTOR, Forming, Halo, forming, meanwhile
+from harness import QP, InputError, Solution, Status, no_rows
+from harness.distributed import factor
+from problems.feti import distributed as over_ranks
+from problems.feti.distributed import (
+    AFTER_FACTOR,
+    Forming,
+    Halo,
+    balanced,
+    forming,
+    meanwhile,
+    owners,
+    partition,
+    shared,
+)
+from problems.feti.operators import DualOperator, dual_operator
+from problems.models.membranes import Membranes
+from tests.support.threads import on_threads
+from tests.support.torn_bodies import torn_pair
 
 
 def loads(work):
@@ -91,3 +111,224 @@ def test_what_several_neighbours_return_for_one_row_is_added_up():
         borrows=np.zeros(3, dtype=np.int64),
     )  # fmt: skip
     assert at.added(np.array([0.5, 0.25, 0.125])).tolist() == [101.5, 1000.25, 10.125]
+
+
+@pytest.fixture(autouse=True)
+def ranks_do_not_lock_one_another_out(monkeypatch):
+    """Until Python 3.12 a cached property is computed in one thread at a time."""
+    blocks = vars(DualOperator)["_blocks"]
+    monkeypatch.setattr(blocks, "lock", nullcontext(), raising=False)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        lambda: Membranes(2, 3).torn("redundant"),
+        lambda: torn_pair("chain", most=4)[2],
+        lambda: torn_pair("orthonormal", most=4)[2],
+    ],
+    ids=["membranes", "chain", "orthonormal"],
+)
+def torn(request):
+    return request.param()
+
+
+def dual_of(torn):
+    """A QP with this F, whose numbers name its rows."""
+    F = dual_operator(torn.B, torn.domains, torn.equalities)
+    m = torn.B.shape[0]
+    G = csr_array((torn.B @ torn.domains.kernel).T)
+    lower = np.where(np.arange(m) < torn.equalities, -np.inf, 0.0)
+    return F.build(), QP(
+        P=F, q=np.arange(m, dtype=float), A=G, b=np.arange(G.shape[0], dtype=float),
+        G=no_rows(m), h=np.zeros(0), lb=lower, ub=1.0 + np.arange(m),
+    )  # fmt: skip
+
+
+PRECONDITIONERS = [
+    (kind, scaling)
+    for kind in ("lumped", "dirichlet")
+    for scaling in ("multiplicity", "stiffness")
+]
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
+    F, qp = dual_of(torn)
+    x = np.random.default_rng(4).standard_normal(qp.q.size)
+    known = {"F": F(x), "diagonal": F.diagonal()}
+    known |= {p: F.preconditioner(*p)(x) for p in PRECONDITIONERS}
+    B = torn.B.toarray()
+    known["onto rows"] = B @ np.linalg.lstsq(B, x, rcond=None)[0]
+
+    def work(ranks):
+        share = shared(qp, F, ranks)
+        part, P = share.qp, share.qp.P
+        own = P.halo.rows[P.halo.own]
+        found = {"F": P(x[own]), "diagonal": P.diagonal()}
+        assert (np.asarray(P @ x[own]) == found["F"]).all()
+        found |= {p: P.preconditioner(*p)(x[own]) for p in PRECONDITIONERS}
+        found["onto rows"] = P.onto_rows()(x[own])
+        for name, value in known.items():
+            got = np.asarray(found[name])
+            assert_allclose(got, value[own], atol=1e-9 * np.abs(value).max())
+        assert P.shape == (own.size, own.size)
+        for got, whole in ((part.q, qp.q), (part.lb, qp.lb), (part.ub, qp.ub)):
+            assert (np.asarray(got) == whole[own]).all()
+        assert_allclose(part.A @ part.q, qp.A @ qp.q, atol=1e-9)
+        assert (part.b == qp.b).all()
+        solution = Solution(
+            status=Status.SOLVED, x=x[own], y=part.b, z=np.zeros(0), z_box=2 * x[own]
+        )
+        return own, P.halo, share.whole(solution)
+
+    found = on_threads(size, work)
+    rows = np.concatenate([own for own, _, _ in found])
+    assert (np.sort(rows) == np.arange(qp.q.size)).all()
+    assert all(whole is None for _, _, whole in found[1:])
+    whole = found[0][2]
+    assert (whole.x == x).all()
+    assert (whole.z_box == 2 * x).all()
+    touching = np.bincount(np.concatenate([at.rows for _, at, _ in found]))
+    for _, at, _ in found:
+        assert (at.is_shared == (touching[at.rows] > 1)).all()
+        assert (np.diff(at.rows) > 0).all()
+        assert at.borrowed.size == at.rows.size - at.own.size
+
+
+@pytest.mark.parametrize("fill", [0, 10**6])
+def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkeypatch):
+    """Either way the sum of the ranks' parts of B W Bᵀ is inverted."""
+    monkeypatch.setattr(factor, "FILL", fill)
+    F, qp = dual_of(torn)
+    x = np.random.default_rng(6).standard_normal(qp.q.size)
+    known = F.preconditioner("dirichlet", "stiffness")(x)
+    ways = []
+    for name in ("_rank_by_rank", "_alike"):
+        way = getattr(over_ranks, name)
+
+        def noted(*args, name=name, way=way):
+            ways.append(name)
+            return way(*args)
+
+        monkeypatch.setattr(over_ranks, name, noted)
+
+    def work(ranks):
+        P = shared(qp, F, ranks).qp.P
+        own = P.halo.rows[P.halo.own]
+        found = np.asarray(P.preconditioner("dirichlet", "stiffness")(x[own]))
+        assert_allclose(found, known[own], atol=1e-7 * np.abs(known).max())
+
+    on_threads(3, work)
+    assert ("_rank_by_rank" in ways) == (fill > 0)
+    if not fill:
+        assert "_alike" in ways
+
+
+def test_owners_of_rows_are_those_that_touch_them_in_turn():
+    reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
+    rows = np.array([4, 5, 6, 7, 9])
+    assert owners(rows, reach).tolist() == [0, 1, 0, 1, 2]
+
+
+def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn):
+    B, domains = torn.B.toarray(), torn.domains
+    parts = partition(torn.B, domains, 3)
+    for row in range(len(B)):
+        subdomains = [
+            s for s in range(domains.kind.size)
+            if B[row, domains.start[s] : domains.start[s + 1]].any()
+        ]  # fmt: skip
+        ranks = sorted(set(parts.rank[subdomains].tolist()))
+        touching = parts.reach[[row]]
+        assert touching.indices.tolist() == ranks
+        assert (touching.data == 1).all()
+        assert parts.owner[row] == ranks[row % len(ranks)]
+
+
+def chain(size):
+    """A graph of subdomains in a row."""
+    beside = np.eye(size, k=1, dtype=np.int32)
+    return csr_array(beside + beside.T + 5 * np.eye(size, dtype=np.int32))
+
+
+def test_subdomains_in_a_row_are_cut_into_equal_halves():
+    ones = np.ones(12, dtype=np.int64)
+    rank = balanced(chain(12), 7 * ones, ones, 2)
+    assert (np.diff(rank) != 0).sum() == 1
+    assert np.bincount(rank).tolist() == [6, 6]
+
+
+def test_one_rank_has_all_and_each_of_many_has_one():
+    ones = np.ones(5, dtype=np.int64)
+    assert balanced(chain(5), ones, ones, 1).tolist() == [0] * 5
+    assert sorted(balanced(chain(5), ones, ones, 5).tolist()) == list(range(5))
+    with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
+        balanced(chain(5), ones, ones, 6)
+
+
+#: of eight subdomains of equal work, of which the first four are four times as large
+ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: is even: sizes of 16 and 4
+ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work of 3 and 5, sizes of 12 and 8
+BETTER = [0, 0, 0, 1, 0, 1, 1, 1]  #: sizes of 13 and 7
+BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("answers", "taken", "asked"),
+    [
+        ([BOTH], BOTH, 1),
+        ([ONLY_WORK, ONLY_SIZE, BETTER, ONLY_WORK, BOTH], BOTH, 5),
+        ([ONLY_WORK, ONLY_SIZE, BETTER], BETTER, 37),
+    ],
+)
+def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
+    answers, taken, asked, monkeypatch
+):
+    """METIS is asked again while sizes are uneven, with 12 seeds and three weights."""
+    asks = []
+
+    def answer(graph, weight, ranks, seed=None):
+        assert not graph.diagonal().any()
+        assert weight.dtype.kind == "i"
+        assert weight.min() == 1
+        asks.append((seed, weight.tolist()))
+        return np.array(answers[min(len(asks), len(answers)) - 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    work, size = np.full(8, 10), np.repeat([4, 1], 4)
+    assert balanced(chain(8), work, size, 2).tolist() == taken
+    assert len(asks) == asked
+    assert asks[0] == (None, [1] * 8)
+    if asked == 37:
+        assert len({seed for seed, _ in asks[1:]}) == 12
+        # sizes relative to their mean of 2.5 count ¼, ½ and 1 of the work
+        heavy = {weight[0] for _, weight in asks[1:]}
+        assert heavy == {int(1.4 / 1.1), int(1.8 / 1.2), int(2.6 / 1.4)}
+
+
+def test_ranks_that_metis_leaves_idle_get_a_subdomain_of_the_largest(monkeypatch):
+    import pymetis
+
+    monkeypatch.setattr(
+        pymetis, "part_graph", lambda *args, **how: (0, [0, 0, 2, 2, 2, 0, 2])
+    )
+    ones = np.ones(7, dtype=np.int64)
+    found = balanced(chain(7), ones, 10**6 * ones, 4)
+    assert found.tolist() == [0, 0, 2, 2, 2, 3, 1]
+
+
+def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
+    F, qp = dual_of(torn)
+
+    def work(ranks):
+        local = shared(qp, F, ranks).qp.P.local
+        groups = local.packed.groups
+        return dict(local.condense(groups)), groups
+
+    for blocks, groups in on_threads(3, work):
+        assert sorted(blocks) == list(range(len(groups)))
+        for i, group in enumerate(groups):
+            whole = group.kind.condensed(group.touched)
+            for got, known in zip(blocks[i], whole, strict=True):
+                assert_allclose(got, known, atol=1e-9 * np.abs(known).max())
