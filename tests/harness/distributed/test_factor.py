@@ -62,6 +62,36 @@ def test_the_factor_of_a_difference_has_the_eigenvalues_that_are_known(share):
     assert (np.diag(L) > 0).all()
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_eigenvalues_below_their_least_value_are_raised_to_it(seed):
+    """M with known λ relative to L₀L₀ᵀ, of which rounding has made some negative."""
+    rng, share = np.random.default_rng(seed), 1e-3
+    L_0 = np.tril(rng.standard_normal((5, 5))) + 3 * np.eye(5)
+    Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    values = np.array([4.0, 1.0, 0.25, -0.03, -0.1])
+    raised = np.array([4.0, 1.0, 0.25, share, share])
+
+    def with_values(v):
+        return L_0 @ (Q * v) @ Q.T @ L_0.T
+
+    L = factor_above(
+        np.asfortranarray(with_values(values)), share, np.asfortranarray(L_0)
+    )
+    assert (np.diag(L) > 0).all()
+    assert not np.triu(L, 1).any()
+    assert L @ L.T == pytest.approx(with_values(raised), abs=1e-13)
+
+
+@pytest.mark.parametrize("length", [0.1, 1.0, 10.0])
+def test_positive_pivots_below_their_least_value_are_raised_to_it(length):
+    """Diagonal matrices: λ of half the share is rounding, though Cholesky finds it."""
+    share = 1e-3
+    L_0 = length * np.eye(3)
+    M = np.diag([1.0, share / 2, 2 * share]) * length**2
+    L = factor_above(np.asfortranarray(M), share, np.asfortranarray(L_0))
+    assert L @ L.T == pytest.approx(np.diag([1.0, share, 2 * share]) * length**2)
+
+
 def test_where_nothing_cancels_the_factor_is_that_of_cholesky():
     L_0, M = parts(0.5)
     L = factor_above(np.asfortranarray(M), 0.5, np.asfortranarray(L_0))
@@ -74,8 +104,10 @@ def test_as_many_rows_are_kept_as_the_rank_that_fractions_tell(seed):
     G = rng.integers(-2, 3, size=(rng.integers(4, 9), 12))
     mixed = rng.integers(-1, 2, size=(5, len(G))) @ G
     G = rng.permutation(np.vstack([G, mixed, np.zeros((1, 12), dtype=int)]))
-    kept = independent_rows(csc_array((G @ G.T).astype(float)))
+    gram = csc_array((G @ G.T).astype(float))
+    kept = independent_rows(gram)
     assert kept.size == rank(G) == rank(G[kept])
+    assert independent_rows(1e-8 * gram).tolist() == kept.tolist()
     assert (np.diff(kept) > 0).all()
 
 
@@ -220,3 +252,34 @@ def test_rows_know_how_many_ranks_touch_them():
         ([2, 1, 3, 1], [2, 5], [0, 1], [3, 6, 2, 6]),
         ([1, 3, 1, 1], [2, 5], [1], [6, 2, 6, 6]),
     ]
+
+
+def test_the_least_pivot_is_one_of_the_sum_and_not_of_a_part():
+    """A diagonal: inner entries 100, a shared one of 4 on each of three ranks."""
+
+    def work(ranks):
+        at = touched_rows(np.array([0, 1 + ranks.rank]), ranks)
+        L = local_factor(csc_array(np.diag([4.0, 100.0])), at).completed()
+        return L.least_pivot, L.shifted(3.0, np.zeros((1, 1))).least_pivot
+
+    assert on_threads(3, work) == [pytest.approx((12**0.5, 48**0.5))] * 3
+
+
+def test_a_rank_without_rows_takes_part_in_a_solve():
+    """Of A = diag(4, 9) on rank 0, rank 1 has nothing."""
+
+    def work(ranks):
+        k = 0 if ranks.rank else 2
+        at = touched_rows(np.arange(k), ranks)
+        A = csc_array(np.diag([4.0, 9.0])[:k, :k])
+        L, t = local_factor(A, at).completed(), at.additive(np.array([2.0, 3.0])[:k])
+        found = L.forward(t), L.backward(L.forward(t)), L(t)
+        return [np.asarray(v).tolist() for v in found], L.norm(t)
+
+    norm = pytest.approx(2**0.5)
+    solved = pytest.approx([1 / 2, 1 / 3])
+    (first, of_first), (second, of_second) = on_threads(2, work)
+    assert first[0] == pytest.approx([1, 1])
+    assert first[1] == first[2] == solved
+    assert second == [[], [], []]
+    assert of_first == of_second == norm
