@@ -283,3 +283,18 @@ def test_a_rank_without_rows_takes_part_in_a_solve():
     assert first[1] == first[2] == solved
     assert second == [[], [], []]
     assert of_first == of_second == norm
+
+
+@pytest.mark.parametrize("changing", [False, True])
+def test_dependent_rows_are_refused_on_ranks_that_share_none_with_them(changing):
+    """Rank 1 has two equal rows, which rank 0 does not touch."""
+
+    def work(ranks):
+        p = ranks.rank
+        at = touched_rows(2 * p + np.arange(2), ranks)
+        A = csc_array(np.ones((2, 2)) if p else np.eye(2))
+        with pytest.raises(DependentRowsError, match="depend on each other"):
+            local_factor(A, at, np.full(2, changing)).completed()
+        return True
+
+    assert on_threads(2, work) == [True, True]

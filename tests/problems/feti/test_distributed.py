@@ -6,10 +6,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from harness import QP, InputError, Solution, Status, no_rows
 from harness.distributed import factor
+from harness.distributed.factor import touched_rows
 from problems.feti import distributed as over_ranks
 from problems.feti.distributed import (
     AFTER_FACTOR,
@@ -17,6 +18,7 @@ from problems.feti.distributed import (
     Halo,
     balanced,
     forming,
+    halo,
     meanwhile,
     owners,
     partition,
@@ -65,6 +67,24 @@ def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
 
     assert meanwhile(tasks, 1) == 1
     assert meanwhile(tasks, 0) == 0
+
+
+def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
+    tasks = {
+        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
+        "e": Forming(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
+        **{name: Forming(4, [1], factor=1, blocks=1) for name in "bcd"},
+    }
+    assert meanwhile(tasks, 1) == 3
+    less = {name: task for name, task in tasks.items() if name != "e"}
+    assert meanwhile(less, 1) == 1
+    smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
+    assert meanwhile(smaller, 1) == 2
+
+
+def test_the_largest_kinds_are_shared_out_first():
+    kinds = {"a": 4, "b": 4, "c": 8}
+    assert loads([kinds, kinds]).tolist() == [8, 8]
 
 
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
@@ -152,7 +172,7 @@ PRECONDITIONERS = [
 ]
 
 
-@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
 def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
     F, qp = dual_of(torn)
     x = np.random.default_rng(4).standard_normal(qp.q.size)
@@ -246,6 +266,25 @@ def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn)
         assert parts.owner[row] == ranks[row % len(ranks)]
 
 
+def test_subdomains_are_weighed_by_dense_blocks_and_joined_by_rows(torn, monkeypatch):
+    seen = {}
+
+    def noted(graph, work, size, ranks):
+        seen.update(graph=graph.toarray(), work=work, size=size)
+        return np.arange(size.size) % ranks
+
+    monkeypatch.setattr(over_ranks, "balanced", noted)
+    partition(torn.B, torn.domains, 2)
+    B, start, kind = torn.B.toarray() != 0, torn.domains.start, torn.domains.kind
+    touches = np.add.reduceat(B, start[:-1], axis=1, dtype=int) > 0
+    assert (seen["graph"] == touches.T.astype(int) @ touches).all()
+    assert (seen["size"] == np.diff(start)).all()
+    for s, k in enumerate(kind):
+        same = np.flatnonzero(kind == k)
+        block = np.any([B[:, start[t] : start[t + 1]].any(axis=0) for t in same], 0)
+        assert seen["work"][s] == block.sum() ** 2
+
+
 def chain(size):
     """A graph of subdomains in a row."""
     beside = np.eye(size, k=1, dtype=np.int32)
@@ -280,6 +319,8 @@ BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
         ([BOTH], BOTH, 1),
         ([ONLY_WORK, ONLY_SIZE, BETTER, ONLY_WORK, BOTH], BOTH, 5),
         ([ONLY_WORK, ONLY_SIZE, BETTER], BETTER, 37),
+        ([ONLY_WORK, BETTER, ONLY_SIZE], BETTER, 37),
+        ([ONLY_WORK, BETTER, ONLY_WORK], BETTER, 37),
     ],
 )
 def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
@@ -290,6 +331,7 @@ def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
 
     def answer(graph, weight, ranks, seed=None):
         assert not graph.diagonal().any()
+        assert (graph.data > 0).all()  # METIS takes no other weights
         assert weight.dtype.kind == "i"
         assert weight.min() == 1
         asks.append((seed, weight.tolist()))
@@ -302,9 +344,19 @@ def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
     assert asks[0] == (None, [1] * 8)
     if asked == 37:
         assert len({seed for seed, _ in asks[1:]}) == 12
-        # sizes relative to their mean of 2.5 count ¼, ½ and 1 of the work
-        heavy = {weight[0] for _, weight in asks[1:]}
-        assert heavy == {int(1.4 / 1.1), int(1.8 / 1.2), int(2.6 / 1.4)}
+
+
+@pytest.mark.parametrize("unit", [1, 10])
+def test_work_is_weighed_in_units_of_the_least(unit, monkeypatch):
+    weights = []
+
+    def answer(graph, weight, ranks, seed=None):
+        weights.append(weight.tolist())
+        return np.array([0, 0, 1, 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    balanced(chain(4), unit * np.array([3, 1, 2, 2]), np.ones(4, dtype=np.int64), 2)
+    assert weights == [[3, 1, 2, 2]]
 
 
 def test_ranks_that_metis_leaves_idle_get_a_subdomain_of_the_largest(monkeypatch):
@@ -332,3 +384,109 @@ def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
             whole = group.kind.condensed(group.touched)
             for got, known in zip(blocks[i], whole, strict=True):
                 assert_allclose(got, known, atol=1e-9 * np.abs(known).max())
+
+
+def halo_of(ranks, here):
+    """Rows of which `here` (ranks, m) tells who touches them, owned in turn."""
+    rows = np.flatnonzero(here[ranks.rank])
+    reach = csr_array(here[:, rows].T.astype(int))
+    return halo(ranks, rows, reach, owners(rows, reach))
+
+
+def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
+    """Relative to the rows: two ranks share 0 … 5, each has two more for itself."""
+    here = np.zeros((2, 10), dtype=bool)
+    here[:, :6] = here[0, [6, 8]] = here[1, [7, 9]] = True
+    length = np.ones(10)
+    length[[4, 6]], length[[5, 7]] = 1e3, 1e-3
+    parts = np.array([np.diag(2.0 * on / here.sum(axis=0)) for on in here])
+    for p, i, j, share in (
+        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # which cancel
+        (0, 2, 3, 0.25), (1, 2, 3, 0.25),
+        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding of long and of short rows
+        (0, 0, 8, 0.5),  # which is none of those that are asked for
+        (1, 1, 9, 0.5),
+    ):  # fmt: skip
+        parts[p, i, j] = parts[p, j, i] = share
+    parts *= np.outer(length, length)
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        diagonal = at.added(part.diagonal())
+        return over_ranks._coupled(part, at, diagonal, at.rows != 8)
+
+    assert set(np.concatenate(on_threads(2, work)).tolist()) == {1, 2, 3, 9}
+
+
+def summed(decades=0):
+    """Who of three ranks touches which of 14 rows, and parts with rows of any length."""
+    rng = np.random.default_rng(0)
+    here = np.zeros((3, 14), dtype=bool)
+    for p in range(3):
+        here[p, 4 * p : 4 * p + 6] = True
+    length = 10.0 ** rng.uniform(-decades, decades, 14)
+    parts = []
+    for on in here:
+        G = rng.standard_normal((14, 20)) * on[:, None]
+        parts.append(np.outer(length, length) * (G @ G.T))
+    return here, length, parts
+
+
+def test_the_sum_of_parts_is_inverted_rank_by_rank():
+    here, length, parts = summed(decades=6)
+    x = length * np.random.default_rng(1).standard_normal(14)
+    known = np.linalg.solve(sum(parts) / np.outer(length, length), x / length)
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        rows = touched_rows(at.rows, ranks)
+        part = csc_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        owned, inverse = over_ranks._rank_by_rank(
+            part, rows, at, at.added(part.diagonal())
+        )
+        own = at.rows[at.own]
+        assert owned.tolist() == list(range(own.size))
+        assert length[own] * inverse(x[own]) == pytest.approx(known[own], rel=1e-5)
+        return True
+
+    assert all(on_threads(3, work))
+
+
+def test_equal_contact_rows_are_inverted_to_rounding():
+    """A row that is there twice: any y with the same sum over both is as good."""
+    here = np.ones((1, 3), dtype=bool)
+    A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        rows = touched_rows(at.rows, ranks)
+        _, inverse = over_ranks._rank_by_rank(csc_array(A), rows, at, np.diag(A).copy())
+        return A @ inverse(np.array([1.0, 1, 1]))
+
+    assert on_threads(1, work)[0] == pytest.approx([1, 1, 1], abs=1e-6)
+
+
+def test_the_sum_of_parts_on_some_rows_is_inverted_by_all_alike():
+    """What couples them with others, and equations with contact, is left out."""
+    here, _, parts = summed()
+    some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
+    A = sum(parts)[np.ix_(some, some)]
+    A[:3, 3:] = A[3:, :3] = 0
+    x = np.random.default_rng(1).standard_normal(14)
+    known = np.full(14, np.nan)
+    known[some] = np.linalg.solve(A, x[some])
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # no other knows
+        owned, inverse = over_ranks._alike(
+            part, np.isin(at.rows, some) & first_of, at, first
+        )
+        own = at.rows[at.own]
+        assert own[owned].tolist() == np.intersect1d(own, some).tolist()
+        assert inverse(x[own[owned]]) == pytest.approx(known[own[owned]], rel=1e-5)
+        return True
+
+    assert all(on_threads(3, work))
