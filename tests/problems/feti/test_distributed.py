@@ -420,12 +420,13 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
 
 
 def summed(decades=0):
-    """Who of three ranks touches which of 14 rows, and parts with rows of any length."""
+    """Who of three ranks touches which of 14 rows, and parts with rows as long."""
     rng = np.random.default_rng(0)
     here = np.zeros((3, 14), dtype=bool)
     for p in range(3):
         here[p, 4 * p : 4 * p + 6] = True
     length = 10.0 ** rng.uniform(-decades, decades, 14)
+    length[[4, 9]], length[[5, 8]] = 0.1**decades, 10.0**decades  # shared rows
     parts = []
     for on in here:
         G = rng.standard_normal((14, 20)) * on[:, None]
