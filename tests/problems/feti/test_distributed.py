@@ -78,6 +78,8 @@ def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
     assert meanwhile(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
     assert meanwhile(less, 1) == 1
+    alone = {"a": less["a"], "b": Forming(11, [1], factor=1, blocks=1)}
+    assert meanwhile(alone, 1) == 1  # more than half of it fits in
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
     assert meanwhile(smaller, 1) == 2
 
@@ -298,9 +300,14 @@ def test_subdomains_in_a_row_are_cut_into_equal_halves():
     assert np.bincount(rank).tolist() == [6, 6]
 
 
-def test_one_rank_has_all_and_each_of_many_has_one():
+def test_one_rank_has_all_without_metis(monkeypatch):
+    monkeypatch.delattr(over_ranks, "_partitioned")
     ones = np.ones(5, dtype=np.int64)
     assert balanced(chain(5), ones, ones, 1).tolist() == [0] * 5
+
+
+def test_each_of_as_many_ranks_has_one_subdomain():
+    ones = np.ones(5, dtype=np.int64)
     assert sorted(balanced(chain(5), ones, ones, 5).tolist()) == list(range(5))
     with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
         balanced(chain(5), ones, ones, 6)
@@ -344,6 +351,20 @@ def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
     assert asks[0] == (None, [1] * 8)
     if asked == 37:
         assert len({seed for seed, _ in asks[1:]}) == 12
+
+
+def test_sizes_are_weighed_beside_work_with_a_quarter_a_half_and_whole(monkeypatch):
+    """One subdomain has 7.94 of the mean size, others 0.008; all have equal work."""
+    seen = set()
+
+    def answer(graph, weight, ranks, seed=None):
+        seen.add(tuple(weight.tolist()))
+        return np.array([0, 0, 0, 0, 1, 1, 1, 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    size = np.array([1000, 1, 1, 1, 1, 1, 1, 1])
+    balanced(chain(8), np.full(8, 10), size, 2)
+    assert seen == {(first, 1, 1, 1, 1, 1, 1, 1) for first in (1, 2, 4, 8)}
 
 
 @pytest.mark.parametrize("unit", [1, 10])
