@@ -7,6 +7,7 @@ milliseconds. A rank that waits for a message that nobody sends fails after `PAT
 from collections import defaultdict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from queue import Queue
 from threading import Barrier, BrokenBarrierError
 from types import SimpleNamespace
@@ -60,6 +61,14 @@ class Comm:
             array[...] = sent
 
         return SimpleNamespace(Wait=wait)
+
+
+def without_lock(monkeypatch: Any, owner: type, name: str) -> None:
+    """Let ranks exchange messages while they compute a cached property.
+
+    Until Python 3.12 one is computed in one thread at a time, for all instances.
+    """
+    monkeypatch.setattr(vars(owner)[name], "lock", nullcontext(), raising=False)
 
 
 def on_threads(size: int, work: Callable[[Ranks], R]) -> list[R]:

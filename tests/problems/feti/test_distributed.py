@@ -26,7 +26,7 @@ from problems.feti.distributed import (
 )
 from problems.feti.operators import DualOperator, dual_operator
 from problems.models.membranes import Membranes
-from tests.support.threads import on_threads
+from tests.support.threads import on_threads, without_lock
 from tests.support.torn_bodies import torn_pair
 
 
@@ -137,9 +137,7 @@ def test_what_several_neighbours_return_for_one_row_is_added_up():
 
 @pytest.fixture(autouse=True)
 def ranks_do_not_lock_one_another_out(monkeypatch):
-    """Until Python 3.12 a cached property is computed in one thread at a time."""
-    blocks = vars(DualOperator)["_blocks"]
-    monkeypatch.setattr(blocks, "lock", nullcontext(), raising=False)
+    without_lock(monkeypatch, DualOperator, "_blocks")
 
 
 @pytest.fixture(
