@@ -1,5 +1,7 @@
 """Extreme eigenvalues by Lanczos, where they are known without it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -9,6 +11,7 @@ from scipy.sparse import csr_array, eye_array
 from harness import QP, Vector, no_rows
 from problems.contact.linearise import linearisation
 from problems.duality.stepping import primal_qp
+from problems.feti import spectrum as module
 from problems.feti.distributed import shared
 from problems.feti.elastic import torn
 from problems.feti.operators import DualOperator, dual_operator
@@ -192,10 +195,18 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
             assert got.within(1e-9)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_ritz_values_are_as_far_off_as_their_residuals_are_long(seed) -> None:
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
+    sign: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The residual of a Ritz vector is the next length times its last entry."""
-    rng = np.random.default_rng(seed)
+    rng, solve = np.random.default_rng(0), module.eigh_tridiagonal
+
+    def turned(*args: Any, **how: Any) -> Any:
+        values, vectors = solve(*args, **how)
+        return values, sign * vectors
+
+    monkeypatch.setattr(module, "eigh_tridiagonal", turned)
     alpha, beta = rng.uniform(1, 2, 5), rng.uniform(0.1, 0.5, 4)
     values, vectors = np.linalg.eigh(
         np.diag(alpha) + np.diag(beta, 1) + np.diag(beta, -1)
@@ -206,3 +217,18 @@ def test_ritz_values_are_as_far_off_as_their_residuals_are_long(seed) -> None:
     assert found.largest == pytest.approx(values[-1])
     assert found.smallest_error == pytest.approx(residuals[0])
     assert found.largest_error == pytest.approx(residuals[-1])
+
+
+def test_without_a_residual_what_is_left_is_rounding_of_the_largest() -> None:
+    """Five steps of an operator with eigenvalues up to 9e6."""
+    found = ritz_bounds(1e6 * np.array([1.0, 9, 2, 3, 4]), np.zeros(4), 0.0)
+    rounding = 5 * np.finfo(float).eps * 9e6
+    assert found.smallest_error == pytest.approx(rounding, abs=0)
+    assert found.largest_error == pytest.approx(rounding, abs=0)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_eigenvalues_in_other_units_are_as_accurate(unit: float) -> None:
+    entries = unit * np.linspace(2.0, 50.0, 40)
+    found = spectrum(lambda x: entries * x, identity, 40)
+    assert_allclose([found.smallest, found.largest], entries[[0, -1]], rtol=1e-10)
