@@ -418,3 +418,23 @@ def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
     monkeypatch.setattr(certificate, "_proved", lambda *args: pair(work=bound**2 / 2))
     split = Undivided(mechanics)
     assert len(list(certificate._certificates(split, answer(u, lam)))) == count
+
+
+@pytest.mark.parametrize("name", ["disc under rollers", "tilted disc", RATIOS[3]])
+def test_motions_either_way_are_bounded(name, monkeypatch):
+    """A motion and its opposite are one direction: which of them is named is chance."""
+    mechanics, u, lam, _ = known(name)
+    reach, seen = certificate._reach, []
+
+    def both(split, exact, G, held, *others):
+        seen.append([reach(split, exact, G, h, *others) for h in (held, -held)])
+        return seen[-1][0]
+
+    monkeypatch.setattr(certificate, "_reach", both)
+    s = _noise(mechanics, answer(u, lam), 1e-4, np.random.default_rng(0))
+    certify(mechanics, s)
+    assert seen
+    for one, other in seen:
+        for got, known_by_symmetry in zip(one, other, strict=True):
+            assert got.size
+            assert got == pytest.approx(known_by_symmetry, rel=1e-6)
