@@ -125,7 +125,7 @@ class Certificate:
     @property
     def pair(self) -> float:
         """√(2g): bound (2) of both errors together."""
-        return float(np.sqrt(2 * self.gap))
+        return _root(2 * self.gap)
 
     @property
     def bound(self) -> float:
@@ -146,10 +146,10 @@ class Certificate:
         lengths = {
             "pair": self.pair,
             "distance": self.distance,
-            "work": float(np.sqrt(2 * max(self.work, 0.0))),
+            "work": _root(2 * self.work),
             "answer": self.claimed,
             "moved": self.moved,
-            "friction": float(np.sqrt(2 * max(self.sliding, 0.0))),
+            "friction": _root(2 * self.sliding),
         }
         relative = {name: self._relative(value) for name, value in lengths.items()}
         return relative | {"seminorm": float(self.seminorm)}

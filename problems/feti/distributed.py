@@ -432,7 +432,6 @@ def _alike(
     )
     places = np.searchsorted(known, row), np.searchsorted(known, column)
     gram = csr_array((data, places), shape=(known.size,) * 2)
-    gram.sum_duplicates()
     first = int(np.searchsorted(known, equalities))
     solve = gram_inverse(uncoupled(gram, first), first)
     _, place, owned = np.intersect1d(known, at.rows[at.own], return_indices=True)

@@ -7,7 +7,6 @@ import json
 import sys
 
 import numpy as np
-from mpi4py import MPI
 from scipy.sparse import csc_array
 
 import mortarbench as mb
@@ -184,6 +183,8 @@ def operator(name, ranks):
 
 
 def main():
+    from mpi4py import MPI  # late: threads that are ranks need none
+
     ranks = Ranks(MPI.COMM_WORLD)
     found = {"vectors": vectors(ranks), "factors": factors(ranks)}
     for name in sys.argv[1:]:

@@ -12,6 +12,7 @@ import pytest
 from harness import Case, Solution, Status, UncertifiableError, certify
 from harness.mechanics import Extended, Mechanics, Real, _cancelling
 from harness.names import parse
+from harness.verify import certificate
 from harness.verify.admissible import _newton, admissible, balanced
 from harness.verify.certificate import Certificate, _charge, _Reach
 from harness.verify.kkt import kkt_residuals
@@ -329,3 +330,111 @@ def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
     s = answer(u, lam)
     for _ in range(40):
         assert certify(mechanics, _swapped_rows(mechanics, s, 1e-6, rng)).bound > 0
+
+
+def pair(**fields: object) -> Certificate:
+    """A certificate whose numbers are given; all others are those of no error."""
+    none: dict[str, object] = dict.fromkeys(
+        ("norm", "distance", "work", "sliding", "rounding", "claimed", "moved"), 0.0
+    )
+    empty = {name: np.zeros(0) for name in ("u", "multipliers", "off")}
+    return Certificate(
+        **empty, **none | {"stretch": 1.0, "least": 1.0, "seminorm": False} | fields
+    )  # fmt: skip
+
+
+def test_parts_of_a_bound_are_lengths_relative_to_the_least_solution():
+    """g = ½·3² + 5 + ½·7 = 13, of the answer 24, of a solution of 2 at least."""
+    found = pair(
+        distance=3.0, work=5.0, rounding=7.0, sliding=2.0, claimed=24.0, moved=1.0,
+        least=2.0, stretch=1.5, seminorm=True,
+    )  # fmt: skip
+    assert found.gap == 13.0
+    assert found.pair == 26**0.5
+    assert found.bound == 12.0
+    assert replace(found, claimed=0.0).bound == 1.5 * 26**0.5 / 2
+    assert found.parts == {
+        "pair": 26**0.5 / 2, "distance": 1.5, "work": 10**0.5 / 2, "answer": 12.0,
+        "moved": 0.5, "friction": 1.0, "seminorm": 1.0,
+    }  # fmt: skip
+
+
+def test_no_error_is_none_and_any_other_is_infinite_beside_a_solution_of_zero():
+    assert pair(least=0.0).bound == 0.0
+    assert pair(least=0.0, claimed=1e-300).bound == np.inf
+    assert pair(least=-1.0, claimed=1.0).bound == np.inf
+    negative = pair(work=-1e-20, sliding=-1e-20).parts
+    assert negative["pair"] == negative["work"] == negative["friction"] == 0.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("vector", ["x", "z"])
+def test_a_single_number_that_is_none_leaves_nothing_to_certify(vector, value):
+    mechanics, u, lam, _ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
+    s = answer(u, lam)
+    getattr(s, vector)[1] = value
+    with pytest.raises(UncertifiableError, match="the answer holds NaN or inf"):
+        certify(mechanics, s)
+
+
+def test_of_a_pair_that_proves_nothing_the_solution_may_be_zero(monkeypatch):
+    mechanics, *_ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
+
+    def refused(*args):
+        raise UncertifiableError("no")
+
+    assert certificate._least_norm(Undivided(mechanics)) > 0
+    monkeypatch.setattr(certificate, "proof", refused)
+    assert certificate._least_norm(Undivided(mechanics)) == 0.0
+
+
+@pytest.mark.parametrize("name", ["disc under rollers", "tilted disc"])
+@pytest.mark.parametrize("size", [1e-4, 1e-3])
+def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name, size):
+    """‖u*‖ ≥ ‖M‖ − √(g − ¼‖û − u_λ‖²) for the midpoint M of û and u_λ, from (3)."""
+    mechanics, u, lam, norm = known(name)
+    disturbed = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
+    found = certify(mechanics, disturbed)
+    middle = mechanics.norm(found.u - found.off / 2)
+    around = np.sqrt(found.gap - 0.25 * found.distance**2)
+    assert found.least * found.stretch >= (middle - around) * (1 - 1e-12)
+    assert found.least <= norm * ROUNDED
+
+
+@pytest.mark.parametrize(
+    ("name", "bound", "count"),
+    [
+        ("tilted disc", 1e-4, 3),
+        ("tilted disc", 1e-2, 2),  # not near: closed rows may be those of another one
+        ("tilted disc", 1e-8, 1),  # good enough
+        ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # which supports hold
+    ],
+)
+def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
+    name, bound, count, monkeypatch
+):
+    """Of pairs that prove a bound by work alone."""
+    mechanics, u, lam, _ = known(name)
+    monkeypatch.setattr(certificate, "_proved", lambda *args: pair(work=bound**2 / 2))
+    split = Undivided(mechanics)
+    assert len(list(certificate._certificates(split, answer(u, lam)))) == count
+
+
+@pytest.mark.parametrize("name", ["disc under rollers", "tilted disc", RATIOS[3]])
+def test_motions_either_way_are_bounded(name, monkeypatch):
+    """A motion and its opposite are one direction: which of them is named is chance."""
+    mechanics, u, lam, _ = known(name)
+    reach, seen = certificate._reach, []
+
+    def both(split, exact, G, held, *others):
+        seen.append([reach(split, exact, G, h, *others) for h in (held, -held)])
+        return seen[-1][0]
+
+    monkeypatch.setattr(certificate, "_reach", both)
+    s = _noise(mechanics, answer(u, lam), 1e-4, np.random.default_rng(0))
+    certify(mechanics, s)
+    assert seen
+    for one, other in seen:
+        for got, known_by_symmetry in zip(one, other, strict=True):
+            assert got.size
+            assert got == pytest.approx(known_by_symmetry, rel=1e-6)

@@ -1,11 +1,33 @@
-"""Who forms the blocks of which kind."""
+"""Duals of torn bodies on ranks that are threads, and who forms which blocks."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import csc_array, csr_array
 
-from problems.feti.distributed import AFTER_FACTOR, Forming, Halo, forming, meanwhile
+from harness import QP, InputError, Solution, Status, no_rows
+from harness.distributed import factor
+from harness.distributed.factor import touched_rows
+from problems.feti import distributed as over_ranks
+from problems.feti.distributed import (
+    AFTER_FACTOR,
+    Forming,
+    Halo,
+    balanced,
+    forming,
+    halo,
+    meanwhile,
+    owners,
+    partition,
+    shared,
+)
+from problems.feti.operators import DualOperator, dual_operator
+from problems.models.membranes import Membranes
+from tests.support.threads import on_threads, without_lock
+from tests.support.torn_bodies import torn_pair
 
 
 def loads(work):
@@ -45,6 +67,26 @@ def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
 
     assert meanwhile(tasks, 1) == 1
     assert meanwhile(tasks, 0) == 0
+
+
+def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
+    tasks = {
+        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
+        "e": Forming(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
+        **{name: Forming(4, [1], factor=1, blocks=1) for name in "bcd"},
+    }
+    assert meanwhile(tasks, 1) == 3
+    less = {name: task for name, task in tasks.items() if name != "e"}
+    assert meanwhile(less, 1) == 1
+    alone = {"a": less["a"], "b": Forming(11, [1], factor=1, blocks=1)}
+    assert meanwhile(alone, 1) == 1  # more than half of it fits in
+    smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
+    assert meanwhile(smaller, 1) == 2
+
+
+def test_the_largest_kinds_are_shared_out_first():
+    kinds = {"a": 4, "b": 4, "c": 8}
+    assert loads([kinds, kinds]).tolist() == [8, 8]
 
 
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
@@ -91,3 +133,380 @@ def test_what_several_neighbours_return_for_one_row_is_added_up():
         borrows=np.zeros(3, dtype=np.int64),
     )  # fmt: skip
     assert at.added(np.array([0.5, 0.25, 0.125])).tolist() == [101.5, 1000.25, 10.125]
+
+
+@pytest.fixture(autouse=True)
+def ranks_do_not_lock_one_another_out(monkeypatch):
+    without_lock(monkeypatch, DualOperator, "_blocks")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        lambda: Membranes(2, 3).torn("redundant"),
+        lambda: torn_pair("chain", most=4)[2],
+        lambda: torn_pair("orthonormal", most=4)[2],
+    ],
+    ids=["membranes", "chain", "orthonormal"],
+)
+def torn(request):
+    return request.param()
+
+
+def dual_of(torn):
+    """A QP with this F, whose numbers name its rows."""
+    F = dual_operator(torn.B, torn.domains, torn.equalities)
+    m = torn.B.shape[0]
+    G = csr_array((torn.B @ torn.domains.kernel).T)
+    lower = np.where(np.arange(m) < torn.equalities, -np.inf, 0.0)
+    return F.build(), QP(
+        P=F, q=np.arange(m, dtype=float), A=G, b=np.arange(G.shape[0], dtype=float),
+        G=no_rows(m), h=np.zeros(0), lb=lower, ub=1.0 + np.arange(m),
+    )  # fmt: skip
+
+
+PRECONDITIONERS = [
+    (kind, scaling)
+    for kind in ("lumped", "dirichlet")
+    for scaling in ("multiplicity", "stiffness")
+]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 8])
+def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
+    F, qp = dual_of(torn)
+    x = np.random.default_rng(4).standard_normal(qp.q.size)
+    known = {"F": F(x), "diagonal": F.diagonal()}
+    known |= {p: F.preconditioner(*p)(x) for p in PRECONDITIONERS}
+    B = torn.B.toarray()
+    known["onto rows"] = B @ np.linalg.lstsq(B, x, rcond=None)[0]
+
+    def work(ranks):
+        share = shared(qp, F, ranks)
+        part, P = share.qp, share.qp.P
+        own = P.halo.rows[P.halo.own]
+        found = {"F": P(x[own]), "diagonal": P.diagonal()}
+        assert (np.asarray(P @ x[own]) == found["F"]).all()
+        found |= {p: P.preconditioner(*p)(x[own]) for p in PRECONDITIONERS}
+        found["onto rows"] = P.onto_rows()(x[own])
+        for name, value in known.items():
+            got = np.asarray(found[name])
+            assert_allclose(got, value[own], atol=1e-9 * np.abs(value).max())
+        assert P.shape == (own.size, own.size)
+        for got, whole in ((part.q, qp.q), (part.lb, qp.lb), (part.ub, qp.ub)):
+            assert (np.asarray(got) == whole[own]).all()
+        assert_allclose(part.A @ part.q, qp.A @ qp.q, atol=1e-9)
+        assert (part.b == qp.b).all()
+        solution = Solution(
+            status=Status.SOLVED, x=x[own], y=part.b, z=np.zeros(0), z_box=2 * x[own]
+        )
+        return own, P.halo, share.whole(solution)
+
+    found = on_threads(size, work)
+    rows = np.concatenate([own for own, _, _ in found])
+    assert (np.sort(rows) == np.arange(qp.q.size)).all()
+    assert all(whole is None for _, _, whole in found[1:])
+    whole = found[0][2]
+    assert (whole.x == x).all()
+    assert (whole.z_box == 2 * x).all()
+    touching = np.bincount(np.concatenate([at.rows for _, at, _ in found]))
+    for _, at, _ in found:
+        assert (at.is_shared == (touching[at.rows] > 1)).all()
+        assert (np.diff(at.rows) > 0).all()
+        assert at.borrowed.size == at.rows.size - at.own.size
+
+
+@pytest.mark.parametrize("fill", [0, 10**6])
+def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkeypatch):
+    """Either way the sum of the ranks' parts of B W Bᵀ is inverted."""
+    monkeypatch.setattr(factor, "FILL", fill)
+    F, qp = dual_of(torn)
+    x = np.random.default_rng(6).standard_normal(qp.q.size)
+    known = F.preconditioner("dirichlet", "stiffness")(x)
+    ways = []
+    for name in ("_rank_by_rank", "_alike"):
+        way = getattr(over_ranks, name)
+
+        def noted(*args, name=name, way=way):
+            ways.append(name)
+            return way(*args)
+
+        monkeypatch.setattr(over_ranks, name, noted)
+
+    def work(ranks):
+        P = shared(qp, F, ranks).qp.P
+        own = P.halo.rows[P.halo.own]
+        found = np.asarray(P.preconditioner("dirichlet", "stiffness")(x[own]))
+        assert_allclose(found, known[own], atol=1e-7 * np.abs(known).max())
+
+    on_threads(3, work)
+    assert ("_rank_by_rank" in ways) == (fill > 0)
+    if not fill:
+        assert "_alike" in ways
+
+
+def test_owners_of_rows_are_those_that_touch_them_in_turn():
+    reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
+    rows = np.array([4, 5, 6, 7, 9])
+    assert owners(rows, reach).tolist() == [0, 1, 0, 1, 2]
+
+
+def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn):
+    B, domains = torn.B.toarray(), torn.domains
+    parts = partition(torn.B, domains, 3)
+    for row in range(len(B)):
+        subdomains = [
+            s for s in range(domains.kind.size)
+            if B[row, domains.start[s] : domains.start[s + 1]].any()
+        ]  # fmt: skip
+        ranks = sorted(set(parts.rank[subdomains].tolist()))
+        touching = parts.reach[[row]]
+        assert touching.indices.tolist() == ranks
+        assert (touching.data == 1).all()
+        assert parts.owner[row] == ranks[row % len(ranks)]
+
+
+def test_subdomains_are_weighed_by_dense_blocks_and_joined_by_rows(torn, monkeypatch):
+    seen = {}
+
+    def noted(graph, work, size, ranks):
+        seen.update(graph=graph.toarray(), work=work, size=size)
+        return np.arange(size.size) % ranks
+
+    monkeypatch.setattr(over_ranks, "balanced", noted)
+    partition(torn.B, torn.domains, 2)
+    B, start, kind = torn.B.toarray() != 0, torn.domains.start, torn.domains.kind
+    touches = np.add.reduceat(B, start[:-1], axis=1, dtype=int) > 0
+    assert (seen["graph"] == touches.T.astype(int) @ touches).all()
+    assert (seen["size"] == np.diff(start)).all()
+    for s, k in enumerate(kind):
+        same = np.flatnonzero(kind == k)
+        block = np.any([B[:, start[t] : start[t + 1]].any(axis=0) for t in same], 0)
+        assert seen["work"][s] == block.sum() ** 2
+
+
+def chain(size):
+    """A graph of subdomains in a row."""
+    beside = np.eye(size, k=1, dtype=np.int32)
+    return csr_array(beside + beside.T + 5 * np.eye(size, dtype=np.int32))
+
+
+def test_subdomains_in_a_row_are_cut_into_equal_halves():
+    ones = np.ones(12, dtype=np.int64)
+    rank = balanced(chain(12), 7 * ones, ones, 2)
+    assert (np.diff(rank) != 0).sum() == 1
+    assert np.bincount(rank).tolist() == [6, 6]
+
+
+def test_one_rank_has_all_without_metis(monkeypatch):
+    monkeypatch.delattr(over_ranks, "_partitioned")
+    ones = np.ones(5, dtype=np.int64)
+    assert balanced(chain(5), ones, ones, 1).tolist() == [0] * 5
+
+
+def test_each_of_as_many_ranks_has_one_subdomain():
+    ones = np.ones(5, dtype=np.int64)
+    assert sorted(balanced(chain(5), ones, ones, 5).tolist()) == list(range(5))
+    with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
+        balanced(chain(5), ones, ones, 6)
+
+
+#: of eight subdomains of equal work, of which the first four are four times as large
+ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: is even: sizes of 16 and 4
+ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work of 3 and 5, sizes of 12 and 8
+BETTER = [0, 0, 0, 1, 0, 1, 1, 1]  #: sizes of 13 and 7
+BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("answers", "taken", "asked"),
+    [
+        ([BOTH], BOTH, 1),
+        ([ONLY_WORK, ONLY_SIZE, BETTER, ONLY_WORK, BOTH], BOTH, 5),
+        ([ONLY_WORK, ONLY_SIZE, BETTER], BETTER, 37),
+        ([ONLY_WORK, BETTER, ONLY_SIZE], BETTER, 37),
+        ([ONLY_WORK, BETTER, ONLY_WORK], BETTER, 37),
+    ],
+)
+def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
+    answers, taken, asked, monkeypatch
+):
+    """METIS is asked again while sizes are uneven, with 12 seeds and three weights."""
+    asks = []
+
+    def answer(graph, weight, ranks, seed=None):
+        assert not graph.diagonal().any()
+        assert (graph.data > 0).all()  # METIS takes no other weights
+        assert weight.dtype.kind == "i"
+        assert weight.min() == 1
+        asks.append((seed, weight.tolist()))
+        return np.array(answers[min(len(asks), len(answers)) - 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    work, size = np.full(8, 10), np.repeat([4, 1], 4)
+    assert balanced(chain(8), work, size, 2).tolist() == taken
+    assert len(asks) == asked
+    assert asks[0] == (None, [1] * 8)
+    if asked == 37:
+        assert len({seed for seed, _ in asks[1:]}) == 12
+
+
+def test_sizes_are_weighed_beside_work_with_a_quarter_a_half_and_whole(monkeypatch):
+    """One subdomain has 7.94 of the mean size, others 0.008; all have equal work."""
+    seen = set()
+
+    def answer(graph, weight, ranks, seed=None):
+        seen.add(tuple(weight.tolist()))
+        return np.array([0, 0, 0, 0, 1, 1, 1, 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    size = np.array([1000, 1, 1, 1, 1, 1, 1, 1])
+    balanced(chain(8), np.full(8, 10), size, 2)
+    assert seen == {(first, 1, 1, 1, 1, 1, 1, 1) for first in (1, 2, 4, 8)}
+
+
+@pytest.mark.parametrize("unit", [1, 10])
+def test_work_is_weighed_in_units_of_the_least(unit, monkeypatch):
+    weights = []
+
+    def answer(graph, weight, ranks, seed=None):
+        weights.append(weight.tolist())
+        return np.array([0, 0, 1, 1])
+
+    monkeypatch.setattr(over_ranks, "_partitioned", answer)
+    balanced(chain(4), unit * np.array([3, 1, 2, 2]), np.ones(4, dtype=np.int64), 2)
+    assert weights == [[3, 1, 2, 2]]
+
+
+def test_ranks_that_metis_leaves_idle_get_a_subdomain_of_the_largest(monkeypatch):
+    import pymetis
+
+    monkeypatch.setattr(
+        pymetis, "part_graph", lambda *args, **how: (0, [0, 0, 2, 2, 2, 0, 2])
+    )
+    ones = np.ones(7, dtype=np.int64)
+    found = balanced(chain(7), ones, 10**6 * ones, 4)
+    assert found.tolist() == [0, 0, 2, 2, 2, 3, 1]
+
+
+def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
+    F, qp = dual_of(torn)
+
+    def work(ranks):
+        local = shared(qp, F, ranks).qp.P.local
+        groups = local.packed.groups
+        return dict(local.condense(groups)), groups
+
+    for blocks, groups in on_threads(3, work):
+        assert sorted(blocks) == list(range(len(groups)))
+        for i, group in enumerate(groups):
+            whole = group.kind.condensed(group.touched)
+            for got, known in zip(blocks[i], whole, strict=True):
+                assert_allclose(got, known, atol=1e-9 * np.abs(known).max())
+
+
+def halo_of(ranks, here):
+    """Rows of which `here` (ranks, m) tells who touches them, owned in turn."""
+    rows = np.flatnonzero(here[ranks.rank])
+    reach = csr_array(here[:, rows].T.astype(int))
+    return halo(ranks, rows, reach, owners(rows, reach))
+
+
+def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
+    """Relative to the rows: two ranks share 0 … 5, each has two more for itself."""
+    here = np.zeros((2, 10), dtype=bool)
+    here[:, :6] = here[0, [6, 8]] = here[1, [7, 9]] = True
+    length = np.ones(10)
+    length[[4, 6]], length[[5, 7]] = 1e3, 1e-3
+    parts = np.array([np.diag(2.0 * on / here.sum(axis=0)) for on in here])
+    for p, i, j, share in (
+        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # which cancel
+        (0, 2, 3, 0.25), (1, 2, 3, 0.25),
+        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding of long and of short rows
+        (0, 0, 8, 0.5),  # which is none of those that are asked for
+        (1, 1, 9, 0.5),
+    ):  # fmt: skip
+        parts[p, i, j] = parts[p, j, i] = share
+    parts *= np.outer(length, length)
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        diagonal = at.added(part.diagonal())
+        return over_ranks._coupled(part, at, diagonal, at.rows != 8)
+
+    assert set(np.concatenate(on_threads(2, work)).tolist()) == {1, 2, 3, 9}
+
+
+def summed(decades=0):
+    """Who of three ranks touches which of 14 rows, and parts with rows as long."""
+    rng = np.random.default_rng(0)
+    here = np.zeros((3, 14), dtype=bool)
+    for p in range(3):
+        here[p, 4 * p : 4 * p + 6] = True
+    length = 10.0 ** rng.uniform(-decades, decades, 14)
+    length[[4, 9]], length[[5, 8]] = 0.1**decades, 10.0**decades  # shared rows
+    parts = []
+    for on in here:
+        G = rng.standard_normal((14, 20)) * on[:, None]
+        parts.append(np.outer(length, length) * (G @ G.T))
+    return here, length, parts
+
+
+def test_the_sum_of_parts_is_inverted_rank_by_rank():
+    here, length, parts = summed(decades=6)
+    x = length * np.random.default_rng(1).standard_normal(14)
+    known = np.linalg.solve(sum(parts) / np.outer(length, length), x / length)
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        rows = touched_rows(at.rows, ranks)
+        part = csc_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        owned, inverse = over_ranks._rank_by_rank(
+            part, rows, at, at.added(part.diagonal())
+        )
+        own = at.rows[at.own]
+        assert owned.tolist() == list(range(own.size))
+        assert length[own] * inverse(x[own]) == pytest.approx(known[own], rel=1e-5)
+        return True
+
+    assert all(on_threads(3, work))
+
+
+def test_equal_contact_rows_are_inverted_to_rounding():
+    """A row that is there twice: any y with the same sum over both is as good."""
+    here = np.ones((1, 3), dtype=bool)
+    A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        rows = touched_rows(at.rows, ranks)
+        _, inverse = over_ranks._rank_by_rank(csc_array(A), rows, at, np.diag(A).copy())
+        return A @ inverse(np.array([1.0, 1, 1]))
+
+    assert on_threads(1, work)[0] == pytest.approx([1, 1, 1], abs=1e-6)
+
+
+def test_the_sum_of_parts_on_some_rows_is_inverted_by_all_alike():
+    """What couples them with others, and equations with contact, is left out."""
+    here, _, parts = summed()
+    some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
+    A = sum(parts)[np.ix_(some, some)]
+    A[:3, 3:] = A[3:, :3] = 0
+    x = np.random.default_rng(1).standard_normal(14)
+    known = np.full(14, np.nan)
+    known[some] = np.linalg.solve(A, x[some])
+
+    def work(ranks):
+        at = halo_of(ranks, here)
+        part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
+        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # no other knows
+        owned, inverse = over_ranks._alike(
+            part, np.isin(at.rows, some) & first_of, at, first
+        )
+        own = at.rows[at.own]
+        assert own[owned].tolist() == np.intersect1d(own, some).tolist()
+        assert inverse(x[own[owned]]) == pytest.approx(known[own[owned]], rel=1e-5)
+        return True
+
+    assert all(on_threads(3, work))

@@ -1,22 +1,31 @@
 """Extreme eigenvalues by Lanczos, where they are known without it."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import null_space, orth
 from scipy.sparse import csr_array, eye_array
 
-from harness import Vector
+from harness import QP, Vector, no_rows
 from problems.contact.linearise import linearisation
 from problems.duality.stepping import primal_qp
+from problems.feti import spectrum as module
+from problems.feti.distributed import shared
 from problems.feti.elastic import torn
+from problems.feti.operators import DualOperator, dual_operator
 from problems.feti.spectrum import (
     Spectrum,
     projector,
     ritz_bounds,
     spectra_of_equations,
+    spectra_over_ranks,
     spectrum,
 )
 from problems.models.beam_ring import model, subdivided
+from problems.models.membranes import Membranes
+from tests.support.threads import on_threads, without_lock
 from tests.support.torn_bodies import torn_pair
 
 
@@ -131,3 +140,95 @@ def test_stretched_cells_of_a_ring_leave_the_least_eigenvalue_of_squares(cells) 
 def test_the_condition_number_is_flat_from_16_900_unknowns_on(cells) -> None:
     small, large = (of_beam_ring(layers, cells).condition for layers in (24, 96))
     assert small < large < 1.04 * small
+
+
+def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
+    """2 ± 0.1 and 8 ± 0.8: a twentieth and a tenth."""
+    found = Spectrum(2.0, 8.0, 0.1, 0.8, steps=1)
+    assert found.condition == 4.0
+    assert found.condition_error == pytest.approx(4 * 0.15)
+    assert found.within(0.1)
+    assert not found.within(0.09)
+    assert not found._replace(smallest_error=0.3).within(0.1)
+    assert not found._replace(largest_error=0.9).within(0.1)
+
+
+def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
+    torn = Membranes(2, 2).torn("redundant")
+    B = torn.B[: torn.equalities]
+    x = np.random.default_rng(1).standard_normal(B.shape[0])
+    dense = B.toarray()
+    found = projector(csr_array((0, B.shape[0])), B)(x)
+    assert found == pytest.approx(dense @ np.linalg.lstsq(dense, x, rcond=None)[0])
+
+
+@pytest.mark.parametrize("floating", [True, False])
+def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
+    """On ker G ∩ range B; without a coarse problem on range B."""
+    without_lock(monkeypatch, DualOperator, "_blocks")
+    torn = Membranes(2, 2).torn("redundant")
+    m = torn.equalities
+    B = torn.B[:m]
+    F = dual_operator(B, torn.domains, m)
+    G = csr_array((B @ torn.domains.kernel).T)
+    if not floating:
+        G = G[:0]
+    qp = QP(
+        P=F, q=np.zeros(m), A=G, b=np.zeros(G.shape[0]), G=no_rows(m), h=np.zeros(0),
+        lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
+    )  # fmt: skip
+    kinds = (None, ("lumped", "stiffness"))
+
+    def work(ranks):
+        share = shared(qp, F.build(), ranks)
+        return spectra_over_ranks(share.qp.P, share.qp.A, kinds, tol=1e-9)
+
+    Q = orth(B.toarray())
+    Q = Q @ null_space(G.toarray() @ Q)
+    dense = Q.T @ F.build()(np.eye(m)) @ Q
+    M = Q.T @ F.build().preconditioner(*kinds[1])(np.eye(m)) @ Q
+    known = [np.linalg.eigvalsh(dense), np.sort(np.linalg.eigvals(M @ dense).real)]
+    for found in on_threads(3, work):
+        for got, values in zip(found, known, strict=True):
+            assert got.smallest == pytest.approx(values[0], rel=1e-8)
+            assert got.largest == pytest.approx(values[-1], rel=1e-8)
+            assert got.within(1e-9)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
+    sign: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The residual of a Ritz vector is the next length times its last entry."""
+    rng, solve = np.random.default_rng(0), module.eigh_tridiagonal
+
+    def turned(*args: Any, **how: Any) -> Any:
+        values, vectors = solve(*args, **how)
+        return values, sign * vectors
+
+    monkeypatch.setattr(module, "eigh_tridiagonal", turned)
+    alpha, beta = rng.uniform(1, 2, 5), rng.uniform(0.1, 0.5, 4)
+    values, vectors = np.linalg.eigh(
+        np.diag(alpha) + np.diag(beta, 1) + np.diag(beta, -1)
+    )
+    found = ritz_bounds(alpha, beta, 0.5)
+    residuals = 0.5 * np.abs(vectors[-1])
+    assert found.smallest == pytest.approx(values[0])
+    assert found.largest == pytest.approx(values[-1])
+    assert found.smallest_error == pytest.approx(residuals[0])
+    assert found.largest_error == pytest.approx(residuals[-1])
+
+
+def test_without_a_residual_what_is_left_is_rounding_of_the_largest() -> None:
+    """Five steps of an operator with eigenvalues up to 9e6."""
+    found = ritz_bounds(1e6 * np.array([1.0, 9, 2, 3, 4]), np.zeros(4), 0.0)
+    rounding = 5 * np.finfo(float).eps * 9e6
+    assert found.smallest_error == pytest.approx(rounding, abs=0)
+    assert found.largest_error == pytest.approx(rounding, abs=0)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_eigenvalues_in_other_units_are_as_accurate(unit: float) -> None:
+    entries = unit * np.linspace(2.0, 50.0, 40)
+    found = spectrum(lambda x: entries * x, identity, 40)
+    assert_allclose([found.smallest, found.largest], entries[[0, -1]], rtol=1e-10)

@@ -78,3 +78,14 @@ def test_a_product_takes_the_rigid_part_from_both_sides(parts: LocalProblems) ->
         assert_allclose(
             found.astype(float), expected, atol=1e-11 * np.abs(expected).max()
         )
+
+
+def test_a_squared_product_is_with_the_squares_of_all_entries(
+    parts: LocalProblems,
+) -> None:
+    K = dense(parts)
+    v = np.random.default_rng(11).standard_normal(len(K))
+    expected = K**2 @ v
+    found = parts.squared_product(v)
+    assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+    assert_allclose(dense(parts), K, atol=0)  # of which none has changed

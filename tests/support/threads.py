@@ -1,0 +1,94 @@
+"""Ranks that are threads of one process, for tests of what ranks exchange.
+
+They pass one another what MPI would, in memory, so that a test on three ranks takes
+milliseconds. A rank that waits for a message that nobody sends fails after `PATIENCE`.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from queue import Queue
+from threading import Barrier, BrokenBarrierError
+from types import SimpleNamespace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from harness.distributed.vectors import Ranks
+
+PATIENCE = 5.0  #: s
+R = TypeVar("R")
+
+
+class Comm:
+    """What `harness.distributed` uses of mpi4py's communicators."""
+
+    def __init__(self, rank: int, size: int, barrier: Barrier, slots: list[Any]):
+        self.rank, self.size = rank, size
+        self._barrier, self._slots = barrier, slots
+        self._inbox: Any = defaultdict(Queue)  # by source
+        self.others: list[Comm] = []
+
+    def allgather(self, value: Any) -> list[Any]:
+        self._slots[self.rank] = value
+        self._barrier.wait(PATIENCE)
+        found = list(self._slots)
+        self._barrier.wait(PATIENCE)
+        return found
+
+    def gather(self, value: Any) -> list[Any] | None:
+        found = self.allgather(value)
+        return found if self.rank == 0 else None
+
+    def Allgather(self, part: np.ndarray, parts: np.ndarray) -> None:
+        parts[...] = self.allgather(part.copy())
+
+    def Allreduce(self, part: np.ndarray, found: np.ndarray) -> None:
+        found[...] = sum(self.allgather(part.copy()))
+
+    def Isend(self, array: np.ndarray, dest: int) -> Any:
+        assert array.flags.c_contiguous
+        self.others[dest]._inbox[self.rank].put(array.copy())
+        return SimpleNamespace(Wait=lambda: None)
+
+    def Irecv(self, array: np.ndarray, source: int) -> Any:
+        assert array.flags.c_contiguous
+
+        def wait() -> None:
+            sent = self._inbox[source].get(timeout=PATIENCE)
+            assert sent.shape == array.shape
+            array[...] = sent
+
+        return SimpleNamespace(Wait=wait)
+
+
+def without_lock(monkeypatch: Any, owner: type, name: str) -> None:
+    """Let ranks exchange messages while they compute a cached property.
+
+    Until Python 3.12 one is computed in one thread at a time, for all instances.
+    """
+    monkeypatch.setattr(vars(owner)[name], "lock", nullcontext(), raising=False)
+
+
+def on_threads(size: int, work: Callable[[Ranks], R]) -> list[R]:
+    """Return what `work` returns on each rank, in their order."""
+    barrier, slots = Barrier(size), [None] * size
+    comms = [Comm(rank, size, barrier, slots) for rank in range(size)]
+    for comm in comms:
+        comm.others = comms
+
+    def one(comm: Comm) -> R:
+        try:
+            return work(Ranks(comm))  # type: ignore[arg-type]
+        except BaseException:
+            barrier.abort()  # the others would wait
+            raise
+
+    with ThreadPoolExecutor(size) as pool:
+        running = [pool.submit(one, comm) for comm in comms]
+    failed = [e for r in running if (e := r.exception()) is not None]
+    for e in failed:
+        if not isinstance(e, BrokenBarrierError):
+            raise e
+    return [r.result() for r in running]
