@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
+import numpy as np
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -102,6 +104,8 @@ class ContactSide:
     force: NDArray[Any]  #: (s, 2) on each node by this contact, N/m
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
+    #: (s,) force on each node against the normal of its own contact row, N/m
+    push: Vector | None = None
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
     friction: NDArray[Any] | None = None  #: (s,) "open", "stick" or "slip"
     #: (k, 3) of the exact solution, where it is known: distance along the side from its
@@ -111,14 +115,16 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Tell which nodes (s,) press on the other side.
 
-        Those whose force is more than `least`, N/m. With friction it is those that are
-        not open: Tresca's law lets friction act on open nodes, too.
+        Those with a push, or where it is not known a force, of more than `least`, N/m:
+        a mortar row of a curved side also pulls along the side at the neighbours of its
+        node. With friction it is those that are not open: Tresca's law lets friction
+        act on open nodes, too.
         """
-        told: NDArray[Any] = (
-            (self.force**2).sum(axis=1) > least**2
-            if self.friction is None else self.friction != "open"
-        )  # fmt: skip
-        return told
+        if self.friction is not None:
+            return np.asarray(self.friction != "open")
+        if self.push is not None:
+            return np.asarray(self.push > least)
+        return np.asarray((self.force**2).sum(axis=1) > least**2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
