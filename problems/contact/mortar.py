@@ -167,10 +167,9 @@ def integrate(slave: Polyline, master: Polyline, basis: Basis, reach: Reach) -> 
     bent = at.field[:, :, None] - own[:, None]  # ν − n_j
     bent[np.abs(bent) <= ROUNDED] = 0
     D = overlap[..., None] * own[:, :, None]
-    D += np.einsum("pgj,pgjx,pgk->pjkx", weighted, bent, N)
-    M = np.einsum(
-        "pgj,pgx,pgl->pjlx", weighted, at.field, _shape(2 * at.beta - 1), optimize=True
-    )
+    D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * bent, N)
+    pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
+    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * at.beta - 1))
     measure = at.weight * np.linalg.norm(at.field, axis=-1)
     gap = np.einsum("pgj,pg->pj", phi, measure * at.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
