@@ -108,6 +108,8 @@ class ContactSide:
     force: NDArray[Any]  #: (s, 2) on each node by this contact, N/m
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
+    #: (s,) force on each node against the normal of its own contact row, N/m
+    push: Vector | None = None
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
     #: (s,) "open", "stick", "slip" or `SLIDING`; files of old say "open" for the last
     friction: NDArray[Any] | None = None
@@ -118,14 +120,18 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Tell which nodes (s,) press on the other side.
 
-        Those whose force is more than `least`, N/m. With friction it is those that
-        stick or slip: Tresca's law lets friction act where nothing presses, too.
+        Those with a push, or where it is not known a force, of more than `least`, N/m:
+        a mortar row of a curved side also pulls along the side at the neighbours of its
+        node. With friction it is those that stick or slip: Tresca's law lets friction
+        act where nothing presses, too.
         """
-        told: NDArray[Any] = (
-            (self.force**2).sum(axis=1) > least**2
-            if self.friction is None
-            else (self.friction == "stick") | (self.friction == "slip")
-        )  # fmt: skip
+        told: NDArray[Any]
+        if self.friction is not None:
+            told = (self.friction == "stick") | (self.friction == "slip")
+        elif self.push is not None:
+            told = self.push > least
+        else:
+            told = (self.force**2).sum(axis=1) > least**2
         return told
 
 

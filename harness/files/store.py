@@ -31,7 +31,8 @@ _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
 _SIDE = "side_{}_"  #: of the contact of that number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
-_SOME = ("shear", "friction", "exact")  #: with friction; of exact solutions
+#: of rows of contact; with friction; of exact solutions
+_SOME = ("push", "shear", "friction", "exact")
 _HISTORY = "history_"
 
 

@@ -6,14 +6,24 @@ slave elements covered in part: Popp, Seitz, Gee and Wall, Comput. Methods Appl.
 Engrg. 264 (2013) 67-80; "normal field" and "ray" are our words.
 
 On the slave segment between the nodes 1 and 2 let ξ ∈ [−1, 1], N_1 = (1 − ξ)/2,
-N_2 = (1 + ξ)/2, and let n(ξ) = (N_1 n_1 + N_2 n_2)/|…| interpolate the averaged normals
-of the nodes. The ray from x(ξ) along n(ξ) meets the master at x(ξ) + g n(ξ), which
+N_2 = (1 + ξ)/2, and let ν(ξ) = N_1 n_1 + N_2 n_2 interpolate the averaged normals of
+the nodes. The ray from x(ξ) along n = ν/|ν| meets the master at x(ξ) + g n, which
 defines the gap g(ξ) (positive: open) and the master's shape functions N^m_l(ξ) there.
-The contact stress is λ = Σ Φ_j λ_j, the impenetrability holds in the weak sense
-∫ Φ_j g ≥ 0, and linearised with rays and normals held it is, for every slave node j,
+The contact traction is Σ λ_j Φ_j ν, the impenetrability holds in the weak sense
+∫ Φ_j |ν| g ≥ 0, and linearised with rays and normals held it is, for every slave node
+j,
 
-    n_jᵀ [(D u_s)_j − (M u_m)_j] ≤ g̃_j + the same of u^k,
-    D_jk = ∫ Φ_j N_k,   M_jl = ∫ Φ_j N^m_l,   g̃_j = ∫ Φ_j g.
+    Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + the same of u^k,
+    D_jk = ∫ Φ_j N_k ν,   M_jl = ∫ Φ_j N^m_l ν,   g̃_j = ∫ Φ_j |ν| g.
+
+*Balance.* At every Gauss point a row pulls the slave by Φ_j ν at x(ξ) and the master by
+−Φ_j ν at x(ξ) + g n, on the same line. So the forces of a row balance and have no
+moment, to rounding, on curved sides as well. (With n_j outside of the integrals the
+moments are O(h²). A body that contact alone holds then turns until a row far from the
+contact, at the end of an arc, balances those of the rows that press.) That ν is not
+normalised is a weight of 1 − O(h²). The integrals for D are of polynomials with it,
+which the Gauss points integrate exactly: no division of the slave by the master's nodes
+changes D, and a row of the dual basis pulls the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlap of one slave with one master segment, where the
@@ -26,19 +36,21 @@ clipped by these two lines, and the ends of what is left are projected by the on
 that then lies in [−1, 1].
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is biorthogonal on the covered part of each
-segment, ∫ Φ_j N_k = δ_jk ∫ N_k, so that D is diagonal. With the mean ξ̄ and the variance
-v of ξ over the covered part, and N̄_j = N_j(ξ̄), the one linear solution is
+segment, ∫ Φ_j N_k = δ_jk ∫ N_k, so that D is diagonal on straight sides, and on curved
+ones but for O(h). With the mean ξ̄ and the variance v of ξ over the covered part, and
+N̄_j = N_j(ξ̄), the one linear solution is
 
     Φ_1 = N̄_1 − κ (ξ − ξ̄),   Φ_2 = N̄_2 + κ (ξ − ξ̄),   κ = 2 N̄_1 N̄_2 / v
 
 (for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
 
-The tangential rows of friction are the same with t = (−n_y, n_x) for n, and a constant
-bound g of the traction makes ∫ Φ_j g = g ∫ N_j of each row, with either basis.
+The tangential rows of friction are the same with (−ν_y, ν_x) for ν; across a gap their
+forces have a moment. A constant bound of the traction is multiplied by ∫ N_j |ν| for
+each row, with either basis.
 
-Each row is divided by ∫ N_j over the covered part, D_jj of the dual basis: so B is
-dimensionless, g̃ a length, and λ a nodal force per thickness as with node-to-segment.
-Forces Bᵀλ of a row are in equilibrium, their moment only up to O(h²) on curved sides.
+Each row is divided by ∫ N_j |ν| over the covered part: so B is dimensionless, g̃ a
+length, and λ a nodal force per thickness as with node-to-segment, up to O(h²) on curved
+sides.
 """
 
 from __future__ import annotations
@@ -51,13 +63,15 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
 from harness import Vector
-from problems.contact.node_to_segment import ContactRows, tangent
+from problems.contact.node_to_segment import ContactRows
 from problems.contact.polyline import Points, Polyline, cross, current_polyline, unit
 from problems.contact.segment_search import Reach, facing
-from problems.fem.mesh import Nodes
+from problems.fem.mesh import Nodes, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
 NEGLIGIBLE = 1e-8
+#: normals of a straight side differ by as much
+ROUNDED = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 Basis = Literal["dual", "standard"]
@@ -65,12 +79,15 @@ Basis = Literal["dual", "standard"]
 
 @dataclass(frozen=True, eq=False)
 class Mortar:
-    """Mortar integrals of a pair of sides, numbered along their chains."""
+    """Mortar integrals of a pair of sides, numbered along their chains.
 
-    D: csr_array  #: (s, s) ∫ Φ_j N_k, m
-    M: csr_array  #: (s, v) ∫ Φ_j N^m_l, m
-    gap: Vector  #: (s,) g̃_j = ∫ Φ_j g, m²
-    cover: Vector  #: (s,) ∫ N_j, m; 0 where no master is in reach
+    The columns of D and M are components, x and y of each node.
+    """
+
+    D: csr_array  #: (s, 2s) ∫ Φ_j N_k ν, m
+    M: csr_array  #: (s, 2v) ∫ Φ_j N^m_l ν, m
+    gap: Vector  #: (s,) g̃_j = ∫ Φ_j |ν| g, m²
+    cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 where no master is in reach
 
 
 class Overlaps(NamedTuple):
@@ -88,6 +105,7 @@ class GaussPoints(NamedTuple):
     master: Nodes  #: (p,) master segment
     xi: NDArray[np.float64]  #: (p, 3) on the slave segment, in [−1, 1]
     beta: NDArray[np.float64]  #: (p, 3) on the master segment, in [0, 1]
+    field: NDArray[np.float64]  #: (p, 3, 2) ν(ξ), |ν| ≤ 1
     gap: NDArray[np.float64]  #: (p, 3) m
     weight: NDArray[np.float64]  #: (p, 3) m
 
@@ -125,14 +143,11 @@ def mortar(
     m = current_polyline(points, u, master, "master")
     integrals = integrate(s, m, basis, reach)
     j = np.flatnonzero(integrals.cover)
-    held = j if tangential else j[:0]
-    scale, sides = 1 / integrals.cover[j], (slave, master)
-    normal = s.node_normal[j] * scale[:, None]
-    B = _rows_along(integrals, j, normal, sides, points.size)
-    T = _rows_along(integrals, held, tangent(normal[: held.size]), sides, points.size)
+    B = _rows(integrals, j, (slave, master), points.size)
+    T = _turned(B if tangential else B[:0])
     return ContactRows(
-        B, integrals.gap[j] * scale + B @ u,
-        T, np.arange(held.size), integrals.cover[j], j,
+        B, integrals.gap[j] / integrals.cover[j] + B @ u,
+        T, np.arange(T.shape[0]), integrals.cover[j], j,
     )  # fmt: skip
 
 
@@ -145,15 +160,23 @@ def integrate(slave: Polyline, master: Polyline, basis: Basis, reach: Reach) -> 
     j = slave.first[at.slave][:, None] + np.arange(2)  # (p, 2) nodes
     k = master.first[at.master][:, None] + np.arange(2)
     weighted = phi * at.weight[..., None]  # (p, 3, 2)
-    if basis == "dual":
-        diagonal = _gather(weighted.sum(axis=1), j, s)
-        D = csr_array((diagonal, np.arange(s), np.arange(s + 1)), shape=(s, s))
-    else:
-        D = _sum(np.einsum("pgj,pgk->pjk", weighted, N), j, j, (s, s))
-    M = _sum(np.einsum("pgj,pgl->pjl", weighted, _shape(2 * at.beta - 1)), j, k, (s, v))
-    gap = np.einsum("pgj,pg->pj", weighted, at.gap)
-    cover = np.einsum("pgj,pg->pj", N, at.weight)
-    return Mortar(D, M, _gather(gap, j, s), _gather(cover, j, s))
+    overlap = np.einsum("pgj,pgk->pjk", weighted, N)
+    if basis == "dual":  # what cancels in sums over the segments, left out
+        overlap = np.eye(2) * weighted.sum(axis=1)[:, None]
+    own = slave.node_normal[j]  # (p, 2, 2)
+    bent = at.field[:, :, None] - own[:, None]  # ν − n_j
+    bent[np.abs(bent) <= ROUNDED] = 0
+    D = overlap[..., None] * own[:, :, None]
+    D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * bent, N)
+    pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
+    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * at.beta - 1))
+    measure = at.weight * np.linalg.norm(at.field, axis=-1)
+    gap = np.einsum("pgj,pg->pj", phi, measure * at.gap)
+    cover = np.einsum("pgj,pg->pj", N, measure)
+    return Mortar(
+        _sum(D, j, j, (s, s)), _sum(M, j, k, (s, v)),
+        _gather(gap, j, s), _gather(cover, j, s),
+    )  # fmt: skip
 
 
 def overlaps(slave: Polyline, master: Polyline) -> Overlaps:
@@ -204,10 +227,9 @@ def cast_rays(
     N, j = _shape(xi), slave.first[e]
     edge = slave.end[e] - slave.start[e]
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
-    n = N[..., :1] * slave.node_normal[j][:, None]
-    n = unit(
-        n + N[..., 1:] * slave.node_normal[j + 1][:, None], slave.normal[e][:, None]
-    )
+    field = N[..., :1] * slave.node_normal[j][:, None]
+    field += N[..., 1:] * slave.node_normal[j + 1][:, None]
+    n = unit(field, slave.normal[e][:, None])
 
     A, B = master.start[m][:, None], master.end[m][:, None]
     f_A, f_B = cross(x - A, n), cross(x - B, n)  # of opposite signs: the ray hits AB
@@ -219,7 +241,7 @@ def cast_rays(
         np.abs(gap).max(axis=1) <= reach.within(slave, master)
     )
     weight = WEIGHTS * (half * np.linalg.norm(edge, axis=1) / 2)[:, None]
-    return GaussPoints(*(a[kept] for a in (e, m, xi, beta, gap, weight)))
+    return GaussPoints(*(a[kept] for a in (e, m, xi, beta, field, gap, weight)))
 
 
 def _dual(at: GaussPoints) -> NDArray[np.float64]:
@@ -251,30 +273,37 @@ def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
 
 
 def _sum(
-    values: NDArray[np.float64], rows: Nodes, columns: Nodes, shape: tuple[int, int]
+    vectors: NDArray[np.float64], rows: Nodes, nodes: Nodes, shape: tuple[int, int]
 ) -> csr_array:
-    """Add (p, 2, 2) blocks into a matrix at rows (p, 2) × columns (p, 2)."""
-    i = np.repeat(rows, 2, axis=1)
-    j = np.tile(columns, (1, 2))
-    return csr_array(coo_array((values.ravel(), (i.ravel(), j.ravel())), shape))
+    """Add vectors (p, 2, 2, 2) into a matrix at rows (p, 2) × nodes (p, 2).
+
+    shape : counts of rows and nodes; a node has two columns, its components
+    """
+    i = np.repeat(rows, 4, axis=1)
+    j = np.tile(dofs_of(nodes.ravel()).reshape(-1, 4), (1, 2))
+    at = (i.ravel(), j.ravel())
+    return csr_array(coo_array((vectors.ravel(), at), (shape[0], 2 * shape[1])))
 
 
-def _rows_along(
-    integrals: Mortar, j: Nodes, normal: Points, sides: tuple[Nodes, Nodes], size: int
+def _rows(
+    integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], size: int
 ) -> csr_array:
-    """Build n_jᵀ [(D u_s)_j − (M u_m)_j] for the slave nodes j as a matrix on u."""
-    if not j.size:
-        return csr_array((0, size))
-    row_of = np.full(len(sides[0]), -1)
-    row_of[j] = np.arange(j.size)
-    D, M = integrals.D.tocoo(), integrals.M.tocoo()
-    row = row_of[np.concatenate([D.row, M.row])]
-    node = np.concatenate([sides[0][D.col], sides[1][M.col]])
-    values = np.concatenate([D.data, -M.data])
-    kept = row >= 0
-    row, node = row[kept], node[kept]
-    values = values[kept, None] * normal[row]
-    at = (np.repeat(row, 2), np.stack([2 * node, 2 * node + 1], axis=-1).ravel())
-    B = csr_array(coo_array((values.ravel(), at), (len(j), size)))
+    """Build (D u_s − M u_m)_j / cover_j for the slave nodes j as a matrix on u."""
+    D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
+    row = np.concatenate([D.row, M.row])
+    slave, master = (dofs_of(side) for side in sides)
+    at = (row, np.concatenate([slave[D.col], master[M.col]]))
+    values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
+    B = csr_array(coo_array((values, at), (len(j), size)))
     B.eliminate_zeros()
     return B
+
+
+def _turned(B: csr_array) -> csr_array:
+    """Turn the vector (x, y) that a row (m, 2N) has at a node to (−y, x)."""
+    y = B.indices % 2
+    T = csr_array(
+        (np.where(y, -B.data, B.data), B.indices + 1 - 2 * y, B.indptr), B.shape
+    )
+    T.sort_indices()
+    return T

@@ -58,9 +58,11 @@ def contact_sides(
         side = current_polyline(points, u, pair.slave, "slave")
         length = nodal_lengths(points[pair.slave])
         normal = np.einsum("sx,sx->s", pressing, side.node_normal)
-        gap = np.full(len(pair.slave), np.nan)
-        place = slave_places(B[rows], pair.slave)
+        gap, push = np.full((2, len(pair.slave)), np.nan)
+        place, own = slave_places(B[rows], pair.slave)
         gap[place] = slack[rows]
+        push[place] = np.einsum("rx,rx->r", pressing[place], -own)
+        push = np.nan_to_num(push)
         t = tangent(side.node_normal)
         told = np.full(len(pair.slave), "open", dtype=state.dtype)
         told[place[friction.row[rough] - rows.start]] = state[rough]
@@ -68,6 +70,7 @@ def contact_sides(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
                 force=pressing + rubbing, pressure=(0.0 - normal) / length, gap=gap,
+                push=push,
                 shear=np.einsum("sx,sx->s", rubbing, t) / length
                 if rough.any() else None,
                 friction=told if rough.any() else None,
@@ -140,7 +143,17 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     return slices
 
 
-def slave_places(B: csr_array, slave: Nodes) -> NDArray[np.int64]:
-    """Find each row's node, as its place on the slave side: where B is largest."""
-    x, y = (abs(B[:, 2 * slave + c]).toarray() for c in (0, 1))
-    return np.asarray((x + y).argmax(axis=1))
+def slave_places(
+    B: csr_array, slave: Nodes
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Find each row's node, as its place on the slave side: where B is largest.
+
+    Returns
+    -------
+    places (r,), and the directions (r, 2) of the rows there, unit vectors
+
+    """
+    entries = np.stack([B[:, 2 * slave + c].toarray() for c in (0, 1)], axis=-1)
+    place = np.abs(entries).sum(axis=2).argmax(axis=1)
+    own = entries[np.arange(len(place)), place]
+    return place, own / np.linalg.norm(own, axis=1, keepdims=True)

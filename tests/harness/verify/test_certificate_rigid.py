@@ -191,6 +191,26 @@ def test_a_disc_between_plates_is_certified_to_six_digits(form, tilt, contact):
     assert found.seminorm
 
 
+@pytest.mark.parametrize("solver", ["smalbe", "piqp"])
+@pytest.mark.parametrize(
+    ("contact", "basis"), [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
+)
+def test_a_free_plate_on_a_disc_rests_on_no_row_at_the_end_of_the_arc(
+    contact, basis, solver
+):
+    """Rows that press balance among themselves: none is needed that would be far."""
+    form = "dual" if solver == "smalbe" else "primal"
+    case = disc_between_plates(9, form=form, contact=contact, basis=basis)
+    s = SOLVERS[solver].prepare(case.qp, 1e-8)()
+    at = case.mechanics.back(s)
+    far = case.mechanics.primal.h > 0.05  # 15 cm
+
+    assert s.status is Status.SOLVED
+    assert certify(case.mechanics, at).bound <= 1e-6
+    assert far.sum() >= 4
+    assert at.z[far].max() <= 1e-8 * at.z.max()
+
+
 def test_a_load_that_nothing_balances_is_named():
     mechanics = disc_between_plates(push=0.1).mechanics
     s = answer(0 * mechanics.exact.f, np.ones_like(mechanics.exact.c))

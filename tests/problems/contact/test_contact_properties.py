@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from problems.contact.mortar import mortar
+from problems.contact.mortar import _dual, cast_rays, mortar, overlaps
 from problems.contact.node_to_segment import closest_points, node_to_segment
 from problems.contact.polyline import polyline
 from problems.contact.segment_search import Reach
@@ -66,6 +66,29 @@ def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     forces = B.toarray().reshape(len(slave), -1, 2)
     moment = forces[..., 1] @ x[:, 0] - forces[..., 0] @ x[:, 1]
     assert moment[inside] == pytest.approx(0, abs=1e-14)
+
+
+@quick
+@given(side=sides())
+def test_forces_of_a_mortar_row_have_no_moment(side):
+    points, u, slave, master = side
+    x = points + u.reshape(-1, 2)
+    s, m = polyline(x[slave], "slave"), polyline(x[master], "master")
+    at = cast_rays(s, m, overlaps(s, m), Reach())
+    for basis, phi in (("dual", _dual(at)), ("standard", None)):
+        B, c, *rest = METHODS[basis](*side)
+        moments = B.toarray().reshape(len(c), -1, 2) * np.column_stack(
+            [-x[:, 1], x[:, 0]]
+        )
+
+        # terms of the integrals: with a sliver of cover ∫|Φ_j| is large beside ∫N_j
+        terms = 1 + np.abs(moments).sum(axis=(1, 2))
+        if phi is not None:
+            sums = np.zeros(len(slave))
+            j = s.first[at.slave][:, None] + [0, 1]
+            np.add.at(sums, j, np.einsum("pgj,pg->pj", np.abs(phi), at.weight))
+            terms += sums[rest[-1]] / rest[-2]
+        assert (np.abs(moments.sum(axis=(1, 2))) <= 1e-14 * terms).all(), basis
 
 
 @quick

@@ -65,6 +65,17 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
         assert np.nanmax(side.gap) > 0.01  # the disc curves away
 
 
+def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
+    """A row of the dual basis presses at its node and pulls a little beside it."""
+    case = disc_between_plates(8, contact="mortar", basis="dual", rollers=True)
+    s = Clarabel().prepare(case.qp, 1e-10)()
+    active = np.split(s.z > 1e-6 * s.z.max(), 2)
+    for side, expected in zip(case.fields(s).contacts, active, strict=True):
+        force = np.linalg.norm(side.force, axis=1)
+        assert side.pressed(1e-6 * force.max()).tolist() == expected.tolist()
+        assert (force > 1e-6 * force.max()).sum() > expected.sum()
+
+
 def test_hertz_is_found_along_the_side():
     case = HertzPlane().build("primal", HertzPlane().defaults, reference_solution)
     s = Clarabel().prepare(case.qp, 1e-10)()
