@@ -143,13 +143,18 @@ def error_at(s: Solution, optimum: Optimum) -> float:
     )
 
 
-@np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
 def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
-    """Solve a QP by the reference, and prove its optimal value; None if that fails."""
+    """Solve a QP by the reference, and prove its optimal value; None if that fails.
+
+    And where it turns out, once an operator P is multiplied out, that it is not small.
+    """
     if not qp.is_explicit:
         qp = replace(qp, P=assembled(qp.P))
-    if not is_small(qp):  # what an operator tells only now
-        return None
+    return _proven(qp, solve) if is_small(qp) else None
+
+
+@np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
+def _proven(qp: QP, solve: Reference) -> Optimum | None:
     try:
         found = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):

@@ -656,7 +656,7 @@ def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(w
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
-    """In four ways; of 7500 right points one is refuted, see docs/verdicts.md: big-M."""
+    """Of 7500 right points one is refuted, as docs/verdicts.md says: big-M."""
     wrong, refuted, verified = search(314159, 100_000 // len(WAYS), way)
 
     assert wrong == []
