@@ -20,7 +20,7 @@ all KKT conditions, without any rounding, its value is f*, and nothing is on tru
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import copysign, inf, isinf
@@ -33,7 +33,7 @@ from scipy.sparse import coo_array, csr_array
 from harness.operators import assembled
 from harness.plugin import Reference
 from harness.qp import QP, Vector
-from harness.solution import Solution
+from harness.solution import Solution, Status
 from harness.verify.kkt import (
     EXCUSED,
     ROUNDING,
@@ -58,6 +58,7 @@ SPARED = 10.0  #: the objective adds up what residuals say of single rows
 MOST = 0.5  #: of the terms of f*: a larger error is not verified at any tolerance
 SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
 NEEDLESS = 1e4  #: an optimum whose terms exceed another's by so much tells no rounding
+STEPS = 20  #: of active sets, to find an optimum that no reference finds
 RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
 
 
@@ -155,20 +156,12 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
 
 @np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
 def _proven(qp: QP, solve: Reference) -> Optimum | None:
-    try:
-        found = solve(qp)
-    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
-        return None
-    s = replace(
-        found,
-        x=found.x.astype(np.longdouble), y=found.y.astype(np.longdouble),
-        z=np.maximum(found.z, 0).astype(np.longdouble),
-        z_box=np.where(found.z_box < 0, np.where(np.isfinite(qp.lb), found.z_box, 0),
-                       np.where(np.isfinite(qp.ub), found.z_box, 0)
-                       ).astype(np.longdouble),
-    )  # fmt: skip
-    if not kkt_residuals(qp, s, generous=True).worst <= CLOSE:
-        return None
+    s = _reference_point(qp, solve)
+    if s is None:
+        anew = exact_optimum_anew(qp)
+        if anew is None:
+            return None
+        s = anew.solution
     f = _objective(qp, s.x)
     bound = np.where(s.z_box < 0, qp.lb, qp.ub)
     pulls = s.z_box[s.z_box != 0] * (s.x - bound)[s.z_box != 0]
@@ -190,8 +183,9 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
                 s, size = exact.solution, shorter
     # f* cannot be told more accurately than rounding x moves f
     told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
+    work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
     if abs(value) > ROUNDING * terms + doubt:
-        known = min(terms, SMALLEST * told)
+        known = min(terms, SMALLEST * told, work)
     else:
         known = told = terms
     rounding = min(ROUNDING * size, EXCUSED * told)
@@ -199,10 +193,27 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
         return None
     return Optimum(
         qp=qp, value=float(value), doubt=doubt + rounding, energy=SPARED * known,
-        terms=float(max(energy_at(qp, s), abs(s.x @ (qp.P @ s.x)), abs(qp.q @ s.x))),
+        terms=max(energy_at(qp, s), work),
         x=scales_at(qp, s.x.astype(float), known).x,
         own=own_sizes(qp, s.x.astype(float)),
     )  # fmt: skip
+
+
+def _reference_point(qp: QP, solve: Reference) -> Solution | None:
+    """Solve by the reference; None where that is no optimum to the last digits."""
+    try:
+        found = solve(qp)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+        return None
+    s = replace(
+        found,
+        x=found.x.astype(np.longdouble), y=found.y.astype(np.longdouble),
+        z=np.maximum(found.z, 0).astype(np.longdouble),
+        z_box=np.where(found.z_box < 0, np.where(np.isfinite(qp.lb), found.z_box, 0),
+                       np.where(np.isfinite(qp.ub), found.z_box, 0)
+                       ).astype(np.longdouble),
+    )  # fmt: skip
+    return s if kkt_residuals(qp, s, generous=True).worst <= CLOSE else None
 
 
 class ExactOptimum(NamedTuple):
@@ -222,21 +233,60 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
     """
     if qp.q.size > RATIONAL and not (held := coupled(qp)).all():
         return _with_others(qp, s, held)
-    below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    lower, upper = (s.z_box < 0) & below, (s.z_box > 0) & above
+    for point in _exact_points(qp, s):
+        if not any(fault.any() for fault in _faults(qp, point)):
+            return _exact(qp, s, point)
+    return None
+
+
+def exact_optimum_anew(qp: QP) -> ExactOptimum | None:
+    """Find an optimum in rational arithmetic without any guess; None where it is not.
+
+    By primal-dual active-set steps: rows with multipliers of the wrong sign are left
+    out, violated ones are taken in, `STEPS` times at most.
+    """
+    s = Solution.without_point(qp, Status.FAILED)
+    s = replace(s, x=0 * qp.q, y=0 * qp.b, z=0 * qp.h, z_box=0 * qp.q)
+    for _ in range(STEPS):
+        point = next(_exact_points(qp, s), None)
+        if point is None:
+            return None
+        over, under, above, pulling, wrong = _faults(qp, point)
+        if not any(fault.any() for fault in (over, under, above, pulling, wrong)):
+            return _exact(qp, s, point)
+        z_box = np.where(wrong, 0, s.z_box)
+        s = replace(
+            s, z=np.where(over, 1, np.where(pulling, 0, s.z)),
+            z_box=np.where(under, -1, np.where(above, 1, z_box)),
+        )  # fmt: skip
+    return None
+
+
+class _ExactPoint(NamedTuple):
+    """A point in fractions."""
+
+    x: Any  #: (n,)
+    y: Any  #: (m,)
+    z: Any  #: (p,)
+    z_box: Any  #: (n,)
+
+
+def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
+    """Solve the KKT equations of the rows that carry a multiplier, from three guesses.
+
+    Of what they leave open: zero; the least multipliers; all as in `s`.
+    """
+    lower = (s.z_box < 0) & np.isfinite(qp.lb)
+    upper = (s.z_box > 0) & np.isfinite(qp.ub)
     n, pressed, held = qp.q.size, s.z > 0, lower | upper
-    box = np.eye(n)[held]
-    G, lb, ub = rational(_dense(qp.G)), rational(qp.lb[below]), qp.ub[above]
-    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], box])
+    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(n)[held]])
     if n + len(B) > RATIONAL:
-        return None
+        return
     c = np.concatenate([qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[held]])
-    P, q = rational(_dense(qp.P)), rational(qp.q)
     equations = np.block([[_dense(qp.P), B.T], [B, np.zeros((len(B), len(B)))]])
     solve = solutions(rational(equations), rational(np.concatenate([-qp.q, c])))
     if solve is None:
-        return None
-    signs = np.where(upper, 1, -1)[held]
+        return
     least = _least_multipliers(qp, s)
     for x, multipliers in ((0 * s.x, None), (0 * s.x, least), (s.x, s)):
         guess = np.zeros(n + len(B))
@@ -245,22 +295,37 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
             guess[n:] = np.concatenate([
                 multipliers.y, multipliers.z[pressed], multipliers.z_box[held]
             ])  # fmt: skip
-        found = solve(rational(guess))
-        x, y, z, z_box = np.split(found, np.cumsum([n, qp.b.size, int(pressed.sum())]))
-        if (
-            (G @ x <= rational(qp.h)).all()
-            and (x[below] >= lb).all()
-            and (x[above] <= rational(ub)).all()
-            and (z >= 0).all()
-            and (z_box * signs >= 0).all()
-        ):
-            rounded = replace(
-                s, x=x.astype(float), y=y.astype(float),
-                z=np.zeros(qp.h.size), z_box=np.zeros(n),
-            )  # fmt: skip
-            rounded.z[pressed], rounded.z_box[held] = z, z_box
-            return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
-    return None
+        at = np.cumsum([n, qp.b.size, int(pressed.sum())])
+        found, y, z_pressed, z_held = np.split(solve(rational(guess)), at)
+        z, z_box = rational(0 * qp.h), rational(0 * qp.q)
+        z[pressed], z_box[held] = z_pressed, z_held
+        yield _ExactPoint(found, y, z, z_box)
+
+
+def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
+    """Tell where a point breaks the KKT conditions that its equations leave open.
+
+    Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) that pushes where
+    no bound is, or at the other one.
+    """
+    below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
+    under, over = np.zeros(qp.q.size, dtype=bool), np.zeros(qp.q.size, dtype=bool)
+    at_lb, at_ub = under.copy(), under.copy()
+    x, lb, ub = point.x, rational(qp.lb[below]), rational(qp.ub[above])
+    under[below], at_lb[below] = x[below] < lb, x[below] == lb
+    over[above], at_ub[above] = x[above] > ub, x[above] == ub
+    wrong = ((point.z_box < 0) & ~at_lb) | ((point.z_box > 0) & ~at_ub)
+    rows = np.asarray(rational(_dense(qp.G)) @ x > rational(qp.h), dtype=bool)
+    return rows, under, over, np.asarray(point.z < 0, dtype=bool), wrong.astype(bool)
+
+
+def _exact(qp: QP, s: Solution, point: _ExactPoint) -> ExactOptimum:
+    P, q, x = rational(_dense(qp.P)), rational(qp.q), point.x
+    rounded = replace(
+        s, x=x.astype(float), y=point.y.astype(float), z=point.z.astype(float),
+        z_box=point.z_box.astype(float),
+    )  # fmt: skip
+    return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
 
 
 def _with_others(qp: QP, s: Solution, held: NDArray[np.bool_]) -> ExactOptimum | None:
