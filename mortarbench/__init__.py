@@ -101,6 +101,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import a name at its first use: a help text needs neither numpy nor scipy."""
+    if name == "__version__":
+        return import_module("importlib.metadata").version(__name__)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_MODULES[name]), name)

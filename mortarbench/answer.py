@@ -249,7 +249,7 @@ def solve(
 
     """
     tol = tolerance(tol)
-    options = {**solver_options(options), **more}
+    options = solver_options(options, more)
     check_solver(solver)
     problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")

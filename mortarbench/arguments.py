@@ -69,23 +69,26 @@ def tolerance(tol: float, where: str = "tol") -> float:
     return float(tol)
 
 
-def solver_options(options: object) -> dict[str, Any]:
-    """Copy the options of a solver.
+def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, Any]:
+    """Join the options of a solver with those that are given as keywords.
 
     Raises
     ------
     InputError
-        Unless they are a mapping from names to values, or None.
+        Unless they are a mapping from names to values, or None; and when one is among
+        the keywords, too.
 
     """
-    if options is None:
-        return {}
+    options = {} if options is None else options
     if not isinstance(options, Mapping) or not all(isinstance(k, str) for k in options):
         raise InputError(
             f"options = {shown(options)}; expected a dict from names to values, such "
             "as {'max_iter': 50}"
         )
-    return dict(options)
+    twice = sorted(options.keys() & more.keys())
+    if twice:
+        raise InputError(f"{twice[0]} is given twice: in `options` and as a keyword")
+    return {**options, **more}
 
 
 def drawn_scale(scale: float, where: str = "scale") -> float:

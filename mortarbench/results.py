@@ -56,17 +56,23 @@ class Results:
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    solvers: tuple[str, ...] = ()  #: of the suite, in its order
+    solvers: tuple[str, ...] = ()  #: of the suite, in its order; of the folder
     cases: frozenset[str] = frozenset()  #: that were asked for; all where none is named
     #: what was not measured; the same call tries it again
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
     def df(self) -> DataFrame:
-        """A row per measurement, a column per field of the journal."""
+        """A row per measurement, a column per field of the journal.
+
+        A field without values is None: Parquet has no type for a mapping of nothing.
+        """
         from pandas import DataFrame
 
-        return DataFrame([record.to_dict() for record in self.records])
+        rows = [record.to_dict() for record in self.records]
+        return DataFrame(
+            [{k: None if v == {} else v for k, v in r.items()} for r in rows]
+        )
 
     @property
     def refuted(self) -> tuple[Record, ...]:
@@ -204,7 +210,11 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     records = read_journal(path, warn)
     if not records:
         raise InputError(f"{path}: no measurements; expected a result folder of `run`")
-    return Results(folder=path, records=tuple(records))
+    return Results(
+        folder=path, records=tuple(records),
+        solvers=tuple(dict.fromkeys(r.solver for r in records)),
+        cases=frozenset(r.case for r in records),
+    )  # fmt: skip
 
 
 def merge(

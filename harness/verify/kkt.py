@@ -32,7 +32,6 @@ OWN = 10.0  #: times its own terms: the size of a row
 ROUNDED = 1e-9  #: of a row's scale: more of a violation is never called rounding
 TOLD = 1e-12  #: of a row's own terms: a right-hand side below may be rounding
 SMALL = 1e-9  #: of the energies that are known: a point's energy below tells nothing
-GAINING = 1e-4  #: relative residual: a step along less gains about its square
 INFLATED = 1e3  #: lengths that the energy knows of: x counts for no more
 
 
@@ -234,13 +233,8 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     own_r = np.maximum(r - ROUNDING * size, 0)
     # what neither bends nor costs is as long as it is
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    relative = _ratios(own_r, own)
-    if t.told:
-        step = _over(r, t.curvature)
-    elif _sup(relative) > GAINING:
-        step = r * _flexibility(qp, s.x, t, own_r)
-    else:
-        step = t.x
+    # an operator may not tell Pᵢᵢ: x tells one curvature of it, but for x = 0
+    step = _over(r, t.curvature if t.told else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
     way = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
     step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
@@ -250,23 +244,17 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
-        _sup(np.minimum(relative, _ratios(gain, E))),
+        _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
         pulling,
         _ratio(np.minimum(s.z_box, 0)[~lower], S),
         _ratio(np.maximum(s.z_box, 0)[~upper], S),
     )
 
 
-def _flexibility(qp: QP, x: Vector, t: _Terms, r: Vector) -> float:
-    """Give rᵀr/rᵀPr of an operator, along a residual of sizes r (n,).
-
-    Of its components that no bound stops: so far is the minimum along it.
-    """
-    way = np.where(t.residual > 0, x - qp.lb, qp.ub - x)  # downhill
-    along = np.where(way > 0, np.where(t.residual > 0, r, -r), 0.0)
-    squared = float(along @ along)
-    bent = float(along @ (qp.P @ along)) if squared > 0 else 0.0
-    return squared / bent if bent > 0 else np.inf
+def _rayleigh(x: Vector, Px: Vector) -> Vector:
+    """Give xᵀPx/xᵀx for each variable (n,), 0 where x is zero."""
+    squared = float(x @ x)
+    return float(x @ Px) / squared + 0 * x if squared > 0 else 0 * x
 
 
 def _complementarity(
@@ -300,7 +288,8 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     their own sum, the objective, or than 1e-4 of itself where the objective vanishes.
     At least a hundredth of the smallest natural energy of a variable (`_alone`).
 
-    generous : cancellation is forgiven, and the median of natural energies counts whole
+    generous : cancellation is forgiven, and the median of natural energies counts, all
+        of it where the point has no energy of its own
     """
     terms = _sup(t.energies)
     value = abs(float(t.energies[0] / 2 + t.energies[1]))
@@ -316,7 +305,8 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         alone = pick(_alone(qp, t.curvature, tightened(qp), by_length=True))
     if not alone < np.inf:
         return E
-    return max(E, alone if generous else SHARE * alone)
+    vanishes = generous and E <= SMALL * alone
+    return alone if vanishes else max(E, SHARE * alone)
 
 
 def _least(values: Vector) -> float:

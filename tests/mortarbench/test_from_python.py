@@ -520,3 +520,10 @@ def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
         "<Case qp: 2 variables, 0 equalities, 1 inequalities, 0 bounds>"
     )
     assert isinstance(case.registries, Registries)
+
+
+def test_an_option_that_is_given_twice_is_refused():
+    with pytest.raises(mb.InputError, match="max_iter is given twice"):
+        mb.solve(
+            "obstacle/dim=1/n=4/primal", "clarabel", options={"max_iter": 9}, max_iter=3
+        )

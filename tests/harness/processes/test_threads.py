@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 
@@ -252,6 +253,8 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
          "--plugin", str(plugin)],
         env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
         stderr=subprocess.PIPE, text=True,
+        # a shell that runs the tests in the background has them ignore Ctrl-C
+        preexec_fn=partial(signal.signal, number, signal.SIG_DFL),
     )  # fmt: skip
     assert soon((tmp_path / "started").exists)
     process = int((tmp_path / "started").read_text())

@@ -343,9 +343,12 @@ def test_the_scaled_qp_has_entries_of_about_one_and_the_same_points():
     assert kkt_residuals(qp, scaled.recover(s)).worst <= 1e-13
 
 
-def test_an_operator_is_refused_in_one_line():
-    qp, _ = manufactured("box")
+def test_a_large_operator_is_refused_in_one_line_and_a_small_one_multiplied_out():
+    qp, point = manufactured("box")
+    s = reference_solution(replace(qp, P=aslinearoperator(qp.P)))
+    assert s.x == pytest.approx(point.x)
 
+    qp, _ = manufactured("box", n=801)
     with pytest.raises(ValueError, match="needs P as a matrix, got an operator") as e:
         reference_solution(replace(qp, P=aslinearoperator(qp.P)))
     assert "\n" not in str(e.value)
