@@ -27,6 +27,7 @@ ROUNDING = 8 * float(np.finfo(float).eps)  #: of a sum of terms, relative to the
 EXCUSED = 2e-4  #: of its scale: more of a residual is never called rounding
 CANCELLED = 1e4  #: terms may exceed their sum by so much before the sum counts alone
 SHARE = 1e-2  #: of a natural energy: the least scale of energy
+VANISHING = 1e-6  #: of a natural energy: a point with less has none of its own
 NOISE = 1e-26  #: of the largest natural energy: smaller ones come of rounding in q
 OWN = 10.0  #: times its own terms: the size of a row
 ROUNDED = 1e-9  #: of a row's scale: more of a violation is never called rounding
@@ -305,7 +306,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         alone = pick(_alone(qp, t.curvature, tightened(qp), by_length=True))
     if not alone < np.inf:
         return E
-    vanishes = generous and E <= SMALL * alone
+    vanishes = generous and E <= VANISHING * alone
     return alone if vanishes else max(E, SHARE * alone)
 
 

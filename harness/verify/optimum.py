@@ -102,6 +102,12 @@ def decided(
     if not is_small(qp):
         return None
     most = allowed(tol)
+    if not qp.is_explicit:  # which knows no rounding of its products
+        found = prove(qp)
+        if found is None:
+            return None
+        qp = found.qp
+        residuals = kkt_residuals(qp, s)
     if not (
         residuals.worst <= most or kkt_residuals(qp, s, generous=True).worst <= most
     ):

@@ -9,7 +9,7 @@ import pytest
 from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdict
 from harness.conformance.hard_qps import KINDS, hard
 from harness.record import Record
-from harness.verify.kkt import Residuals, rejudged, tightened
+from harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
 from harness.verify.optimum import (
     decided,
     error_at,
@@ -502,10 +502,11 @@ WAYS = {"as it is": (0, False), "400 idle": (400, False), "operator": (0, True),
 class Attack:
     """Points of one planted QP that somebody may want to pass off as its solution."""
 
-    def __init__(self, planted, rng, way="as it is"):
+    def __init__(self, planted, rng, way="as it is", *, is_unique=True):
         self.qp, self.s, self.value = planted.qp, planted.solution, planted.value
         self.rng = rng
         self.prove = proves(reference_solution)
+        self.is_unique = is_unique
         self.idle, is_operator = WAYS[way]
         self.stated = with_idle(self.qp, rng, self.idle) if self.idle else self.qp
         if is_operator:
@@ -536,16 +537,22 @@ class Attack:
         return abs(self.objective(s.x) - self.value) / size
 
     def violation(self, x, at):
-        """The worst row or bound, relative to its terms at sizes `at` of x, if any."""
+        """The worst row or bound, relative to its terms at sizes `at` of x, if any.
+
+        Where other solutions are longer, rounding at such a point is none.
+        """
         qp, worst = self.qp, 0.0
-        for off, b, terms in (
-            (abs(qp.A @ x - qp.b), qp.b, abs(qp.A) @ at),
-            (qp.G @ x - qp.h, qp.h, abs(qp.G) @ at),
-            (qp.lb - x, qp.lb, at),
-            (x - qp.ub, qp.ub, at),
+        box = np.eye(x.size)
+        for M, off, b in (
+            (qp.A, abs(qp.A @ x - qp.b), qp.b),
+            (qp.G, qp.G @ x - qp.h, qp.h),
+            (box, qp.lb - x, qp.lb),
+            (box, x - qp.ub, qp.ub),
         ):
-            size = abs(b) + terms
+            size = abs(b) + abs(M) @ at
             told = np.isfinite(b) & (size > 0)
+            if not self.is_unique:
+                off = off - ROUNDING * (abs(b) + abs(M) @ abs(x))
             worst = max(worst, (off[told] / size[told]).max(initial=0.0))
         return worst
 
@@ -664,7 +671,8 @@ def search(seed, tries, way, each=40):
                 map(str, rng.choice([*KINDS], rng.integers(0, 4), replace=False))
             )
             number = int(rng.integers(2**30))
-            attack = Attack(hard(kinds, number), rng, way)
+            is_unique = not kinds & {"duplicates", "free direction", "singular"}
+            attack = Attack(hard(kinds, number), rng, way, is_unique=is_unique)
             for _ in range(3):
                 s = attack.rounded()
                 if attack.error(s) < 1e-9 and not attack.verified(s):
