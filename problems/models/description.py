@@ -148,6 +148,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         materials = _materials(table["bodies"], named)
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
+        _check_felt(table["loads"], loads, np.concatenate(fixed))
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
         _described_once(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
@@ -248,6 +249,27 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     if kinds == ["force"]:
         weights /= weights.sum()
     return np.outer(weights, vector)
+
+
+def _check_felt(
+    entries: Sequence[Mapping[str, Any]],
+    loads: Sequence[NDArray[np.float64]],
+    fixed: Nodes,
+) -> None:
+    """Refuse a load with a component that acts on prescribed displacements alone."""
+    for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
+        lost = []
+        for component, name in enumerate("xy"):
+            at = np.flatnonzero(load[:, component])
+            if at.size and np.isin(2 * at + component, fixed).all():
+                lost.append(name)
+        if lost:
+            where = entry.get("boundary", entry.get("point"))
+            raise InputError(
+                f"loads[{i}] acts on {where!r} in {' and '.join(lost)}, which fix "
+                "holds there: it has no effect; load another side, or hold other "
+                "components"
+            )
 
 
 def _friction(entry: Mapping[str, Any]) -> None:

@@ -487,6 +487,48 @@ def test_a_bad_description_is_refused_with_file_entry_and_remedy(
     assert "\n" not in str(e.value)
 
 
+POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
+
+
+@pytest.mark.parametrize(
+    ("load", "supports", "told"),
+    [
+        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
+        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
+        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, which"),
+        (POINT_LOAD, '[[supports]]\npoint = "corner"\nfix = ["y"]\n',
+         "acts on 'corner' in y, which"),
+        ('boundary = "top"\nforce = [1e5, -1e8]',
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
+    ],
+)  # fmt: skip
+def test_a_load_that_its_supports_take_up_is_refused(described, load, supports, told):
+    """Every component of it is prescribed to be zero: no body feels it."""
+    toml = TOML.replace(POINT_LOAD, load) + supports
+    with pytest.raises(InputError) as e:
+        build(f"{described(toml=toml)}/step=1/dual")
+
+    assert str(e.value) == (
+        f"a.toml: loads[0] {told} fix holds there: it has no effect; load another "
+        "side, or hold other components"
+    )
+
+
+@pytest.mark.parametrize(
+    ("load", "supports"),
+    [
+        # one node of the top, at its left end, is held
+        ('boundary = "top"\nforce = [0, -1e8]', ""),
+        ('boundary = "top"\nforce = [0, -1e8]',
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n'),
+        ('boundary = "left"\nforce = [0, 0]\n[[loads]]\n' + POINT_LOAD, ""),
+    ],
+)  # fmt: skip
+def test_a_load_that_supports_take_up_in_part_is_a_load(described, load, supports):
+    toml = TOML.replace(POINT_LOAD, load) + supports
+    assert build(f"{described(toml=toml)}/step=1/dual").qp.q.any()
+
+
 def test_a_missing_body_is_named(described):
     text = described(toml=re.sub(r'\[\[bodies\]\]\nname = "ring"\n.*\n.*\n', "", TOML))
     with pytest.raises(
