@@ -18,6 +18,7 @@ from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
+from tests.support.gmsh_files import msh22, square
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -75,28 +76,6 @@ def parts(flip=False):
         cells[::3] = cells[::3, ::-1]
     quads = {name: cells[RING.body == i] for i, name in enumerate(RING.names)}
     return quads, curves, {"corner": np.array([[CORNER]])}
-
-
-def msh22(points, quads, curves, spots, quad_type=3):
-    """Write ASCII 2.2: gmsh's element types are 15 (point), 1 (line), 3 (quad)."""
-    groups, rows, tag = [], [], 0
-    for dimension, kind, named in (
-        (0, 15, spots),
-        (1, 1, curves),
-        (2, quad_type, quads),
-    ):
-        for name, cells in named.items():
-            tag += 1
-            groups += [f'{dimension} {tag} "{name}"'] if name else []
-            for cell in cells:
-                nodes = " ".join(str(n + 1) for n in cell)
-                rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
-    nodes = [f"{i} {x!r} {y!r} {z!r}" for i, (x, y, z) in enumerate(points.tolist(), 1)]
-    blocks = {"PhysicalNames": groups, "Nodes": nodes, "Elements": rows}
-    text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
-    for name, lines in blocks.items():
-        text += "\n".join([f"${name}", str(len(lines)), *lines, f"$End{name}", ""])
-    return text
 
 
 def msh41(points, quads, curves, spots):
@@ -535,14 +514,6 @@ def test_a_missing_body_is_named(described):
         InputError, match="bodies: physical surface 'ring' has no entry"
     ):
         build(f"{text}/dual")
-
-
-def square(n=2, at=(0.0, 0.0)):
-    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0))
-    points = np.column_stack([x.ravel() + at[0], y.ravel() + at[1], 0 * x.ravel()])
-    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
-    return points, cells.reshape(-1, 4)
 
 
 def read(tmp_path, *contents, **kinds):
