@@ -60,12 +60,15 @@ master = "table"
 """
 
 
-def stacked_blocks(folder, gap=0.0, toml=BLOCKS):
+def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
     """Write two squares of side 2, one above the other; return the description.
 
     Their Poisson's ratio is zero: pressed together, each is in uniaxial stress.
+
+    sag : by which the middle of the upper one's lower side is lower than its ends
     """
     (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0 + gap))
+    upper[1, 1] -= sag
     sides = {
         "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
         "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
