@@ -77,6 +77,8 @@ from problems.ranges import (
 )
 
 _SIDES = ("slave", "master")
+_PLACES = ("boundary", "point")
+_LOADS = ("force", "traction")
 #: names of units of length, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -220,6 +222,7 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
 
 def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
     """Return the displacement components that a support fixes."""
+    checked.only_keys(entry, (*_PLACES, "fix"))
     nodes, _ = _place(entry, named, ("fix",))
     fix = checked.filled_list("fix", entry["fix"])
     for component in fix:
@@ -230,7 +233,8 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     """Return the nodal forces (N, 2) of a load, N/m."""
-    kinds = [kind for kind in ("force", "traction") if kind in entry]
+    checked.only_keys(entry, (*_PLACES, *_LOADS))
+    kinds = [kind for kind in _LOADS if kind in entry]
     if len(kinds) != 1:
         raise InputError("expected either force or traction, [x, y]")
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
@@ -373,7 +377,7 @@ def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
     """Find the nodes, and the edges if there are any, that an entry is about."""
-    where = [key for key in ("boundary", "point") if key in entry]
+    where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, a physical name")
     _keys(entry, (*where, *others))

@@ -2,8 +2,10 @@
 
 import re
 import shutil
+import struct
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
@@ -79,15 +81,16 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1, one entity for each physical group."""
+    """Write ASCII 4.1, one entity for each physical group, or for cells without one."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
         for name, cells in named.items():
             tag += 1
-            groups.append(f'{dimension} {tag} "{name}"')
+            groups += [f'{dimension} {tag} "{name}"'] if name else []
             box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            entities.append(f"{tag} {box} 1 {tag}" + (" 0" if dimension else ""))
+            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 writes these, too
+            entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
             blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
             for cell in cells:
                 cell_number += 1
@@ -443,6 +446,12 @@ def test_nodes_of_no_cell_are_left_out(described):
         ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
         ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: the loads sum up to"),
         ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
+        ("force = [0, -1e8]", "forces = [0, -1e8]",
+         "a.toml: loads[0]: unknown key 'forces'; did you mean 'force'? known: "),
+        ('point = "corner"', 'pint = "corner"',
+         "a.toml: loads[0]: unknown key 'pint'; did you mean 'point'? known: "),
+        ('boundary = "feet"', 'boundry = "feet"',
+         "a.toml: supports[1]: unknown key 'boundry'; did you mean 'boundary'? known"),
         ("force = [0, -1e8]", "traction = [0, -1e8]", "a.toml: loads[0]: a point"),
         ('slave = "outer"', 'slave = "outre"',
          "a.toml: contacts[0]: slave: unknown physical curve 'outre'; did you mean 'o"),
@@ -539,6 +548,10 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
          ' named surface: Physical Surface("NAME") in the .geo file'),
+        # the file has no cells of a surface that has no physical name
+        (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
+         "that bounds no body in the file: gmsh leaves out surfaces without a physical "
+         'name; expected Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
@@ -555,6 +568,87 @@ def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
+
+
+def untagged(text):
+    """Set the physical tags of format 2.2 to zero where they have no name.
+
+    This is what Mesh.SaveAll = 1 writes of entities in no physical group.
+    """
+    named = set(re.findall(r'^\d (\d+) "', text, re.M))
+    head, cells = text.split("$Elements\n")
+    return head + "$Elements\n" + re.sub(
+        r"^(\d+ \d+ 2) (\d+)",
+        lambda m: m[0] if m[2] in named else f"{m[1]} 0", cells, flags=re.M,
+    )  # fmt: skip
+
+
+SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
+
+
+@pytest.mark.parametrize("writer", SAVED)
+def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
+    """Curves and points without a name, as of Mesh.SaveAll = 1, change nothing."""
+    quads, curves, spots = parts()
+    more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
+    read = []
+    for name, contents in (("a", (curves, spots)), ("b", more)):
+        (tmp_path / f"{name}.msh").write_text(writer(POINTS, quads, *contents))
+        read.append(read_msh(tmp_path / f"{name}.msh"))
+
+    np.testing.assert_array_equal(read[0].points, read[1].points)
+    np.testing.assert_array_equal(read[0].cells, read[1].cells)
+    assert list(read[0].curves) == list(read[1].curves)
+    for name, edge in read[0].curves.items():
+        np.testing.assert_array_equal(edge, read[1].curves[name])
+
+
+@pytest.mark.parametrize("writer", SAVED)
+def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer):
+    points, cells = square()
+    contents = points, {"a": cells[:1], "": cells[1:]}, {"m": [[7, 8]]}, {}
+    (tmp_path / "m.msh").write_text(writer(*contents))
+    with pytest.raises(InputError) as e:
+        read_msh(tmp_path / "m.msh")
+
+    assert str(e.value).endswith(
+        "m.msh: 3 cells without a name; expected each in a named surface: "
+        'Physical Surface("NAME") in the .geo file; or, if they are of no body, save '
+        "only physical groups: Mesh.SaveAll = 0"
+    )
+
+
+def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
+    """The entities of a text without the tag of its first curve, in binary."""
+    text = msh41(POINTS, *parts())
+    (tmp_path / "a.msh").write_text(text)
+    mesh = meshio.gmsh.read(tmp_path / "a.msh")
+    meshio.gmsh.write(tmp_path / "m.msh", mesh, "4.1", binary=True)
+    data = (tmp_path / "m.msh").read_bytes()
+    counts, point, *others = text.split("$Entities\n")[1].split("\n$End")[0].split("\n")
+    packed = struct.pack("4Q", *map(int, counts.split()))
+    packed += struct.pack("<i3dQi", *map(int, point.split()))
+    for k, line in enumerate(others):
+        tag, *box, _, physical, _ = map(int, line.split())
+        packed += struct.pack("<i6d", tag, *box)
+        packed += struct.pack("<Qi", 1, physical) if k else struct.pack("<Q", 0)
+        packed += struct.pack("<Q", 0)
+    head, _, rest = re.split(rb"\$(?:End)?Entities\n", data)
+    binary = head + b"$Entities\n" + packed + b"\n$EndEntities\n" + rest
+    (tmp_path / "m.msh").write_bytes(binary)
+    with pytest.raises(InputError, match=r"m\.msh: .*Mesh\.SaveAll = 0"):
+        read_msh(tmp_path / "m.msh")
+
+
+def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
+    text = described(toml=TOML.replace("two.msh", "two.geo"))
+    Path("two.geo").write_text("Point(1) = {0, 0, 0};\n")
+    with pytest.raises(InputError) as e:
+        build(f"{text}/dual")
+
+    assert str(e.value) == (
+        "two.geo: a drawing, not a mesh; mesh it first: gmsh -2 two.geo writes two.msh"
+    )
 
 
 def test_a_body_of_two_parts_is_refused(tmp_path):
