@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from contextlib import redirect_stderr
 from io import StringIO
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -213,10 +213,10 @@ def _parsed(path: Path) -> Any:
         if fields[at] == b"0":
             fields[at : at + 1] = [b"1", b"0"]
     text = b"\n".join([b"", *(b" ".join(fields) for fields in lines), b""])
-    with NamedTemporaryFile(suffix=".msh") as copy:
-        copy.write(head + start + text + end + rest)
-        copy.flush()
-        return meshio.gmsh.read(copy.name)
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(head + start + text + end + rest)
+        return meshio.gmsh.read(copy)
 
 
 def _numbers(data: bytes) -> NDArray[np.int64] | None:
