@@ -218,6 +218,13 @@ class Family(ABC):
         """
         return None
 
+    def unrefined(self, params: Mapping[str, Value]) -> str:
+        """Describe the part of the geometry that `refined` leaves coarse, or "".
+
+        The words follow an error of the mesh: "of the bodies as they are meshed".
+        """
+        return ""
+
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
         """Return the file that a case is read from, to be copied with its results."""
         return None
@@ -285,6 +292,10 @@ class _Offered(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         finer: Mapping[str, Value] | None = self._own("refined")(params)
         return finer
+
+    def unrefined(self, params: Mapping[str, Value]) -> str:
+        words: str = self._own("unrefined")(params)
+        return words
 
     def emission(
         self, form: str, params: Mapping[str, Value]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from html import escape
@@ -53,6 +53,11 @@ if TYPE_CHECKING:
 
     from harness.crossval.discretisation import Discretisation
 
+LOOSE = 0.01  #: certified relative error above which a verified answer has a remark
+#: sum of the contact forces, relative to that of the loads, up to which there is no
+#: contact: interior points end at 1e-8 or so of their scale, a closed contact far above
+UNFELT_FORCE = 1e-6
+
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Answer:
@@ -64,6 +69,7 @@ class Answer:
     spec: SolverSpec
     solver: str | Solver  #: as given to `solve`: a name or an object
     defaults: Mapping[str, Any]  #: options that the solver has if none are given
+    remarks: tuple[str, ...] = ()  #: reasons to doubt what is verified, a line each
 
     @property
     def verdict(self) -> Verdict:
@@ -101,9 +107,13 @@ class Answer:
         return self.solution is not None and has_point(self.solution)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: the record, and the history of the iterations."""
+        """Plain data for JSON: the record, the history of the iterations, remarks."""
         history = finite(plain(self.history))
-        return {**json.loads(self.record.to_json()), "history": history}
+        return {
+            **json.loads(self.record.to_json()),
+            "history": history,
+            "remarks": [*self.remarks],
+        }
 
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
         """Estimate the error of the mesh, to which that of the solver adds.
@@ -201,15 +211,92 @@ class Answer:
         return path
 
     def __repr__(self) -> str:
-        return outcome(self.record, self.defaults)
+        notes = (f"note: {text}" for text in self.remarks)
+        return "\n".join([outcome(self.record, self.defaults), *notes])
 
     def _repr_html_(self) -> str:
         rows = (
             f"<tr><th style='text-align:left'>{escape(name)}</th>"
             f"<td style='text-align:left'>{escape(value)}</td></tr>"
-            for name, value in outcome_rows(self.record, self.defaults)
+            for name, value in (
+                *outcome_rows(self.record, self.defaults),
+                *(("note", text) for text in self.remarks),
+            )
         )
         return f"<table>{''.join(rows)}</table>"
+
+
+def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str, ...]:
+    """Return the reasons why a person may doubt a verified answer, a line each.
+
+    The QP is solved; its certificate may bound little, and the QP may not be what was
+    meant: no contact, or displacements that linear kinematics does not describe.
+    """
+    if record.verdict is not Verdict.VERIFIED or solution is None:
+        return ()
+    found = []
+    bound = record.energy_bound
+    if bound is not None and bound == np.inf:
+        found.append(
+            "the certificate does not bound the solver's error: the displacements may "
+            "be as small as rounding, or a load may act on supports"
+        )
+    elif bound is not None and bound > LOOSE:
+        found.append(
+            f"the solver's error is certified to be at most {100 * bound:.2g} % only; "
+            "a smaller tolerance may bound it better"
+        )
+    # on ranks nothing is built here; a plug-in's code may fail
+    with suppress(Exception), one_thread():
+        if _is_open(case, record, solution):
+            found.append(
+                "no node is in contact: the sides stay apart, and the answer is that "
+                "of bodies without contact; see the direction of the load, and the gap"
+            )
+    with suppress(Exception), one_thread():
+        found += _large_displacements(case, solution)
+    return tuple(found)
+
+
+def _is_open(case: Case, record: Record, solution: Solution) -> bool:
+    """Whether no contact row presses; interior points leave forces like rounding."""
+    if not record.quantities.get("contact_rows"):
+        return False
+    if record.quantities.get("active") == 0:
+        return True
+    mechanics = case.made.mechanics if "made" in vars(case) else None
+    if mechanics is None:
+        return False
+    normal = mechanics.back(solution).z[: mechanics.primal.h.size]
+    load = np.abs(mechanics.primal.q).sum()
+    return bool(np.abs(normal).sum() <= UNFELT_FORCE * load)
+
+
+def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
+    """Yield a remark if a body moves by more than its size, with linear kinematics."""
+    if "made" not in vars(case) or case.params.get("kinematics") == "finite":
+        return
+    mechanics = case.made.mechanics
+    if mechanics is None or mechanics.grid is None:
+        return
+    grid, u = mechanics.grid, case.made.recover(solution)
+    if u.size != grid.points.size:
+        return  # a height, as of membranes, is not a motion along the mesh
+    moved = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
+    worst, text = 1.0, ""
+    for body in np.unique(grid.bodies):
+        nodes = np.unique(grid.cells[grid.bodies == body])
+        size = float(np.ptp(grid.points[nodes], axis=0).max())
+        if moved[nodes].max() > worst * size:
+            worst = float(moved[nodes].max()) / size
+            name = repr(mechanics.names[body]) if mechanics.names else str(body)
+            text = (
+                f"body {name} moves by up to {moved[nodes].max():.3g} m and is "
+                f"{size:.3g} m large; linear kinematics describes small displacements: "
+                "see the moduli, the loads and the supports"
+            )
+    if text:
+        yield text
 
 
 @TURN
@@ -312,7 +399,7 @@ def answers_of(
             )  # fmt: skip
         return Answer(
             case=case, record=record, solution=solution, spec=spec, solver=solver,
-            defaults=defaults,
+            defaults=defaults, remarks=remarks(case, record, solution),
         )  # fmt: skip
 
     work = None

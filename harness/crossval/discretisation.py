@@ -78,7 +78,7 @@ class Discretisation:
     error: float | None = None  #: relative to ‖û‖, energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
     rate: float | None = None  #: q of the squared error, observed
-    note: str = ""  #: why there is no more than that
+    note: str = ""  #: why there is no more than that; of a limit, of which geometry
     levels: tuple[Level, ...] = ()  #: coarsest first, that is the case itself
     params: Mapping[str, object] = field(default_factory=dict)  #: of the case, all
 
@@ -88,6 +88,8 @@ class Discretisation:
             return f"unknown: {self.note}"
         before = {"limit": "about ", "rounding": "less than "}.get(self.kind, "")
         after = f" to the next finer mesh only: {self.note}" * (self.kind == "change")
+        if self.kind == "limit" and self.note:
+            after = f", {self.note}"
         return f"{before}{brief(self.error)}{after}"
 
 
@@ -112,6 +114,11 @@ def estimated(
     found = replace(nothing, kind="change", error=change, change=change, rate=rate)
     if singular or rate is None:
         return replace(found, note=singular or note)
+    if rate <= 0:
+        return replace(
+            found, note="it does not fall on these meshes: the next halving changes "
+            f"{2 ** (-rate / 2):.3g} times as much",
+        )  # fmt: skip
     if rate < SLOWEST:
         return replace(
             found, note=f"it falls slowly on these meshes, like h^{rate / 2:.2f}"
@@ -146,7 +153,9 @@ def discretisation_errors(
             left = _Halving(case.family, reference, folder / "references", end)
             levels = tuple(left.levels(case))
             new = estimated(physical, levels, case.family.singular, left.why)
-            new = replace(new, params=case.params)
+            kept = case.family.unrefined(case.params) if new.error is not None else ""
+            note = "; ".join(filter(None, [new.note, kept]))
+            new = replace(new, params=case.params, note=note)
             old = earlier.get(physical, new)
             found[physical] = old if left.late and _continues(old, new) else new
     _write(folder / FILE, found.values())

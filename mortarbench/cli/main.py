@@ -312,7 +312,8 @@ def _add_solve_options(command: _Parser) -> None:
         metavar="S",
         type=float,
         help="multiply the displacement in the picture; default: 1 where it can be "
-        "seen, else a round factor that the picture states",
+        "seen, else a round factor that the picture states; above 1, bodies in "
+        "contact may seem to overlap",
     )
     command.add_argument(
         "--vtu",

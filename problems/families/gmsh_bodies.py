@@ -104,8 +104,20 @@ class GmshBodies(InSubdomains):
         from problems.models.gmsh_bodies import laws_of
 
         one_state(self.name, params)
-        minimised(self.name, [law.kind for law in laws_of(params)])
+        laws = [law.kind for law in laws_of(params)]
+        minimised(self.name, laws, "halvings=0, 1 and 2")
         return {**params, "halvings": int(params["halvings"]) + 1}
+
+    def unrefined(self, params: Mapping[str, Value]) -> str:
+        """Name the arcs of contact sides, whose chords halving leaves as they are."""
+        from problems.models.gmsh_bodies import has_arcs
+
+        if not has_arcs(params):
+            return ""
+        return (
+            "of the bodies as they are meshed; chords of an arc stay corners: for "
+            "pressures, mesh anew"
+        )
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
         """Whether there are parts, and no Newton iterations."""

@@ -85,8 +85,10 @@ class ContactPatch(InSubdomains):
         is none: the QP of another mesh is linearised at another state.
         """
         one_state(self.name, params)
-        minimised(self.name, [str(params["friction"])])
-        return {**params, **doubled(params, "lower", "upper")}
+        finer = doubled(params, "lower", "upper")
+        meshes = "/".join(f"{key}={n}" for key, n in finer.items())
+        minimised(self.name, [str(params["friction"])], meshes)
+        return {**params, **finer}
 
     def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
         """Whether there are subdomains, and no Newton iterations."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from contextlib import redirect_stderr
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ _SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
 _SPACE = "three dimensions are not supported yet"
 _FIRST_ORDER = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -2 -order 1"
 _NAMED = 'Physical Surface("NAME") in the .geo file'
+_SAVED = "only physical groups: Mesh.SaveAll = 0"
 
 
 class NamedMesh(NamedTuple):
@@ -153,14 +155,17 @@ def _remedy(block: Any) -> str:
 
 
 def _read(path: Path) -> Any:
-    import meshio  # late: workers and other families do without it
-
+    if path.suffix.lower() == ".geo":
+        raise InputError(
+            f"{path}: a drawing, not a mesh; mesh it first: gmsh -2 {path.name} writes "
+            f"{path.with_suffix('.msh').name}"
+        )
     with opened(path, "a .msh file") as file:
         size = os.fstat(file.fileno()).st_size
     check_size(f"{path}: what it says", _COPIES * size)
     with parsing(path, "not a .msh file of format 2.2 or 4.1", _COPIES * size):
         with redirect_stderr(StringIO()):  # what meshio says of sections that it skips
-            mesh = meshio.gmsh.read(path)  # meshio.read would print and exit
+            mesh = _parsed(path)
         points = np.asarray(mesh.points, dtype=float)
         cells = [np.asarray(block.data) for block in mesh.cells]
         tags = mesh.cell_data.get("gmsh:physical", [])
@@ -180,6 +185,38 @@ def _read(path: Path) -> Any:
     if tags and not tagged:
         raise InputError(f"{path}: not every cell has a tag; expected one for each")
     return mesh
+
+
+def _parsed(path: Path) -> Any:
+    """Parse a file by meshio, which wants every entity of format 4.1 to have a tag.
+
+    Mesh.SaveAll = 1 writes cells of entities in no physical group, too. Format 2.2 has
+    tag 0 for them, which the text of format 4.1 is given here.
+    """
+    import meshio  # late: workers and other families do without it
+
+    try:
+        return meshio.gmsh.read(path)  # meshio.read would print and exit
+    except ValueError as e:
+        if "gmsh:physical" not in str(e):
+            raise
+    head, start, rest = path.read_bytes().partition(b"$Entities")
+    if head.split(b"$MeshFormat")[1].split(maxsplit=2)[1] != b"0":
+        raise InputError(
+            f"{path}: cells without a physical name in a binary file; expected {_SAVED}"
+        )
+    entities, end, rest = rest.partition(b"$EndEntities")
+    lines = [line.split() for line in entities.split(b"\n") if line.split()]
+    points = int(lines[0][0])
+    for i, fields in enumerate(lines[1:]):
+        at = 4 if i < points else 7  # tag, position or box, number of physical tags
+        if fields[at] == b"0":
+            fields[at : at + 1] = [b"1", b"0"]
+    text = b"\n".join([b"", *(b" ".join(fields) for fields in lines), b""])
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        copy.write_bytes(head + start + text + end + rest)
+        return meshio.gmsh.read(copy)
 
 
 def _numbers(data: bytes) -> NDArray[np.int64] | None:
@@ -213,6 +250,7 @@ def _named(path: Path, mesh: Any, wanted: int) -> dict[str, Nodes]:
     }
     found: dict[str, list[Nodes]] = {}
     tags = mesh.cell_data.get("gmsh:physical", [np.zeros(len(b)) for b in mesh.cells])
+    nameless: list[int] = []  # physical tags of cells
     for block, tag in zip(mesh.cells, tags, strict=True):
         if DIMENSION[block.type] != wanted:
             continue
@@ -223,10 +261,15 @@ def _named(path: Path, mesh: Any, wanted: int) -> dict[str, Nodes]:
                     part = part[:, [0, 1, 2, 2]]
                 found.setdefault(names[int(number)], []).append(part)
             elif wanted == 2:
-                raise InputError(
-                    f"{path}: {(tag == number).sum()} cells without a name; expected "
-                    f"each in a named surface: {_NAMED}"
-                )
+                nameless += tag[tag == number].tolist()
+    if nameless:
+        # gmsh leaves out what is in no physical group, unless there is none
+        is_all = 0 in nameless and mesh.field_data
+        more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
+        raise InputError(
+            f"{path}: {len(nameless)} cells without a name; expected each in a named "
+            f"surface: {_NAMED}{more}"
+        )
     return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
@@ -289,6 +332,11 @@ def _directed(
     path: Path, name: str, edges: Nodes, boundary: Mapping[Any, tuple[int, int]]
 ) -> Nodes:
     """Give the edges of a curve the direction that has the body on the left."""
+    if (edges < 0).any():
+        raise InputError(
+            f"{path}: curve {name!r} has an edge that bounds no body in the file: gmsh "
+            f"leaves out surfaces without a physical name; expected {_NAMED}"
+        )
     sorted_ = [(min(a, b), max(a, b)) for a, b in edges.tolist()]
     if not all(edge in boundary for edge in sorted_):
         raise InputError(

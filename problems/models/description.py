@@ -77,6 +77,8 @@ from problems.ranges import (
 )
 
 _SIDES = ("slave", "master")
+_PLACES = ("boundary", "point")
+_LOADS = ("force", "traction")
 #: names of units of length, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -148,6 +150,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         materials = _materials(table["bodies"], named)
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
+        _check_felt(table["loads"], loads, np.concatenate(fixed))
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
         _described_once(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
@@ -219,6 +222,7 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
 
 def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
     """Return the displacement components that a support fixes."""
+    checked.only_keys(entry, (*_PLACES, "fix"))
     nodes, _ = _place(entry, named, ("fix",))
     fix = checked.filled_list("fix", entry["fix"])
     for component in fix:
@@ -229,7 +233,8 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     """Return the nodal forces (N, 2) of a load, N/m."""
-    kinds = [kind for kind in ("force", "traction") if kind in entry]
+    checked.only_keys(entry, (*_PLACES, *_LOADS))
+    kinds = [kind for kind in _LOADS if kind in entry]
     if len(kinds) != 1:
         raise InputError("expected either force or traction, [x, y]")
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
@@ -248,6 +253,27 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     if kinds == ["force"]:
         weights /= weights.sum()
     return np.outer(weights, vector)
+
+
+def _check_felt(
+    entries: Sequence[Mapping[str, Any]],
+    loads: Sequence[NDArray[np.float64]],
+    fixed: Nodes,
+) -> None:
+    """Refuse a load with a component that acts on prescribed displacements alone."""
+    for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
+        lost = []
+        for component, name in enumerate("xy"):
+            at = np.flatnonzero(load[:, component])
+            if at.size and np.isin(2 * at + component, fixed).all():
+                lost.append(name)
+        if lost:
+            where = entry.get("boundary", entry.get("point"))
+            raise InputError(
+                f"loads[{i}] acts on {where!r} in {' and '.join(lost)}, which fix "
+                "holds there: it has no effect; load another side, or hold other "
+                "components"
+            )
 
 
 def _friction(entry: Mapping[str, Any]) -> None:
@@ -351,7 +377,7 @@ def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
     """Find the nodes, and the edges if there are any, that an entry is about."""
-    where = [key for key in ("boundary", "point") if key in entry]
+    where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, a physical name")
     _keys(entry, (*where, *others))

@@ -53,6 +53,9 @@ from problems.models.description import (
     remarks,
 )
 
+STRAIGHT = 1e-6  #: angle between edges of a straight side, which coordinates round
+ARC = np.pi / 4  #: between chords of an arc, at most; larger angles are drawn corners
+
 
 def load_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     """Emit the QP of one load step in one form.
@@ -196,6 +199,19 @@ def model(path: str, sha256: str, plane: Any, halvings: int) -> Bodies:
     """Assemble the bodies of a description; the digest tells contents apart."""
     del sha256
     return assembled(described_bodies(Path(path), plane, halvings))
+
+
+def has_arcs(params: Mapping[str, Value]) -> bool:
+    """Whether a side that may touch has chords: edges that meet at less than ARC."""
+    p: Any = params
+    bodies = model(p["path"], p["sha256"], p["plane"], p["halvings"])
+    for side in (chain for pair in bodies.pairs for chain in pair):
+        edges = np.diff(bodies.mesh.points[side], axis=0)
+        angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
+        turns = np.abs(np.diff(angles))
+        if ((turns > STRAIGHT) & (turns < ARC)).any():
+            return True
+    return False
 
 
 @lru_cache(maxsize=4)

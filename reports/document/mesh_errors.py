@@ -26,7 +26,7 @@ def mesh_table(found: Sequence[Discretisation]) -> Table:
 def _mesh(d: Discretisation) -> tuple[Cell, ...]:
     sizes = [level.unknowns for level in d.levels]
     note = {
-        "limit": "against the limit of fine meshes",
+        "limit": "; ".join(filter(None, ["against the limit of fine meshes", d.note])),
         "change": f"to the next mesh only: {d.note}",
         "rounding": "the mesh holds the solution; what rounding hides",
     }.get(d.kind, d.note)

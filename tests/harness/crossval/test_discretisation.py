@@ -28,8 +28,10 @@ from harness.verify.references import reference_point
 from problems import PROBLEMS
 from problems.models.hertz import halved
 from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
+from reports.document.mesh_errors import mesh_table
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT
+from tests.support.gmsh_files import stacked_blocks
 
 
 def levels(*distances, bound=1e-9):
@@ -193,6 +195,16 @@ def test_what_hardly_falls_is_not_extrapolated():
 
     assert found.kind == "change"
     assert "slowly" in found.note
+
+
+def test_what_grows_is_not_said_to_fall():
+    """The second halving changes 2^1.45 = 2.73 times as much as the first."""
+    found = estimated("box", levels(0.1, 0.1 * 2**1.45))
+
+    assert (found.kind, found.error) == ("change", found.change)
+    assert "does not fall" in found.note
+    assert "2.73 times" in found.note
+    assert "slowly" not in str(found)
 
 
 def test_what_the_reference_does_not_know_is_no_discretisation_error():
@@ -360,7 +372,7 @@ def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path)
                      / coarse.levels[0].norm)  # fmt: skip
     assert coarse.error == pytest.approx(whole, rel=0.1)
     assert "on curved sides" in curved.note
-    assert "expected friction=tresca" in coulomb.note
+    assert "compare answers with lower=" in coulomb.note
     assert curved.kind == coulomb.kind == "unknown"
 
 
@@ -400,7 +412,7 @@ def test_parts_of_bodies_have_the_error_of_the_whole(tmp_path, monkeypatch):
     ("key", "reason"),
     [
         ("kinematics=finite", "expected kinematics=linear"),
-        ("friction=coulomb/mu=0.3", "expected friction=tresca"),
+        ("friction=coulomb/mu=0.3", "compare answers with halvings=0, 1 and 2"),
     ],
 )
 def test_bodies_without_an_error_of_the_mesh_have_a_reason(
@@ -411,3 +423,16 @@ def test_bodies_without_an_error_of_the_mesh_have_a_reason(
 
     assert found.kind == "unknown"
     assert reason in found.note
+
+
+@pytest.mark.parametrize(("sag", "is_arc"), [(0.0, False), (0.05, True)])
+def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is_arc):
+    """Two blocks; the middle of the upper one's lower side hangs down, or does not."""
+    path = stacked_blocks(tmp_path, gap=2 * sag, sag=sag)
+    (found,) = meshes(tmp_path, f"bodies:{path}/dual")
+
+    assert found.error is not None
+    assert ("chords of an arc stay corners" in str(found)) is is_arc
+    assert (
+        "for pressures, mesh anew" in mesh_table([found]).rows[0][-1].text
+    ) is is_arc

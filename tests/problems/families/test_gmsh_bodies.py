@@ -2,8 +2,10 @@
 
 import re
 import shutil
+import struct
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
@@ -18,6 +20,7 @@ from problems.models.description import described_bodies
 from solvers import SOLVERS
 from solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
+from tests.support.gmsh_files import msh22, square
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -77,38 +80,17 @@ def parts(flip=False):
     return quads, curves, {"corner": np.array([[CORNER]])}
 
 
-def msh22(points, quads, curves, spots, quad_type=3):
-    """Write ASCII 2.2: gmsh's element types are 15 (point), 1 (line), 3 (quad)."""
-    groups, rows, tag = [], [], 0
-    for dimension, kind, named in (
-        (0, 15, spots),
-        (1, 1, curves),
-        (2, quad_type, quads),
-    ):
-        for name, cells in named.items():
-            tag += 1
-            groups += [f'{dimension} {tag} "{name}"'] if name else []
-            for cell in cells:
-                nodes = " ".join(str(n + 1) for n in cell)
-                rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
-    nodes = [f"{i} {x!r} {y!r} {z!r}" for i, (x, y, z) in enumerate(points.tolist(), 1)]
-    blocks = {"PhysicalNames": groups, "Nodes": nodes, "Elements": rows}
-    text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
-    for name, lines in blocks.items():
-        text += "\n".join([f"${name}", str(len(lines)), *lines, f"$End{name}", ""])
-    return text
-
-
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1, one entity for each physical group."""
+    """Write ASCII 4.1, one entity for each physical group, or for cells without one."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
         for name, cells in named.items():
             tag += 1
-            groups.append(f'{dimension} {tag} "{name}"')
+            groups += [f'{dimension} {tag} "{name}"'] if name else []
             box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            entities.append(f"{tag} {box} 1 {tag}" + (" 0" if dimension else ""))
+            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 writes these, too
+            entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
             blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
             for cell in cells:
                 cell_number += 1
@@ -464,6 +446,12 @@ def test_nodes_of_no_cell_are_left_out(described):
         ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
         ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: the loads sum up to"),
         ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
+        ("force = [0, -1e8]", "forces = [0, -1e8]",
+         "a.toml: loads[0]: unknown key 'forces'; did you mean 'force'? known: "),
+        ('point = "corner"', 'pint = "corner"',
+         "a.toml: loads[0]: unknown key 'pint'; did you mean 'point'? known: "),
+        ('boundary = "feet"', 'boundry = "feet"',
+         "a.toml: supports[1]: unknown key 'boundry'; did you mean 'boundary'? known"),
         ("force = [0, -1e8]", "traction = [0, -1e8]", "a.toml: loads[0]: a point"),
         ('slave = "outer"', 'slave = "outre"',
          "a.toml: contacts[0]: slave: unknown physical curve 'outre'; did you mean 'o"),
@@ -487,20 +475,54 @@ def test_a_bad_description_is_refused_with_file_entry_and_remedy(
     assert "\n" not in str(e.value)
 
 
+POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
+
+
+@pytest.mark.parametrize(
+    ("load", "supports", "told"),
+    [
+        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
+        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
+        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, which"),
+        (POINT_LOAD, '[[supports]]\npoint = "corner"\nfix = ["y"]\n',
+         "acts on 'corner' in y, which"),
+        ('boundary = "top"\nforce = [1e5, -1e8]',
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
+    ],
+)  # fmt: skip
+def test_a_load_that_its_supports_take_up_is_refused(described, load, supports, told):
+    """Every component of it is prescribed to be zero: no body feels it."""
+    toml = TOML.replace(POINT_LOAD, load) + supports
+    with pytest.raises(InputError) as e:
+        build(f"{described(toml=toml)}/step=1/dual")
+
+    assert str(e.value) == (
+        f"a.toml: loads[0] {told} fix holds there: it has no effect; load another "
+        "side, or hold other components"
+    )
+
+
+@pytest.mark.parametrize(
+    ("load", "supports"),
+    [
+        # one node of the top, at its left end, is held
+        ('boundary = "top"\nforce = [0, -1e8]', ""),
+        ('boundary = "top"\nforce = [0, -1e8]',
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n'),
+        ('boundary = "left"\nforce = [0, 0]\n[[loads]]\n' + POINT_LOAD, ""),
+    ],
+)  # fmt: skip
+def test_a_load_that_supports_take_up_in_part_is_a_load(described, load, supports):
+    toml = TOML.replace(POINT_LOAD, load) + supports
+    assert build(f"{described(toml=toml)}/step=1/dual").qp.q.any()
+
+
 def test_a_missing_body_is_named(described):
     text = described(toml=re.sub(r'\[\[bodies\]\]\nname = "ring"\n.*\n.*\n', "", TOML))
     with pytest.raises(
         InputError, match="bodies: physical surface 'ring' has no entry"
     ):
         build(f"{text}/dual")
-
-
-def square(n=2, at=(0.0, 0.0)):
-    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0))
-    points = np.column_stack([x.ravel() + at[0], y.ravel() + at[1], 0 * x.ravel()])
-    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
-    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
-    return points, cells.reshape(-1, 4)
 
 
 def read(tmp_path, *contents, **kinds):
@@ -526,6 +548,10 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
          ' named surface: Physical Surface("NAME") in the .geo file'),
+        # the file has no cells of a surface that has no physical name
+        (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
+         "that bounds no body in the file: gmsh leaves out surfaces without a physical "
+         'name; expected Physical Surface("NAME") in the .geo file'),
         (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
@@ -542,6 +568,87 @@ def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
+
+
+def untagged(text):
+    """Set the physical tags of format 2.2 to zero where they have no name.
+
+    This is what Mesh.SaveAll = 1 writes of entities in no physical group.
+    """
+    named = set(re.findall(r'^\d (\d+) "', text, re.M))
+    head, cells = text.split("$Elements\n")
+    return head + "$Elements\n" + re.sub(
+        r"^(\d+ \d+ 2) (\d+)",
+        lambda m: m[0] if m[2] in named else f"{m[1]} 0", cells, flags=re.M,
+    )  # fmt: skip
+
+
+SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
+
+
+@pytest.mark.parametrize("writer", SAVED)
+def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
+    """Curves and points without a name, as of Mesh.SaveAll = 1, change nothing."""
+    quads, curves, spots = parts()
+    more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
+    read = []
+    for name, contents in (("a", (curves, spots)), ("b", more)):
+        (tmp_path / f"{name}.msh").write_text(writer(POINTS, quads, *contents))
+        read.append(read_msh(tmp_path / f"{name}.msh"))
+
+    np.testing.assert_array_equal(read[0].points, read[1].points)
+    np.testing.assert_array_equal(read[0].cells, read[1].cells)
+    assert list(read[0].curves) == list(read[1].curves)
+    for name, edge in read[0].curves.items():
+        np.testing.assert_array_equal(edge, read[1].curves[name])
+
+
+@pytest.mark.parametrize("writer", SAVED)
+def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer):
+    points, cells = square()
+    contents = points, {"a": cells[:1], "": cells[1:]}, {"m": [[7, 8]]}, {}
+    (tmp_path / "m.msh").write_text(writer(*contents))
+    with pytest.raises(InputError) as e:
+        read_msh(tmp_path / "m.msh")
+
+    assert str(e.value).endswith(
+        "m.msh: 3 cells without a name; expected each in a named surface: "
+        'Physical Surface("NAME") in the .geo file; or, if they are of no body, save '
+        "only physical groups: Mesh.SaveAll = 0"
+    )
+
+
+def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
+    """The entities of a text without the tag of its first curve, in binary."""
+    text = msh41(POINTS, *parts())
+    (tmp_path / "a.msh").write_text(text)
+    mesh = meshio.gmsh.read(tmp_path / "a.msh")
+    meshio.gmsh.write(tmp_path / "m.msh", mesh, "4.1", binary=True)
+    data = (tmp_path / "m.msh").read_bytes()
+    counts, point, *others = text.split("$Entities\n")[1].split("\n$End")[0].split("\n")
+    packed = struct.pack("4Q", *map(int, counts.split()))
+    packed += struct.pack("<i3dQi", *map(int, point.split()))
+    for k, line in enumerate(others):
+        tag, *box, _, physical, _ = map(int, line.split())
+        packed += struct.pack("<i6d", tag, *box)
+        packed += struct.pack("<Qi", 1, physical) if k else struct.pack("<Q", 0)
+        packed += struct.pack("<Q", 0)
+    head, _, rest = re.split(rb"\$(?:End)?Entities\n", data)
+    binary = head + b"$Entities\n" + packed + b"\n$EndEntities\n" + rest
+    (tmp_path / "m.msh").write_bytes(binary)
+    with pytest.raises(InputError, match=r"m\.msh: .*Mesh\.SaveAll = 0"):
+        read_msh(tmp_path / "m.msh")
+
+
+def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
+    text = described(toml=TOML.replace("two.msh", "two.geo"))
+    Path("two.geo").write_text("Point(1) = {0, 0, 0};\n")
+    with pytest.raises(InputError) as e:
+        build(f"{text}/dual")
+
+    assert str(e.value) == (
+        "two.geo: a drawing, not a mesh; mesh it first: gmsh -2 two.geo writes two.msh"
+    )
 
 
 def test_a_body_of_two_parts_is_refused(tmp_path):

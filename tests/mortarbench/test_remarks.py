@@ -1,0 +1,104 @@
+"""Remarks beside `verified`: two blocks whose displacements are known by hand.
+
+Each block has side 2 and, with Poisson's ratio zero, the strain p/E under a pressure p:
+its upper end moves by 4p/E if both are pressed together.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import mortarbench as mb
+from harness import Verdict
+from mortarbench.answer import remarks
+from mortarbench.cli.main import main
+from mortarbench.registries import Registries
+from tests.support.gmsh_files import BLOCKS, stacked_blocks
+
+pytestmark = pytest.mark.together
+
+APART = (  # the upper block hangs from its top and is pulled upwards
+    BLOCKS.replace('[[loads]]\nboundary = "top"', '[[loads]]\nboundary = "foot"')
+    .replace("-1e6", "1e6")
+    .replace("[[loads]]", '[[supports]]\nboundary = "top"\nfix = ["x", "y"]\n[[loads]]')
+)
+
+
+def solved(folder, form="dual", solver="smalbe", **given):
+    return mb.solve(f"bodies:{stacked_blocks(folder, **given)}/{form}", solver)
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    return solved(tmp_path_factory.mktemp("blocks"))
+
+
+def test_an_answer_as_expected_has_no_remarks(sound):
+    assert sound.verdict is Verdict.VERIFIED
+    assert sound.remarks == ()
+    assert "note:" not in repr(sound)
+    assert sound.to_dict()["remarks"] == []
+
+
+@pytest.mark.parametrize(("pressure", "is_large"), [(0.4, False), (0.6, True)])
+def test_displacements_larger_than_the_body_are_remarked_upon(
+    tmp_path, pressure, is_large
+):
+    """4·0.6 is more than the side of 2, and 4·0.4 is not."""
+    toml = BLOCKS.replace("-1e6", f"{-pressure * 1e9}")
+    found = solved(tmp_path, toml=toml)
+
+    assert found.verdict is Verdict.VERIFIED
+    assert len(found.remarks) == is_large
+    if is_large:
+        (told,) = found.remarks
+        assert told.startswith("body 'upper' moves by up to 2.4 m and is 2 m large")
+        assert f"note: {told}" in repr(found).splitlines()
+        assert told.replace("'", "&#x27;") in found._repr_html_()
+        assert found.to_dict()["remarks"] == [told]
+
+
+@pytest.mark.parametrize(
+    ("form", "solver"),
+    [("dual", "smalbe"), ("primal", "clarabel"), ("dual-bounds", "osqp")],
+)
+def test_a_contact_that_never_closes_is_remarked_upon(tmp_path, form, solver):
+    """Interior points and iterates of OSQP leave forces of the size of rounding."""
+    toml = APART.replace('boundary = "base"\nfix = ["y"]', 'boundary = "base"\n'
+                         'fix = ["x", "y"]')  # fmt: skip
+    found = solved(tmp_path, form, solver, toml=toml, gap=0.5)
+    (told,) = found.remarks
+
+    assert found.verdict is Verdict.VERIFIED
+    assert told.startswith("no node is in contact: the sides stay apart")
+
+
+@pytest.mark.parametrize(
+    ("bound", "told"),
+    [
+        (0.009, None),
+        (0.83, "the solver's error is certified to be at most 83 % only"),
+        (np.inf, "the certificate does not bound the solver's error"),
+    ],
+)
+def test_a_certificate_that_says_little_is_remarked_upon(sound, bound, told):
+    record = replace(sound.record, energy_bound=bound)
+    found = remarks(sound.case, record, sound.solution)
+
+    assert [text.startswith(told) for text in found] == [True] * (told is not None)
+
+
+def test_what_is_not_verified_has_its_verdict_and_no_remarks(sound):
+    record = replace(sound.record, verdict=Verdict.INACCURATE, energy_bound=np.inf)
+
+    assert remarks(sound.case, record, sound.solution) == ()
+
+
+def test_the_command_prints_notes_and_keeps_its_exit_code(tmp_path, capsys):
+    toml = BLOCKS.replace("-1e6", "-0.6e9")
+    path = stacked_blocks(tmp_path, toml=toml)
+    code = main(Registries(), ["solve", f"bodies:{path}/dual", "--solver", "smalbe"])
+
+    assert code == 0
+    assert "\nnote: body 'upper' moves by" in capsys.readouterr().out

@@ -1,0 +1,83 @@
+"""Meshes as gmsh writes them, without gmsh."""
+
+import numpy as np
+
+
+def msh22(points, quads, curves, spots, quad_type=3):
+    """Write ASCII 2.2: gmsh's element types are 15 (point), 1 (line), 3 (quad)."""
+    groups, rows, tag = [], [], 0
+    for dimension, kind, named in (
+        (0, 15, spots),
+        (1, 1, curves),
+        (2, quad_type, quads),
+    ):
+        for name, cells in named.items():
+            tag += 1
+            groups += [f'{dimension} {tag} "{name}"'] if name else []
+            for cell in cells:
+                nodes = " ".join(str(n + 1) for n in cell)
+                rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
+    nodes = [f"{i} {x!r} {y!r} {z!r}" for i, (x, y, z) in enumerate(points.tolist(), 1)]
+    blocks = {"PhysicalNames": groups, "Nodes": nodes, "Elements": rows}
+    text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
+    for name, lines in blocks.items():
+        text += "\n".join([f"${name}", str(len(lines)), *lines, f"$End{name}", ""])
+    return text
+
+
+def square(n=2, at=(0.0, 0.0)):
+    x, y = np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0))
+    points = np.column_stack([x.ravel() + at[0], y.ravel() + at[1], 0 * x.ravel()])
+    i = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    cells = np.stack([i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]], axis=-1)
+    return points, cells.reshape(-1, 4)
+
+
+BLOCKS = """\
+mesh = "blocks.msh"
+steps = 1
+plane = "stress"
+[[bodies]]
+name = "lower"
+E = 1e9
+nu = 0
+[[bodies]]
+name = "upper"
+E = 1e9
+nu = 0
+[[supports]]
+boundary = "base"
+fix = ["y"]
+[[supports]]
+boundary = "axis"
+fix = ["x"]
+[[loads]]
+boundary = "top"
+traction = [0, -1e6]
+[[contacts]]
+slave = "foot"
+master = "table"
+"""
+
+
+def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
+    """Write two squares of side 2, one above the other; return the description.
+
+    Their Poisson's ratio is zero: pressed together, each is in uniaxial stress.
+
+    sag : by which the middle of the upper one's lower side is lower than its ends
+    """
+    (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0 + gap))
+    upper[1, 1] -= sag
+    sides = {
+        "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
+        "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
+        "axis": [[0, 3], [3, 6], [9, 12], [12, 15]],
+    }  # fmt: skip
+    bodies = {"lower": cells, "upper": cells + 9}
+    curves = {name: np.array(edges) for name, edges in sides.items()}
+    mesh = msh22(np.vstack([lower, upper]), bodies, curves, {})
+    (folder / "blocks.msh").write_text(mesh)
+    path = folder / "blocks.toml"
+    path.write_text(toml)
+    return path
