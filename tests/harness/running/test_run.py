@@ -150,7 +150,8 @@ OUTCOMES = {
     "returnsnan": (Verdict.WRONG, "solved", ""),
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
-        Verdict.FAILED, "failed", "ValueError: assignment destination is read-only",
+        Verdict.FAILED, "failed",
+        "ValueError: assignment destination is read-only (adversaries.py:377)",
     ),
     "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),
