@@ -585,6 +585,11 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
     return Plugin(solvers=dict(solvers), problems=families, origin=where)
 
 
+def is_solver(thing: object) -> bool:
+    """Tell a solver, or the class of one, from the name of a solver."""
+    return _has(_SOLVER_PARTS, thing)
+
+
 def check_solver(thing: object) -> None:
     """Refuse a `thing` that is neither the name of a solver nor a solver.
 
