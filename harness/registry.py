@@ -32,8 +32,17 @@ from importlib.machinery import (
     SourceFileLoader,
 )
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import ModuleType, NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from harness.digest import hex_digest, pieces
 from harness.errors import PLUGINS, InputError, shown, unknown
@@ -227,6 +236,23 @@ def options_of(solver: Solver) -> dict[str, Any]:
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
 
 
+def option_types(solver: Solver) -> dict[str, Any]:
+    """Return the annotated types of a solver's options.
+
+    An option is absent where its annotation leaves the type open, and all are where
+    Python cannot evaluate the annotations; the type of the default decides then.
+    """
+    try:
+        hints = get_type_hints(type(solver))
+    except (NameError, TypeError, AttributeError, SyntaxError):  # of a plug-in
+        return {}
+    return {
+        name: hints[name]
+        for name in options_of(solver)
+        if name in hints and hints[name] not in (Any, object)
+    }
+
+
 def load_plugin(file: str | Path | PluginFile) -> Plugin:
     """Import a file that defines ``SOLVERS`` and/or ``PROBLEMS``.
 
@@ -335,11 +361,13 @@ def _with_options(
     known = options_of(solver)
     for name in reserved or ():
         known.pop(name, None)
+    annotated = option_types(solver)
     changes = {}
     for name, value in spec.options.items():
         if name not in known:
             raise unknown("option", name, known, where=spec.name)
-        changes[name] = _option(f"{spec.name}: {name}", value, known[name])
+        where, kind = f"{spec.name}: {name}", annotated.get(name)
+        changes[name] = _option(where, value, known[name], kind)
     if not changes:
         return solver  # type: ignore[no-any-return]  # need not even be a dataclass
     try:
@@ -349,23 +377,45 @@ def _with_options(
     return configured
 
 
-def _option(where: str, value: Any, current: Any) -> Any:
-    """Check the type of an option's value by that of the value it replaces."""
-    match current, value:
-        case None, _:
+def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
+    """Check the type of an option's value by its annotation, else by the default."""
+    kinds = _classes(annotation)
+    if kinds is None:
+        kinds = None if current is None else (type(current),)
+    if kinds is None or (value is None and current is None):
+        return value
+    if isinstance(value, bool):
+        if bool in kinds:
             return value
-        case bool(), bool():
-            return value
-        case float(), int() | float() if not isinstance(value, bool):
-            return float(value)
-        case Mapping(), Mapping():
-            return value
-        case (bool(), _) | (_, bool()):
-            pass
-        case _ if isinstance(value, type(current)):
-            return value
-    expected, got = type(current).__name__, type(value).__name__
+    elif isinstance(value, kinds):
+        return value
+    elif float in kinds and isinstance(value, int):
+        return float(value)
+    elif any(issubclass(kind, Mapping) for kind in kinds) and isinstance(
+        value, Mapping
+    ):
+        return value
+    expected = " or ".join(
+        "None" if kind is NoneType else kind.__name__ for kind in kinds
+    )
+    got = type(value).__name__
     raise InputError(f"{where} = {value!r} is of type {got}; expected {expected}")
+
+
+def _classes(annotation: Any) -> tuple[type, ...] | None:
+    """List the classes of values that an annotation allows; None if it is open."""
+    if annotation is None:
+        return None
+    if get_origin(annotation) is Literal:
+        return tuple(dict.fromkeys(type(value) for value in get_args(annotation)))
+    if get_origin(annotation) in (Union, UnionType):
+        parts = [_classes(part) for part in get_args(annotation)]
+        if any(part is None for part in parts):
+            return None
+        return tuple(dict.fromkeys(kind for part in parts for kind in part or ()))
+    kind = get_origin(annotation) or annotation
+    is_class = isinstance(kind, type) and not getattr(kind, "_is_protocol", False)
+    return (kind,) if is_class else None
 
 
 def _no_file(asked: PluginFile) -> InputError:
@@ -533,6 +583,11 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
     families = {name: as_family(offered) for name, offered in problems.items()}
     return Plugin(solvers=dict(solvers), problems=families, origin=where)
+
+
+def is_solver(thing: object) -> bool:
+    """Tell a solver, or the class of one, from the name of a solver."""
+    return _has(_SOLVER_PARTS, thing)
 
 
 def check_solver(thing: object) -> None:

@@ -432,7 +432,7 @@ class Verification:
     multipliers: Multipliers  #: as given; where left out, the best ones
     objective: float  #: ½xᵀPx + qᵀx
     optimum_error: float | None  #: against a proven optimum, where that decided
-    tol: float  #: verified means every residual ≤ 10·tol
+    tol: float  #: verified means every residual ≤ 10·tol, or as a proven optimum says
 
     def __repr__(self) -> str:
         if self.optimum_error is not None:
@@ -462,7 +462,8 @@ def verify(
     qp : a QP, a case of `build`, or its name
     x : (n,) the point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, where known
-    tol : relative KKT accuracy; verified means that every residual is within 10·tol
+    tol : relative KKT accuracy; verified means that every residual is within 10·tol,
+        or for small QPs the error against a proven optimum
 
     Raises
     ------

@@ -164,6 +164,7 @@ def _change(c: Comparison) -> dict[str, Any]:
         "slower": [_slower(one) for one in judged.slower],
         "slower_judged": {"solvers": judged.solvers, "cells": judged.cells},
         "slower_not_judged": judged.why_not or None,
+        "slower_unverified": list(judged.unverified),
         "ratios": {
             s: _interval(mean) | {"cells": mean.cells} for s, mean in means.items()
         },

@@ -20,7 +20,7 @@ from harness.errors import InputError, some, unknown
 from harness.errors import shown as given
 from harness.files.reading import MOST_TOML, read_text
 from harness.record import Record, Verdict
-from harness.registry import resolve
+from harness.registry import is_solver, resolve
 from harness.results.faults import in_words
 from harness.results.folder import keep_environment, refuse_links
 from harness.results.journal import read_journal
@@ -244,6 +244,16 @@ def merge(
     return Results(folder=target, records=tuple(records))
 
 
+def _refuse_objects(solvers: object) -> None:
+    """Refuse solver objects, which no result folder could name again."""
+    for one in solvers if isinstance(solvers, list | tuple) else [solvers]:
+        if is_solver(one):
+            raise InputError(
+                "solver objects are for mb.solve; in a suite name them by "
+                "plugins=['FILE.py']"
+            )
+
+
 @TURN
 def run(
     suite: str | Path | Mapping[str, Any],
@@ -285,6 +295,9 @@ def run(
         When something of that is wrong, the folder is in use, or its disk is full.
 
     """
+    _refuse_objects(solvers)
+    if isinstance(suite, Mapping):
+        _refuse_objects(suite.get("solvers"))
     registries = known(plugins, registries)
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):

@@ -17,7 +17,7 @@ from harness.crossval.comparison import brief
 from harness.crossval.discretisation import Discretisation, discretisation_errors
 from harness.crossval.summary import as_data
 from harness.crossval.validation import validated
-from harness.errors import InputError, unknown
+from harness.errors import InputError, some, unknown
 from harness.files.durable import full_disk_told, replace_file
 from harness.names import CaseId, assemble
 from harness.plugin import Family, Reference, Solver
@@ -268,11 +268,19 @@ class Conformance:
     @property
     def conforms(self) -> bool:
         """True if no check fails, and the solver solved something."""
-        solved = any(
+        return not self.objection
+
+    @property
+    def objection(self) -> str:
+        """The reason why the solver does not conform; empty if it does."""
+        if self.failed:
+            return f"fails {some(map(repr, self.failed))}"
+        if not any(
             r.grade is Grade.PASS and name.startswith(FINDS)
             for name, r in self.results.items()
-        )
-        return solved and not self.failed
+        ):
+            return f"passes no check {FINDS!r}: it solved nothing"
+        return ""
 
     @property
     def failed(self) -> Mapping[str, str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from harness.errors import unknown
 from harness.record import VERIFIED_FACTOR
 from reports.data.aggregation import ranking_of
+from reports.data.cells import BY_OPTIMUM
 from reports.data.comparison_groups import ComparisonGroup, all_groups
 from reports.data.environment import dateline
 from reports.data.evidence import Evidence, read_evidence
@@ -250,6 +251,11 @@ def _accuracy(evidence: Evidence) -> tuple[Picture, ...]:
         "Accuracy reached against time spent, one mark per case, tolerance and solver. "
         "Filled: verified; hollow: not."
     )
+    if any(o.against_residuals for o in evidence.flat):
+        caption += (
+            " Filled above the line, or hollow below it: decided by the proven optimum "
+            f"of a small QP, against the residuals ({BY_OPTIMUM} in tables)."
+        )
     return (Picture(name="accuracy", caption=caption, figure=figure),)
 
 

@@ -39,7 +39,12 @@ from harness.record import VERIFIED_FACTOR
 from harness.solution import Solution, Status
 from harness.verify.infeasibility import infeasibility_margin
 from harness.verify.kkt import kkt_residuals
-from harness.verify.measure import measure
+from harness.verify.measure import (
+    ReasonError,
+    failure,
+    measure,
+    reason_to_decline,
+)
 
 FINDS = "finds the planted solution"  #: how the checks begin that need an answer
 KEEPS = "keeps its answer"  #: how those begin that compare equivalent formulations
@@ -91,6 +96,14 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
+    """Solve by the harness's own clock, and insist on a point, right or wrong."""
+    s = _ended(solver, qp, tol)
+    if s.status is Status.FAILED and np.isnan(s.x).any():
+        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+    return s
+
+
+def _ended(solver: Solver, qp: QP, tol: float) -> Solution:
     """Solve by the harness's own clock, which makes a status of whatever happens."""
     s = measure(solver, qp, tol).solution
     if s.status is Status.DECLINED:
@@ -186,7 +199,7 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
     qp = problem()
-    s = _solve(solver, qp, 1e-9)
+    s = _ended(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
         raise BrokenError("claims to have solved what has no solution")
     if not s.message:
@@ -237,16 +250,18 @@ def _a_sequence_is_solved(solver: Solver) -> None:
     qps = _sequence()
     prepare = chain(1e-6)
     for i, qp in enumerate(qps):
-        if reason := solver.declines(qp):
-            raise DeclinedError(reason)
         try:
+            if (reason := reason_to_decline(solver, qp)) is not None:
+                raise DeclinedError(reason)
             _judge(qp, prepare(qp)(), VERIFIED_FACTOR * 1e-6)
-        except BrokenError as e:
+        except (BrokenError, ReasonError) as e:
             raise BrokenError(f"QP {i + 1} of the sequence: {e}") from None
+        except DeclinedError:
+            raise
         except ImportError as e:
             raise DeclinedError(f"not installed: {e.name}") from None
         except Exception as e:  # the solver's own code
-            message = f"QP {i + 1} of the sequence: {type(e).__name__}: {e}"
+            message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
             raise BrokenError(message) from None
 
 

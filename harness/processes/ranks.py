@@ -281,7 +281,7 @@ class OnRanks:
     def __init__(
         self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
     ) -> None:
-        self._solver = solver
+        self._solver = self.__wrapped__ = solver  # its file is that of failures
         self._ranks = ranks
         self._emit = emit
         self._emitted: Emitted | None = None

@@ -12,12 +12,12 @@ from dataclasses import replace
 from itertools import product
 from numbers import Integral, Real
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin
 
 from harness.checked import located
 from harness.errors import InputError, shown, unknown
 from harness.plugin import Solver
-from harness.registry import SolverSpec, options_of, resolve
+from harness.registry import SolverSpec, option_types, options_of, resolve
 from harness.suite.suite import NULL
 
 _KEY = re.compile(r"[^\W\d]\w*")
@@ -165,12 +165,12 @@ def _combinations(
 
 def _typed(name: str, solver: Solver, given: Mapping[str, str]) -> dict[str, Any]:
     """Read the values of options as the types that a solver declares."""
-    known, hints = options_of(solver), _hints(solver)
+    known, annotated = options_of(solver), option_types(solver)
     values = {}
     for key, text in given.items():
         if key not in known:
             raise unknown("option", key, known, where=name)
-        kind = hints.get(key, type(known[key]))
+        kind = annotated.get(key, type(known[key]))
         if kind is NoneType:  # nothing tells its type
             kind = bool | int | float | str
         read = [*_readings(text, kind, known[key])]
@@ -212,13 +212,6 @@ def _text(value: object) -> str:
         case Real():
             return repr(float(value))
     return repr(value)
-
-
-def _hints(solver: Solver) -> Mapping[str, Any]:
-    try:
-        return get_type_hints(type(solver))
-    except (NameError, TypeError, AttributeError):  # annotations of a plug-in
-        return {}
 
 
 def _readings(text: str, kind: Any, current: object) -> Iterator[Any]:

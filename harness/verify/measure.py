@@ -7,14 +7,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
+from inspect import unwrap
 from math import ceil
+from numbers import Real
 from pathlib import Path
 from time import perf_counter
+from traceback import walk_tb
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import issparse
 
+from harness.errors import shortened, shown
 from harness.limits import too_large
 from harness.operators import SerialisableOperator, assembled
 from harness.plugin import Solver
@@ -27,6 +32,7 @@ MOST_INNER = 100
 MOST_ASSEMBLED = 3000  #: rows of an operator P that is multiplied out
 LARGEST_COUNT = 2**53
 LONGEST_MESSAGE = 1900  #: characters
+_LONGEST_NAME = 60  #: characters of a file's name in a message
 
 _VECTORS = ("x", "y", "z", "z_box")
 
@@ -80,13 +86,15 @@ def measure(
                     sum(phase) / inner for phase in zip(*again, strict=True)
                 )
         except _DeclinedError as e:
-            return _without_point(qp, Status.DECLINED, str(e))
+            return _without_point(qp, Status.DECLINED, one_line(e))
         except ImportError as e:
             name = e.name or str(e)
             message = f"not installed: {name} (pip install {name.partition('.')[0]})"
-            return _without_point(qp, Status.DECLINED, message)
+            return _without_point(qp, Status.DECLINED, one_line(message))
+        except ReasonError as e:
+            return _without_point(qp, Status.FAILED, str(e))
         except (Exception, SystemExit) as e:
-            return _without_point(qp, Status.FAILED, f"{type(e).__name__}: {_said(e)}")
+            return _without_point(qp, Status.FAILED, failure(solver, e))
         finally:
             ends()
     cost = Measurement(
@@ -109,15 +117,36 @@ class _Asked:
     prepare: Prepare
 
     def __call__(self, qp: QP) -> Callable[[], Solution]:
-        reason = self.solver.declines(qp)
+        reason = reason_to_decline(self.solver, qp)
         if reason == NEEDS_MATRICES and not qp.is_explicit:
             qp = _explicit(qp)
-            reason = self.solver.declines(qp)
+            reason = reason_to_decline(self.solver, qp)
         if reason is not None:
             raise _DeclinedError(reason)
         if isinstance(qp.P, SerialisableOperator):
             qp.P.build()
         return self.prepare(qp)
+
+
+class ReasonError(Exception):
+    """A solver's `declines` returned neither None nor a text."""
+
+
+def reason_to_decline(solver: Solver, qp: QP) -> str | None:
+    """Return the reason why `solver` does not take `qp`, or None if it does.
+
+    Raises
+    ------
+    ReasonError
+        When `declines` returns anything else, such as False.
+
+    """
+    reason: object = solver.declines(qp)
+    if reason is None or isinstance(reason, str):
+        return reason
+    is_plain = isinstance(reason, bool | Real | np.generic)
+    got = shown(reason) if is_plain else type(reason).__name__
+    raise ReasonError(f"declines returned {got}; expected None or a text")
 
 
 def _explicit(qp: QP) -> QP:
@@ -202,7 +231,7 @@ def _reset_peak() -> bool:
 
 
 def _without_point(qp: QP, status: Status, message: str) -> Timed:
-    solution = Solution.without_point(qp, status, one_line(message))
+    solution = Solution.without_point(qp, status, message)
     return Timed(solution, Measurement())
 
 
@@ -211,6 +240,37 @@ def one_line(message: object) -> str:
     whole = " ".join(str(message).split())
     text = whole.encode(errors="backslashreplace").decode()
     return text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}…"
+
+
+def failure(solver: Solver, e: BaseException) -> str:
+    """Describe an exception of a solver in one line that ends with its place.
+
+    The place is the last call in the file of the solver's class, without its folder:
+    ``KeyError: 'rho' (mine.py:24)``. An exception from elsewhere has no place.
+    """
+    line = one_line(f"{type(e).__name__}: {_said(e)}")
+    file = _file_of(type(getattr(solver, "__wrapped__", solver)))
+    calls = [
+        at for frame, at in walk_tb(e.__traceback__) if frame.f_code.co_filename == file
+    ]
+    if not calls:
+        return line
+    return f"{line} ({shortened(one_line(Path(file).name), _LONGEST_NAME)}:{calls[-1]})"
+
+
+def _file_of(kind: type) -> str:
+    """Find the file of a class by its methods; empty if no file has them.
+
+    A class that cloudpickle copied has a module of another process.
+    """
+    for one in kind.__mro__:
+        for part in vars(one).values():
+            if not isinstance(part, FunctionType) or part.__module__ != one.__module__:
+                continue
+            file: str = unwrap(part).__code__.co_filename
+            if Path(file).is_file():  # methods that dataclasses generate have none
+                return file
+    return ""
 
 
 def _said(e: BaseException) -> str:

@@ -15,6 +15,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
@@ -34,7 +35,27 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         usage = " ".join(self.format_usage().split())
-        raise InputError(f"{message}; {usage}; {self.prog} --help tells more")
+        stop = " " if message.endswith("?") else "; "
+        raise InputError(f"{message}{stop}{usage}; {self.prog} --help tells more")
+
+    def parse_known_args(  # type: ignore[override]  # argparse overloads it
+        self,
+        args: Sequence[str] | None = None,
+        namespace: argparse.Namespace | None = None,
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse the options of a command, after naming one that it does not have.
+
+        argparse would miss a required option before it saw the misspelt one.
+        """
+        if self._subparsers is None:  # a command
+            known = [name for name in self._option_string_actions if len(name) > 2]
+            for text in takewhile(lambda text: text != "--", args or ()):
+                name = text.partition("=")[0]
+                if text.startswith("--") and name not in known:
+                    near = get_close_matches(name, known, n=1)
+                    hint = f"; did you mean {near[0]}?" if near else ""
+                    self.error(f"unknown argument {name!r}{hint}")
+        return super().parse_known_args(args, namespace)
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """End after a help text, while a reader that has gone is no surprise."""

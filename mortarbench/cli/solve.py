@@ -104,6 +104,7 @@ def _hint(answer: Answer) -> str:
 
     from harness.qp import no_rows
     from harness.registry import resolve
+    from harness.verify.measure import reason_to_decline
 
     qp = case.made.qp
     n = qp.q.size
@@ -111,7 +112,9 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        declined = solver.declines(like_dual)  # bounds in place of inequality rows
+        declined = reason_to_decline(
+            solver, like_dual
+        )  # bounds in place of inequality rows
     except Exception:  # the family's or the solver's code: there is no hint then
         return ""
     return "" if declined else f"; dualise inequality rows first: solve {dual}"

@@ -7,6 +7,7 @@ import json
 from argparse import Namespace
 from collections.abc import Collection
 
+from harness.errors import say
 from harness.registry import SolverSpec, check_name, resolve
 from mortarbench.registries import Registries
 
@@ -38,6 +39,9 @@ def run(registries: Registries, options: Namespace) -> int:
         return 0
     if options.json:
         print(json.dumps([row for one in found for row in one.to_dict()["checks"]]))
+    for one in found:
+        if one.objection:
+            say(f"{one.solver} does not conform: it {one.objection}")
     return 0 if all(one.conforms for one in found) else 1
 
 

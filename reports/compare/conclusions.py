@@ -157,6 +157,7 @@ def _slower(c: Comparison) -> str:
     return (
         f"Slower, beyond chance and the machine: {told} ({judged} judged, all "
         f"intervals together at {COVERAGE:.0%})."
+        + "".join(f" {clean(text, 400)}." for text in found.unverified)
     )
 
 

@@ -23,7 +23,7 @@ from reports.compare.conclusions import (
 )
 from reports.compare.conditions import Difference, environments, options, settings
 from reports.compare.figure import ratios_figure
-from reports.data.cells import case_cells, source, verdict_cell
+from reports.data.cells import case_cells, legend, source, verdict_cell
 from reports.data.evidence import Outcome
 from reports.document.formatting import (
     ABSENT,
@@ -248,7 +248,13 @@ def _listed(
     """Make a section of one table, or of the word that there is nothing to list."""
     if not rows:
         return Section(name=name, title=title, prose=("None.",))
-    table = Table(caption=caption, columns=columns, rows=tuple(rows), text_columns=2)
+    table = Table(
+        caption=caption,
+        notes=legend(rows),
+        columns=columns,
+        rows=tuple(rows),
+        text_columns=2,
+    )
     return Section(name=name, title=title, tables=(table,))
 
 

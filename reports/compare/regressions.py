@@ -57,6 +57,7 @@ class Regressions:
     solvers: int  #: that could be judged over their cases
     cells: int  #: that could be judged one by one
     why_not: str = ""  #: why nothing could be judged
+    unverified: tuple[str, ...] = ()  #: solvers without a verified answer in one folder
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,14 +115,44 @@ def regressions(c: Comparison) -> Regressions:
             for change in cells
             if (one := _of_cell(change, scatter, freedom, miss / len(cells)))
         ]
-    return Regressions(slower=tuple(found), solvers=len(judged), cells=len(cells))
+    return Regressions(
+        slower=tuple(found),
+        solvers=len(judged),
+        cells=len(cells),
+        unverified=_unverified(c, folders=1),
+    )
+
+
+def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
+    """Name the solvers that have no verified answer in so many of the two folders."""
+    found = []
+    for solver in c.solvers:
+        pairs = [p for p in c.of(solver) if not p.after.first.role]
+        lacking = [
+            str(evidence.directory)
+            for evidence, outcomes in (
+                (c.before, [p.before for p in pairs]),
+                (c.after, [p.after for p in pairs]),
+            )
+            if not any(r.verdict.is_verified for o in outcomes for r in o.records)
+        ]
+        if pairs and len(lacking) == folders:
+            where = " and in ".join(lacking)
+            found.append(
+                f"{solver} has no verified answer in {where}: nothing to compare"
+            )
+    return tuple(found)
 
 
 def _why_not(c: Comparison) -> str:
     if not any(p.same_machine for p in c.pairs):
         return "no cell was measured on equal machines in both folders"
+    if lacking := _unverified(c, folders=1):
+        return "; ".join(lacking)
     if not c.timed:
         return "no cell has two verified repeats in both folders"
+    if lacking := _unverified(c, folders=2):
+        return "; ".join(lacking)
     return (
         "no two solvers of both folders were measured in the same blocks, and one "
         "alone is not told from the machine; add one that does not change"

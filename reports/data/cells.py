@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from reports.data.evidence import Evidence, Outcome
 from reports.document.formatting import ABSENT, VERDICTS, clean, plural, tolerance
 from reports.document.layout import Cell, Table, name_cell, sources
+
+#: after a verdict that a proven optimum decided against the residuals
+BY_OPTIMUM = "⋆"
 
 
 def source(*outcomes: Outcome) -> str:
@@ -17,6 +20,8 @@ def source(*outcomes: Outcome) -> str:
 def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
     """Show a verdict with symbol and words, and how many repeats it holds for."""
     symbol, words = VERDICTS[outcome.verdict]
+    if outcome.against_residuals:
+        words += f" {BY_OPTIMUM}"
     alike = sum(r.verdict is outcome.verdict for r in outcome.records)
     if alike < len(outcome.records):
         words += f" ({alike} of {plural(len(outcome.records), 'repeat')})"
@@ -27,6 +32,20 @@ def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
         kind=outcome.verdict.value,
         title=source(outcome),
     )
+
+
+def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
+    """Explain the mark of a proven optimum as a note, if a verdict in a table has it.
+
+    rows : of the table
+    """
+    kinds = {verdict.value for verdict in VERDICTS}
+    marked = any(c.kind in kinds and BY_OPTIMUM in c.text for row in rows for c in row)
+    note = (
+        f"{BY_OPTIMUM}: decided by the proven optimum of a small QP, against the "
+        "residuals."
+    )
+    return (note,) if marked else ()
 
 
 def case_cells(outcome: Outcome | Mapping[str, Outcome]) -> tuple[Cell, Cell]:
@@ -50,6 +69,7 @@ def grid(
         rows.append((*case_cells(row), *cells))
     return Table(
         caption=caption,
+        notes=legend(rows),
         columns=("case", "tol", *(clean(s, 40) for s in evidence.solvers)),
         rows=tuple(rows),
     )

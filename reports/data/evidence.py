@@ -92,6 +92,18 @@ class Outcome:
         return self.verdict.is_verified
 
     @cached_property
+    def against_residuals(self) -> bool:
+        """True if a proven optimum decided otherwise than the residuals would."""
+        return any(
+            r.decided_by == "reference"
+            and r.verdict in (Verdict.VERIFIED, Verdict.INACCURATE, Verdict.WRONG)
+            and None not in (values := [getattr(r, name) for name in RESIDUALS])
+            and (max(values) <= allowed(r.judged_at, self.factor))
+            is not (r.verdict is Verdict.VERIFIED)
+            for r in self.records
+        )
+
+    @cached_property
     def claims(self) -> tuple[str, ...]:
         """What the solver said of itself, without repetition."""
         return tuple(dict.fromkeys(r.claimed for r in self.records if r.claimed))

@@ -30,8 +30,8 @@ from reports.paper.stepping import SINCE, orders, stepping_figure
 REPEATED = (
     "Medians of interleaved, randomised repeats in worker processes of their own, with "
     "the distribution-free 95 % interval of the median (below six repeats: smallest "
-    "and largest). Every answer is judged by its residuals on the QP as given; only "
-    "verified answers have times."
+    "and largest). Every answer is judged on the QP as given, by its "
+    "residuals or for small QPs by a proven optimum; only verified answers have times."
 )
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from harness import Verdict
-from reports.data.cells import source, verdict_cell
+from reports.data.cells import legend, source, verdict_cell
 from reports.data.evidence import Evidence, Outcome
 from reports.document.figure import (
     INK,
@@ -201,7 +201,7 @@ def fleet_table(evidence: Evidence, form: str) -> Table:
     return Table(
         caption=f"Form {form}: median time by the size m of the dual, and the exponent "
         "p of t = c·mᵖ over the verified sizes.",
-        notes=(TIMED,),
+        notes=(TIMED, *legend(rows)),
         columns=("", *(f"m = {m}" for m in sizes), "p [95 %]"),
         rows=tuple(rows),
     )

@@ -18,7 +18,7 @@ _SPECIAL = {
     "±": r"$\pm$", "≈": r"$\approx$", "∞": r"$\infty$", "√": r"$\surd$",
     "½": r"$\frac12$", "µ": r"$\mu$", "λ": r"$\lambda$", "ν": r"$\nu$",
     "°": r"$^\circ$", "∅": r"$\emptyset$", "✓": r"$\surd$", "−": r"$-$",
-    "\0": "{}",
+    "⋆": r"$\star$", "\0": "{}",
 }  # fmt: skip
 
 #: text that needs no escape

@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping
 
 from harness import Verdict
-from reports.data.cells import case_cells, grid, source, verdict_cell
+from reports.data.cells import case_cells, grid, legend, source, verdict_cell
 from reports.data.evidence import RESIDUALS, Evidence, Outcome
 from reports.document.formatting import ABSENT, clean, plain_value, power, span
 from reports.document.layout import Cell, Section, Table, name_cell, sources
@@ -90,12 +90,14 @@ def _refuted(evidence: Evidence) -> list[Table]:
     ]  # fmt: skip
     if not refuted:
         return []
+    rows = tuple(_refutation(o) for o in refuted)
     return [
         Table(
             caption="Refuted claims: what the solver said, and the residual that says "
             "otherwise, with what verification allows.",
+            notes=legend(rows),
             columns=("case", "solver", "tol", "verdict", "evidence", "its words"),
-            rows=tuple(_refutation(o) for o in refuted),
+            rows=rows,
             text_columns=2,
         )
     ]
@@ -217,10 +219,12 @@ def errors(evidence: Evidence) -> Section:
     if not answers:
         none = "No solver handed over a point, so there are no residuals."
         return Section(name="errors", title="Errors", prose=(none,))
+    rows = tuple(_residuals(o, measures) for o in answers)
     table = Table(
         caption="Residuals of every answer.",
+        notes=legend(rows),
         columns=("case", "solver", "tol", "verdict", *heads),
-        rows=tuple(_residuals(o, measures) for o in answers),
+        rows=rows,
         text_columns=2,
     )
     return Section(

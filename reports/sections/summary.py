@@ -43,8 +43,8 @@ def summary(evidence: Evidence) -> Section:
         f"{plural(len(evidence.solvers), 'solver')}, {plural(cases, 'case')}, "
         f"tolerance {', '.join(map(tolerance, tols))}. What a solver says of its "
         "answer is recorded beside our verdict: every verdict below comes from "
-        "residuals that we evaluated at the returned point, and only verified answers "
-        "enter a comparison of times.",
+        "residuals that we evaluated at the returned point, or for small QPs from a "
+        "proven optimum, and only verified answers enter a comparison of times.",
     ]
     digests = sorted({r.environment for r in evidence.records})
     if len(digests) > 1:

@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass
+from typing import Any, Literal
 from zipfile import ZipFile
 
 import pytest
@@ -416,3 +417,67 @@ def test_a_labelled_adapter_of_many_backends_is_one(tmp_path):
 
     assert resolve(spec("new:mine:scs"), solvers).backend == "scs"
     assert resolve(spec("new:mine"), solvers).backend == "own"
+
+
+@dataclass(frozen=True)
+class Wide:
+    rho: float = 1  # an int, as people write it
+    steps: int = 1e4
+    norm: Literal["max", 2] = "max"
+    weight: float | None = 1
+    start: Any = 0
+
+    declines, prepare = Method.declines, Method.prepare
+
+
+@dataclass(frozen=True)
+class Lost:
+    rho: float = 1.0
+    inner: "NameForTypeCheckers | None" = None  # noqa: F821
+
+    declines, prepare = Method.declines, Method.prepare
+
+
+@pytest.mark.parametrize("default", [Wide(), Wide(rho=10), Wide(rho=2.5)])
+@pytest.mark.parametrize("value", [0.1, 2, 2.0, 1e-3])
+def test_the_annotation_of_an_option_decides_its_type(default, value):
+    found = resolve(spec("wide", rho=value), {"wide": default}).rho
+
+    assert found == value
+    assert type(found) is float
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rho": "much"}, "rho = 'much' is of type str; expected float"),
+        ({"rho": True}, "rho = True is of type bool; expected float"),
+        ({"steps": 9.5}, "steps = 9.5 is of type float; expected int"),
+        ({"norm": 1.5}, "norm = 1.5 is of type float; expected str or int"),
+        ({"weight": "no"}, "weight = 'no' is of type str; expected float or None"),
+        ({"start": 0.5}, "start = 0.5 is of type float; expected int"),
+    ],
+)
+def test_a_value_of_another_type_than_annotated_is_refused(options, message):
+    with pytest.raises(InputError) as refused:
+        resolve(spec("wide", **options), {"wide": Wide()})
+
+    assert str(refused.value) == f"wide: {message}"
+
+
+@pytest.mark.parametrize(
+    ("options", "value"),
+    [({"steps": 9}, 9), ({"norm": 2}, 2), ({"weight": None}, None), ({"weight": 3}, 3)],
+)
+def test_a_value_of_an_annotated_type_is_taken(options, value):
+    (name,) = options
+
+    assert getattr(resolve(spec("wide", **options), {"wide": Wide()}), name) == value
+
+
+def test_defaults_decide_where_annotations_cannot_be_read():
+    lost = {"lost": Lost()}
+
+    assert resolve(spec("lost", rho=0.5), lost).rho == 0.5
+    with pytest.raises(InputError, match="rho = 'much' is of type str; expected float"):
+        resolve(spec("lost", rho="much"), lost)

@@ -417,7 +417,19 @@ WRONG = {
     "no command": ((), "the following arguments are required: COMMAND; usage: morta"),
     "unknown command": (("rnu",), "'rnu' (choose from"),
     "unknown list": (("list", "sovlers"), "'sovlers' (choose from"),
-    "unknown option": (("run", "tiny", "--repeat", "3"), "unknown argument '--repeat'"),
+    "unknown option": (
+        ("run", "tiny", "--repeat", "3"),
+        "unknown argument '--repeat'; did you mean --repeats? usage: mortarbench run ",
+    ),
+    "misspelt option": (
+        ("solve", "well/primal", "--solvr=exact"),
+        "unknown argument '--solvr'; did you mean --solver? usage: mortarbench solve ",
+    ),
+    "option like no other": (
+        ("solve", "well/primal", "--zzz", "--solver", "exact"),
+        "unknown argument '--zzz'; usage: mortarbench solve ",
+    ),
+    "unknown option of no command": (("--versoin",), "argument"),
     "no integer": (
         ("run", "tiny", "--repeats", "x"),
         "argument --repeats: invalid int",

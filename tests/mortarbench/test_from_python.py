@@ -62,6 +62,21 @@ def test_a_solver_object_is_measured_in_a_process_of_its_own():
     assert mb.solve(SMALL, ActiveRow()).record.message == "other sizes"
 
 
+@pytest.mark.parametrize(
+    "solvers", [[ActiveRow()], ["clarabel", ActiveRow], ActiveRow()]
+)
+def test_a_suite_refuses_solver_objects(tmp_path, solvers):
+    suite = {"name": "tiny", "solvers": solvers, "problems": [{"family": "strings"}]}
+    for arguments in ({"suite": "demo", "solvers": solvers}, {"suite": suite}):
+        with pytest.raises(mb.InputError) as refused:
+            mb.run(**arguments, out=tmp_path / "out")
+        assert str(refused.value) == (
+            "solver objects are for mb.solve; in a suite name them by "
+            "plugins=['FILE.py']"
+        )
+    assert not (tmp_path / "out").exists()
+
+
 def test_fields_of_a_solver_object_are_its_options():
     assert mb.solve(QP, ActiveRow(shift=0.5)).record.options == {"shift": 0.5}
     answer = mb.solve(QP, ActiveRow(), options={"shift": 0.25})

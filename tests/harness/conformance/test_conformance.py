@@ -333,6 +333,11 @@ class DeclinesAll(Sound):
         return "never on a Monday"
 
 
+class SaysFalse(Sound):
+    def declines(self, qp):
+        return False
+
+
 class Dies(Sound):
     def act(self, qp, tol):
         os.kill(os.getpid(), signal.SIGSEGV)
@@ -340,7 +345,7 @@ class Dies(Sound):
 
 PLUGIN_SOLVERS = {
     "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
-    "slow": SlowInNewtons(),
+    "slow": SlowInNewtons(), "false": SaysFalse(),
 }  # fmt: skip
 
 
@@ -531,6 +536,32 @@ def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):
 def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
     assert command("test-solver", "declines", "--plugin", plugin) == 1
     assert "never on a Monday" in capsys.readouterr().out
+
+
+def test_what_fails_is_said_where_the_exit_code_is_1(plugin, capsys, monkeypatch):
+    few = [
+        "finds the planted solution: bounds, sparse", "refuses a misspelt option",
+        "gives multipliers our signs",
+    ]  # fmt: skip
+    monkeypatch.setattr(conformance, "CHECKS", few)
+    wrong = "declines returned False; expected None or a text"
+
+    assert command("test-solver", "false", "--plugin", plugin) == 1
+    out, err = capsys.readouterr()
+    assert out.count(wrong) == 2
+    assert "1 pass, 0 decline, 0 weak, 2 fail" in out
+    assert err == (
+        f"mortarbench: false does not conform: it fails {few[0]!r}, {few[2]!r}\n"
+    )
+
+    assert command("test-solver", "declines", "--plugin", plugin, "--json") == 1
+    assert capsys.readouterr().err == (
+        "mortarbench: declines does not conform: it passes no check "
+        "'finds the planted solution': it solved nothing\n"
+    )
+
+    assert command("test-solver", "sound", "--plugin", plugin) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_an_unknown_solver_is_wrong_input(capsys):

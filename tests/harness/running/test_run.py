@@ -121,8 +121,12 @@ def measure(tmp_path):
 
 OUTCOMES = {
     "honest": (Verdict.VERIFIED, "solved", ""),
-    "raises": (Verdict.FAILED, "failed", "ValueError: first line second line"),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3"),
+    "raises": (
+        Verdict.FAILED,
+        "failed",
+        "ValueError: first line second line (adversaries.py:125)",
+    ),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:130)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -146,7 +150,8 @@ OUTCOMES = {
     "returnsnan": (Verdict.WRONG, "solved", ""),
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
-        Verdict.FAILED, "failed", "ValueError: assignment destination is read-only",
+        Verdict.FAILED, "failed",
+        "ValueError: assignment destination is read-only (adversaries.py:377)",
     ),
     "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),

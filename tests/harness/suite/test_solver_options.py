@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -169,3 +169,29 @@ def test_the_label_of_the_suite_is_found_in_a_longer_one():
     assert list(without_options("my way x=1 max_iter=5")) == [
         "my way x=1 max_iter=5", "my way x=1", "my way"
     ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sized:
+    rho: float = 1  # an int, as people write it
+    start: Any = 0  # no type: that of the default
+
+    declines, prepare = Method.declines, Method.prepare
+
+
+@pytest.mark.parametrize("solver", [Sized(), Sized(rho=10)])
+@pytest.mark.parametrize(("text", "value"), [("0.1", 0.1), ("2", 2.0), ("1e-3", 1e-3)])
+def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
+    registry = {"sized": solver}
+    specs = [SolverSpec(name="sized", label="sized")]
+    one = options_for("sized", [f"rho={text}"], registry)
+    (spec,) = swept(specs, {"rho": [text]}, registry)
+
+    assert one == {"rho": value}
+    assert resolve(spec, registry).rho == value
+
+
+def test_a_default_decides_where_the_annotation_leaves_it_open():
+    assert options_for("sized", ["start=3"], {"sized": Sized()}) == {"start": 3}
+    with pytest.raises(InputError, match=r"start = '0\.5'; expected an integer"):
+        options_for("sized", ["start=0.5"], {"sized": Sized()})

@@ -17,6 +17,14 @@ from tests.support import ADVERSARIES
 
 PLUGIN = load_plugin(ADVERSARIES)
 
+#: places in the file of these solvers, as messages name them
+AT = {
+    code: f" ({ADVERSARIES.name}:{line})"
+    for line, text in enumerate(ADVERSARIES.read_text().splitlines(), start=1)
+    for code in ("raise Va", "sys.exit(3)", "qp.q[:] = 0.0")
+    if text.strip().startswith(code)
+}
+
 
 @pytest.fixture
 def qp():
@@ -33,9 +41,17 @@ def outcome(solver, qp):
     ("solver", "status", "message"),
     [
         ("honest", Status.SOLVED, ""),
-        ("raises", Status.FAILED, "ValueError: first line second line"),
-        ("exits", Status.FAILED, "SystemExit: 3"),
-        ("mutates", Status.FAILED, "ValueError: assignment destination is read-only"),
+        (
+            "raises",
+            Status.FAILED,
+            f"ValueError: first line second line{AT['raise Va']}",
+        ),
+        ("exits", Status.FAILED, f"SystemExit: 3{AT['sys.exit(3)']}"),
+        (
+            "mutates",
+            Status.FAILED,
+            f"ValueError: assignment destination is read-only{AT['qp.q[:] = 0.0']}",
+        ),
         ("declines", Status.DECLINED, "never on a Monday"),
         ("returnsnone", Status.FAILED, "returned NoneType, expected Solution"),
         ("wrongshape", Status.FAILED, "Solution.x has shape (3,), expected (2,)"),
@@ -48,6 +64,84 @@ def outcome(solver, qp):
 )
 def test_whatever_a_solver_does_is_a_status_and_one_line(qp, solver, status, message):
     assert outcome(solver, qp) == (status, message)
+
+
+HELPER = """
+def fails(x):
+    return x.nothing
+"""
+ADMM = """
+from dataclasses import dataclass
+import helper
+
+def start(q):
+    return helper.fails(q)
+
+@dataclass(frozen=True)
+class Admm:
+    rho: float = 1.0
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        def solve():
+            return start(
+                qp.q
+            )
+        return solve
+
+@dataclass(frozen=True)
+class Faster(Admm):
+    rho: float = 10.0
+
+SOLVERS = {"admm": Admm(), "faster": Faster()}
+"""
+
+
+@pytest.mark.parametrize("name", ["admm", "faster"])
+def test_a_failure_ends_with_the_last_place_in_the_solver_s_own_file(
+    qp, tmp_path, name
+):
+    """Not in a helper's, nor in numpy's; no folder of a machine is in it."""
+    (tmp_path / "helper.py").write_text(HELPER)
+    (tmp_path / "admm.py").write_text(ADMM)
+    solver = load_plugin(tmp_path / "admm.py").solvers[name]
+
+    assert measure(solver, qp, 1e-6).solution.message == (
+        "AttributeError: 'numpy.ndarray' object has no attribute 'nothing' (admm.py:6)"
+    )
+
+
+def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
+    path = tmp_path / f"{'long' * 50}.py"
+    code = ADMM.replace("import helper", "")
+    path.write_text(code.replace("helper.fails(q)", "{}['9' * 4000]"))
+    message = measure(load_plugin(path).solvers["admm"], qp, 1e-6).solution.message
+
+    assert message.endswith(".py:6)")
+    assert len(message) < 2000  # of the protocol
+
+
+@pytest.mark.parametrize(
+    ("reason", "got"),
+    [
+        (False, "False"),
+        (True, "True"),
+        (0, "0"),
+        (("no",), "tuple"),
+        (object(), "object"),
+    ],
+)
+def test_what_declines_returns_is_none_or_a_text(qp, reason, got):
+    class Vague(type(PLUGIN.solvers["honest"])):
+        def declines(self, qp):
+            return reason
+
+    s = measure(Vague(), qp, 1e-6).solution
+
+    assert s.status is Status.FAILED
+    assert s.message == f"declines returned {got}; expected None or a text"
 
 
 def test_both_phases_are_timed_and_add_up(qp):
@@ -130,7 +224,8 @@ def test_garbage_is_not_collected_while_the_clock_runs(qp):
         def act(self, qp):
             raise ValueError(f"gc is {gc.isenabled()}")
 
-    assert measure(Looks(), qp, 1e-6).solution.message == "ValueError: gc is False"
+    message = measure(Looks(), qp, 1e-6).solution.message
+    assert message.startswith("ValueError: gc is False (test_measure.py:")
     assert gc.isenabled()
 
 

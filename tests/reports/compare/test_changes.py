@@ -579,6 +579,19 @@ def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
     assert any("two on box/n=1/dual" in line for line in found.said)
 
 
+def test_a_gate_without_verified_answers_of_a_solver_names_it(folders):
+    """Of the two solvers of the suite, one is wrong everywhere in the later folder."""
+    pair = [r for r in suite(2, cases=4, repeats=3) if r.solver in ("one", "two")]
+    spoilt = [r.but(verdict=Verdict.WRONG) if r.solver == "two" else r for r in pair]
+    a, b = folders(HERE, HERE, before=pair, after=spoilt)
+    with pytest.raises(InputError) as refused:
+        report(a, b, formats=["csv"], fail_on=["slower"])
+    assert str(refused.value) == (
+        f"fail-on slower: {a} and {b}: two has no verified answer in {b}: nothing to "
+        "compare"
+    )
+
+
 def test_a_gate_that_cannot_judge_times_and_finds_nothing_worse_says_so(folders):
     slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     a, b = folders(HERE, slow)

@@ -148,7 +148,7 @@ def test_the_more_folders_are_compared_the_wider_are_the_intervals(changed):
     assert many.ratio.high > one.ratio.high
 
 
-def test_where_nothing_can_be_judged_it_is_said_why(changed):
+def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
     rng = np.random.default_rng(244948)
 
     def why(after_too=lambda made: made, **shape):
@@ -163,9 +163,38 @@ def test_where_nothing_can_be_judged_it_is_said_why(changed):
         return [r.but(environment="f") for r in made]
 
     assert why(solvers=("one",)).endswith("add one that does not change")
+
+    def wrong(*solvers):
+        def spoil(made):
+            return [
+                r.but(verdict=Verdict.WRONG) if r.solver in solvers else r for r in made
+            ]
+
+        return spoil
+
+    pair, b = ("one", "two"), tmp_path / "b"
+    lacking = f"two has no verified answer in {b}: nothing to compare"
+    assert why(wrong("two"), solvers=pair) == lacking
+    assert why(wrong("two"), solvers=("two",)) == lacking
+    assert why(wrong("two"), solvers=pair, repeats=1) == lacking
     assert why(repeats=1) == "no cell has two verified repeats in both folders"
     assert why(elsewhere) == "no cell was measured on equal machines in both folders"
     assert (
         why(cases=2) == f"fewer than 3 cases of a solver, and of {CELLS} cells in all"
     )
     assert why(cases=3) == ""
+
+
+def test_a_solver_without_a_verified_answer_is_named_beside_what_is_judged(
+    changed, tmp_path
+):
+    rng = np.random.default_rng(141421)
+    before, after = (session(rng, name, draw=normal) for name in "ab")
+    spoilt = [r.but(verdict=Verdict.WRONG) if r.solver == "two" else r for r in after]
+    found = regressions(c := changed(before, spoilt))
+    named = f"two has no verified answer in {tmp_path / 'b'}: nothing to compare"
+
+    assert (found.solvers, found.why_not) == (2, "")
+    assert found.unverified == (named,)
+    assert any(named in line for line in verdict_lines(c))
+    assert regressions(changed(before, after)).unverified == ()
