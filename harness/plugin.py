@@ -34,7 +34,7 @@ class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options."""
 
     def declines(self, qp: QP) -> str | None:
-        """Say why this solver cannot take `qp`, or None if it can; nothing else."""
+        """Give the reason why this solver cannot take `qp`, or None if it can."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Convert and factorise; return the call that solves. Both are timed.

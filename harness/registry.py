@@ -586,7 +586,7 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
 
 
 def is_solver(thing: object) -> bool:
-    """Tell a solver, or the class of one, from the name of a solver."""
+    """Return True if a thing is a solver, or the class of one, and no name."""
     return _has(_SOLVER_PARTS, thing)
 
 

@@ -259,7 +259,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:
-    """Whether no contact row presses; interior points leave forces like rounding."""
+    """Return True if no contact row presses, but for forces of rounding size."""
     if not record.quantities.get("contact_rows"):
         return False
     if record.quantities.get("active") == 0:

@@ -270,7 +270,7 @@ class Registries:
     def commands(
         self, specs: Iterable[SolverSpec], folder: Path | None = None
     ) -> Commands:
-        """Make the commands that start the processes of a run.
+        """Return the commands that start the processes of a run.
 
         folder : the result folder, whose copies of files cases may be built from
         """

@@ -117,7 +117,7 @@ def decided(
 
 
 def is_small(qp: QP) -> bool:
-    """Whether a QP is cheap to solve once more; an operator P, to multiply out."""
+    """Return True if a QP is cheap to solve once more, or its P to multiply out."""
     n, rows = qp.q.size, qp.b.size + qp.h.size
     if not qp.is_explicit:
         return n + rows <= MULTIPLIED
@@ -127,7 +127,7 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Tell which variables (n,) P, a matrix, couples to others, or a row holds."""
+    """Mark the variables (n,) that P, a matrix, couples to others, or a row holds."""
     found = np.zeros(qp.q.size, dtype=bool)
     P = coo_array(qp.P)
     for j in (P.row, P.col):
@@ -309,7 +309,7 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Tell where a point breaks the KKT conditions that its equations leave open.
+    """Mark where a point breaks the KKT conditions that its equations leave open.
 
     Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) that pushes where
     no bound is, or at the other one.

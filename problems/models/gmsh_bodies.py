@@ -202,7 +202,7 @@ def model(path: str, sha256: str, plane: Any, halvings: int) -> Bodies:
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:
-    """Whether a side that may touch has chords: edges that meet at less than ARC."""
+    """Return True if a side that may touch has edges that meet at less than ARC."""
     p: Any = params
     bodies = model(p["path"], p["sha256"], p["plane"], p["halvings"])
     for side in (chain for pair in bodies.pairs for chain in pair):
