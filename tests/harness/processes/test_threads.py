@@ -290,58 +290,6 @@ SOLVERS = {"hangs": Hangs()}
 """
 
 
-@pytest.mark.parametrize(("phase", "size"), [("build", 2), ("write", 1500)])
-def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(
-    tmp_path, phase, size
-):
-    """While the case is built, and while its file is written."""
-    plugin, out = tmp_path / "large.py", tmp_path / "out"
-    plugin.write_text(LARGE)
-    out.mkdir()
-    export = subprocess.Popen(
-        [sys.executable, "-m", "mortarbench", "export", f"large/n={size}/primal",
-         str(out / "qp.mat"), "--plugin", str(plugin)],
-        env=env(tmp_path) | {"STARTED": str(tmp_path / "started"), "PHASE": phase},
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    if phase == "build":
-        assert soon((tmp_path / "started").exists)
-    else:
-        assert soon(lambda: any(p.stat().st_size for p in out.glob(".*.tmp")))
-    export.send_signal(signal.SIGTERM)
-    printed, said = export.communicate()
-
-    assert export.returncode == 143
-    assert (printed, said) == ("", "mortarbench: terminated\n")
-    assert not list(out.iterdir())
-    assert not list(tmp_path.glob("mortarbench-*"))
-
-
-#: a family with a dense P of random numbers, which takes seconds to compress
-LARGE = """
-import os, time
-from pathlib import Path
-import numpy as np
-from harness import Case, Family, QP
-
-class Large(Family):
-    name = "large"
-    defaults = {"n": 2}
-    forms = ("primal",)
-
-    def build(self, form, params, reference):
-        if os.environ["PHASE"] == "build":
-            Path(os.environ["STARTED"]).touch()
-            time.sleep(3600)
-        n = params["n"]
-        P = np.random.default_rng(0).uniform(size=(n, n))
-        qp = QP.from_arrays(P + P.T + 2 * n * np.eye(n), np.ones(n))
-        return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {})
-
-PROBLEMS = {"large": Large()}
-"""
-
-
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
     """As nohup does with SIGHUP."""
     script = (
