@@ -48,14 +48,8 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
             label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
             keys.append(Key(label=label, look=style, solver=solver))
             times.append(timed)
-        counted = [
-            (float(n), sum(o.iterations) / 2, run_ids(o.records))
-            for n, o in series.curve(solver)
-            if o.iterations is not None
-        ]
-        if counted:
-            n, its, runs = zip(*counted, strict=True)
-            counts.append(Series(x=n, y=its, look=style, solver=solver, runs=runs))
+        if counted := _counts(series, solver, style):
+            counts.append(counted)
     left = with_slopes(
         Panel(x=log(_SIZE), y=log("total time in s"), marks=tuple(times))
     )
@@ -74,16 +68,10 @@ def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None
     curves: list[Series] = []
     keys: list[Key] = []
     for series in found[:MOST_SERIES]:
-        counted = [
-            (float(n), sum(o.iterations) / 2, run_ids(o.records))
-            for n, o in series.curve(solver)
-            if o.iterations is not None
-        ]
-        if counted:
-            n, its, runs = zip(*counted, strict=True)
-            style = look(len(keys))
+        style = look(len(keys))
+        if counted := _counts(series, solver, style):
             keys.append(Key(label=legible(series.title, 64), look=style))
-            curves.append(Series(x=n, y=its, look=style, solver=solver, runs=runs))
+            curves.append(counted)
     if not curves:
         return None
     most = max(max(curve.y) for curve in curves)
@@ -98,6 +86,19 @@ def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None
         height=2.6 + LEGEND_LINE * len(keys),
         legend=below(keys, 1),
     )
+
+
+def _counts(series: SizeSeries, solver: str, style: Look) -> Series | None:
+    """Return the iterations over the size, the middle of both ends; None without."""
+    counted = [
+        (float(n), sum(o.iterations) / 2, run_ids(o.records))
+        for n, o in series.curve(solver)
+        if o.iterations is not None
+    ]
+    if not counted:
+        return None
+    n, its, runs = zip(*counted, strict=True)
+    return Series(x=n, y=its, look=style, solver=solver, runs=runs)
 
 
 def _times(series: SizeSeries, solver: str, style: Look) -> Series | None:
