@@ -304,6 +304,45 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
     assert (done.returncode, done.stdout) == (143, b"goes on\n")
 
 
+def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
+    """While its case is built."""
+    plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
+    plugin.write_text(SLOW)
+    out.mkdir()
+    export = subprocess.Popen(
+        [sys.executable, "-m", "mortarbench", "export", "slow/primal",
+         str(out / "qp.mat"), "--plugin", str(plugin)],
+        env=env(tmp_path) | {"STARTED": str(started)},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert soon(lambda: started.exists() or export.poll() is not None)
+    export.send_signal(signal.SIGTERM)
+    printed, said = export.communicate()
+
+    assert (printed, said) == ("", "mortarbench: terminated\n")
+    assert export.returncode == 143
+    assert not list(out.iterdir())
+    assert not list(tmp_path.glob("mortarbench-*"))
+
+
+SLOW = """
+import os, time
+from pathlib import Path
+from harness import Family
+
+class Slow(Family):
+    name = "slow"
+    defaults = {}
+    forms = ("primal",)
+
+    def build(self, form, params, reference):
+        Path(os.environ["STARTED"]).touch()
+        time.sleep(3600)
+
+PROBLEMS = {"slow": Slow()}
+"""
+
+
 #: a worker that creates a System V segment of 64 MiB, fills it, and writes which it is:
 #: other programs of the machine create segments meanwhile
 SEGMENT = SHOWS.replace(
